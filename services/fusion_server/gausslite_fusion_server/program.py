@@ -7,6 +7,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
+from gausslite.domain.errors import StorageError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.joint_refinement import rasterizer_of_backend
 from gausslite.fusion.memory_store import MemoryStore
@@ -67,3 +68,6 @@ async def _serve(settings: ServerSettings, store: FusionStore) -> None:
             )
     finally:
         servicer.close()
+        # a full disk is in the log already
+        with contextlib.suppress(StorageError):
+            engine.save_counters()

@@ -62,7 +62,7 @@ class RefinementWorker:
             gaussians, keyframes, revision = engine.refinement_input()
             refined = refine(gaussians, keyframes, self._create_rasterizer(), settings, report_progress)
             if not cancelled.is_set():
-                engine.maps.store_refined(refined, revision)
+                engine.store_refined(refined, revision)
 
         future = loop.run_in_executor(self._worker, work)
         future.add_done_callback(lambda _: self._finish(progress_notifier))

@@ -69,6 +69,11 @@ class ChangeLog:
         if keys:
             self._advance(keys, [])
 
+    def mark_changed(self, keys: Int64[ndarray, " k"]) -> None:
+        """Record that these voxels of the fused map have changed, with the winners that are recorded already."""
+        if len(keys):
+            self._advance(keys.tolist(), [])
+
     def record(self, agent_id: str, keys: Int64[ndarray, " k"], vote: VoteResult) -> Int64[ndarray, " c"]:
         """Record that this agent's updates of `keys` changed; `vote` is the new result on these voxels.
 

@@ -35,6 +35,7 @@ from gausslite.fusion.keyframes import (
 from gausslite.fusion.limits import FusionSettings, VoteRule
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.refined_map import load_refinement, save_refinement
 from gausslite.fusion.storage_probe import StorageProbe
 from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.team_objects import TeamObjects, find_objects
@@ -61,7 +62,7 @@ class JoinResult(NamedTuple):
 class FusionEngine:
     """Owns the store, the sessions, the keyframes and the refined map of one mission. Thread-safe.
 
-    Updates, sessions, keyframes and objects persist with the store; the refined map and counters end with this object.
+    Updates, sessions, keyframes, objects, counters and the refined map persist with the store.
     decode_keyframe reads keyframes as they were received; only a refinement needs it. first_revision must exceed the
     revisions from before a restart; by default it is the time in microseconds.
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
@@ -84,7 +85,7 @@ class FusionEngine:
         self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
         self._objects = TeamObjects(store)
         self._checks = UpdateChecks(store, quotas)
-        self._traffic = TrafficLog()
+        self._traffic = TrafficLog(store)
         self._alignments = FrameAlignments(store)
         self._free_space = FreeSpaceRecords(store, settings.grid)
         uses_free_space = settings.vote is VoteRule.FREE_SPACE
@@ -93,7 +94,8 @@ class FusionEngine:
         self._aligner = FrameAligner(
             store, self._alignments, self._votes, self._free_space, self._lock, settings.alignment
         )
-        self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, settings.max_removed_voxels)
+        refined, max_removed = load_refinement(store), settings.max_removed_voxels
+        self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, max_removed, refined)
         parts = self._aligner, self._free_space, self._checks, self._traffic, self._keyframes, self._objects
         self._data = AgentData(store, self._votes, self._maps, self._alignments, parts)
         self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_update)
@@ -302,6 +304,13 @@ class FusionEngine:
             )
         return gaussians, self.in_fused_frame(self._keyframes.decode(encoded)), revision
 
+    def store_refined(self, gaussians: Gaussians, revision: int) -> None:
+        """Store the result of a refinement of the vote at this revision. Raises RevisionGoneError, StorageError."""
+        # no update may be in the store without being in the change log
+        with self._committer.committing:
+            stored = self._maps.show_refined(gaussians, revision)
+        save_refinement(self._store, stored)
+
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
         """Return the keyframes with camera poses in the fused map's frame.
 
@@ -326,6 +335,11 @@ class FusionEngine:
                 tuple(self._contribution(agent_id) for agent_id in sorted(self._members.sources)),
                 self._members.banned,
             )
+
+    def save_counters(self) -> None:
+        """Save the agents' counters, which are otherwise saved every 10 s. Raises StorageError."""
+        with self._lock:
+            self._traffic.save()
 
     def close(self) -> None:
         """Close the store."""
@@ -365,3 +379,4 @@ class FusionEngine:
         if len(outcome.accepted):
             self._maps.record(subset.agent_id, self._votes.changed_keys(subset.agent_id, outcome.accepted))
             self._data.drop_outgrown(subset.agent_id)
+        self._traffic.save_if_due()

@@ -20,9 +20,9 @@ from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.change_log import ChangeLog
-from gausslite.fusion.refined_map import RefinedMap
+from gausslite.fusion.refined_map import RefinedMap, StoredRefinement
 from gausslite.fusion.tile_index import TileIndex
-from gausslite.fusion.vote import fuse, rank_voxels, union_maps
+from gausslite.fusion.vote import VoteResult, fuse, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
 
 
@@ -63,8 +63,15 @@ class FusedMapLayers:
     """Owns the change logs and the refined map; reads the updates from `votes`. Thread-safe, with the engine's lock."""
 
     def __init__(
-        self, votes: VoteInput, lock: RLock, grid: VoxelGrid, first_revision: int, max_removed_voxels: int
+        self,
+        votes: VoteInput,
+        lock: RLock,
+        grid: VoxelGrid,
+        first_revision: int,
+        max_removed_voxels: int,
+        stored: StoredRefinement | None = None,
     ) -> None:
+        """stored: the latest refinement from before a restart."""
         self._votes, self._lock, self._grid = votes, lock, grid
         self._change_log = ChangeLog(first_revision, max_removed_voxels)
         self._refined: RefinedMap | None = None
@@ -72,8 +79,9 @@ class FusedMapLayers:
         self._refined_tiles = TileIndex()
         vote = rank_voxels(votes.scores())
         self._change_log.load(vote)
-        if len(vote):
-            self._record_refined(vote.keys.tolist(), [])
+        shown = vote.keys if stored is None else self._restore_refined(stored, vote)
+        if len(shown):
+            self._record_refined(shown.tolist(), [])
 
     def revision(self, layer: MapLayer = MapLayer.VOTE) -> int:
         """Return the layer's revision; it increases with every change."""
@@ -128,8 +136,8 @@ class FusedMapLayers:
             batches = {only_agent: batches[only_agent]}
         return union_maps(batches)
 
-    def store_refined(self, gaussians: Gaussians, revision: int) -> None:
-        """Store the result of a refinement that started from the vote at this revision.
+    def show_refined(self, gaussians: Gaussians, revision: int) -> StoredRefinement:
+        """Show the result of a refinement that started from the vote at this revision; returns it for the store.
 
         Raises RevisionGoneError if the change log no longer reaches back.
         """
@@ -140,6 +148,8 @@ class FusedMapLayers:
             shown = (set(refined.batch.keys.tolist()) - changed) | (before & changed)
             self._record_refined(sorted(shown - changed), sorted(before - shown))
             self._refined = refined
+            vote = rank_voxels(self._votes.scores())
+        return StoredRefinement.of(refined, vote, np.array(sorted(changed), np.int64))
 
     def refined_map(self) -> VoxelBatch:
         """Return the refined map; voxels that changed after the refinement started show the newer vote.
@@ -200,6 +210,13 @@ class FusedMapLayers:
         removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_tiles]
         if changed or removed:
             self._record_refined(changed, removed)
+
+    def _restore_refined(self, stored: StoredRefinement, vote: VoteResult) -> Int64[ndarray, " k"]:
+        """Show a refinement from before a restart; returns the voxels of the refined layer."""
+        changed = stored.changed_voxels(vote)
+        self._refined = RefinedMap(stored.without_removed(vote), self._change_log.revision)
+        self._change_log.mark_changed(changed)
+        return np.union1d(self._refined.batch.keys, changed)
 
     def _record_refined(self, changed: list[int], removed: list[int]) -> None:
         revision = self._refined_log.revision + 1

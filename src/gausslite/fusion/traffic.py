@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import time
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 
+from gausslite.domain.errors import CodecError, StorageError
 from gausslite.fusion.frame_alignment import FrameAlignment
 from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.store import FusionStore
+
+_SAVE_INTERVAL_S = 10.0
+# no agent can have an empty id
+_OWNER, _RECORD = "", "traffic"
 
 
 @dataclass(frozen=True, slots=True)
 class TrafficCounters:
-    """Messages of one agent since the server started. last_seen_ns: time of its latest subset, 0 before the first."""
+    """Messages of one agent since it first joined. last_seen_ns: time of its latest subset, 0 before the first."""
 
     last_seen_ns: int = 0
     roi_bytes: int = 0
@@ -33,15 +42,33 @@ class TrafficCounters:
 
 
 class TrafficLog:
-    """The counters of each agent. Not thread-safe; FusionEngine holds a lock."""
+    """The counters of each agent, saved in the store every 10 s. Not thread-safe; FusionEngine holds a lock."""
 
-    def __init__(self) -> None:
-        self._by_agent: dict[str, TrafficCounters] = {}
+    def __init__(self, store: FusionStore, clock_s: Callable[[], float] = time.monotonic) -> None:
+        """Raises CodecError if the stored counters are damaged."""
+        self._store, self._clock_s = store, clock_s
+        self._by_agent = _decode(store.records(_RECORD).get(_OWNER, b"{}"))
+        self._is_saved, self._next_save_s = True, clock_s() + _SAVE_INTERVAL_S
 
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         newer = replace(traffic, last_seen_ns=time.time_ns())
         self._by_agent[agent_id] = self.of(agent_id).plus(newer)
+        self._is_saved = False
+
+    def save_if_due(self) -> None:
+        """Save the counters if 10 s have passed; a store that refuses is asked again after as long."""
+        if self._clock_s() >= self._next_save_s:
+            # the updates of the caller are stored, and figures are not worth an error
+            with contextlib.suppress(StorageError):
+                self.save()
+            self._next_save_s = self._clock_s() + _SAVE_INTERVAL_S
+
+    def save(self) -> None:
+        """Save the counters. Raises StorageError."""
+        if not self._is_saved:
+            self._store.save_record(_OWNER, _RECORD, _encode(self._by_agent))
+            self._is_saved = True
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""
@@ -49,7 +76,7 @@ class TrafficLog:
 
     def remove_agent(self, agent_id: str) -> None:
         """Forget the agent."""
-        self._by_agent.pop(agent_id, None)
+        self._is_saved &= self._by_agent.pop(agent_id, None) is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,3 +109,18 @@ class MissionStatus:
     refined: bool
     agents: tuple[AgentContribution, ...]
     banned_agents: tuple[str, ...] = ()
+
+
+def _encode(counters: dict[str, TrafficCounters]) -> bytes:
+    return json.dumps({agent_id: asdict(each) for agent_id, each in counters.items()}).encode()
+
+
+def _decode(data: bytes) -> dict[str, TrafficCounters]:
+    try:
+        stored = json.loads(data)
+        return {
+            str(agent_id): TrafficCounters(**{name: int(value) for name, value in each.items()})
+            for agent_id, each in stored.items()
+        }
+    except (AttributeError, TypeError, ValueError, RecursionError) as error:
+        raise CodecError(f"stored counters: expected the JSON of counters, got other bytes ({error})") from error

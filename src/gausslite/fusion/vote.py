@@ -32,6 +32,7 @@ class VoteResult:
     keys: Int64[ndarray, " v"]
     offsets: Int64[ndarray, " v1"]
     agent_index: Int32[ndarray, " s"]
+    update_seqs: Int64[ndarray, " s"]
     kappa_sums: UInt64[ndarray, " s"]
     counts: UInt32[ndarray, " s"]
 
@@ -90,6 +91,7 @@ def rank_voxels(scores: VoxelScoreTable) -> VoteResult:
         keys[is_first],
         np.append(np.flatnonzero(is_first), len(order)).astype(np.int64),
         scores.agent_index[order],
+        scores.update_seqs[order],
         scores.kappa_sums[order],
         scores.counts[order],
     )

@@ -717,7 +717,9 @@ Global___GetSessionStatusResponse: _TypeAlias = GetSessionStatusResponse  # noqa
 
 @_typing.final
 class AgentContribution(_message.Message):
-    """What the server stores of one agent, and its traffic since the server started."""
+    """What the server stores of one agent, and its traffic since it first joined, as far as
+    the server has saved it: every 10 s and when it ends.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -757,7 +759,7 @@ class AgentContribution(_message.Message):
     last_update_seq: _builtins.int
     """The highest sequence number of its updates; 0 without any."""
     last_seen_ns: _builtins.int
-    """Time of its latest subset, by the server's clock; 0 before the first since the server started."""
+    """Time of its latest subset, by the server's clock; 0 before the first."""
     free_voxels: _builtins.int
     """Voxels that the agent has observed as free."""
     @_builtins.property
