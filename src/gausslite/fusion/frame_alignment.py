@@ -55,7 +55,7 @@ class AlignmentSettings:
     min_improvement: float = 1.4
     refit_share: float = 0.25
     min_overlap: float = 0.3
-    max_contradicted_share: float = 0.1
+    max_contradicted_share: float = 0.05
 
     def is_chance(self, fit: FrameFit) -> bool:
         """Return whether the maps may share too little surface to compare the frames."""

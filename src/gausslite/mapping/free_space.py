@@ -16,6 +16,9 @@ from gausslite.domain.voxels import VoxelGrid
 _MAX_RANGE_M, _NEAR_M = 4.0, 0.2
 _MAX_VOXELS = 1_000_000
 _SLACK_M, _SLACK_SHARE = 0.05, 0.02
+_CELLS = np.stack(np.unravel_index(np.arange(BLOCK_VOXELS), (BLOCK_SIDE,) * 3), axis=1)
+"""(i, j, k) of a block's voxels, relative to the block."""
+_MIN_DEPTH_SHARE = 0.8
 _RADII_PX = np.array([1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64], np.int64)
 """Sizes of the squares in the image that hold a voxel; nearer voxels, which are larger, are not evaluated."""
 
@@ -36,8 +39,8 @@ class FreeSpaceMap:
     def observe(self, frame: Frame) -> None:
         """Count one view for the voxels that lie completely in front of the measured surface.
 
-        A voxel is free if all pixels that it may cover have a depth, each behind the voxel's farthest point. Voxels
-        beyond 4 m are not evaluated.
+        A voxel is free if all depths of the pixels that it may cover are behind its farthest point, and at least 80 %
+        of these pixels have one. Voxels beyond 4 m are not evaluated.
         """
         indices = self._free_indices(frame)
         if len(indices) == 0:
@@ -64,40 +67,42 @@ class FreeSpaceMap:
         """Return the (i, j, k) of the voxels that this frame shows to be free."""
         size_m, camera = self._grid.size_m, frame.camera
         half_m = 0.5 * np.sqrt(3.0) * size_m
-        indices = _indices_in_view(frame, size_m)
-        points = transform_points(inverse(frame.T_world_camera), (indices + 0.5) * size_m)
-        z_m = points[:, 2]
-        chosen = np.flatnonzero((z_m > _NEAR_M + half_m) & (z_m < min(_MAX_RANGE_M, float(frame.depth_m.max()))))
-        z_m = z_m[chosen]
-        pixels = np.floor(project(points[chosen].astype(np.float32), camera)).astype(np.int64)
-        radius_px = np.ceil(max(camera.fx_px, camera.fy_px) * half_m / z_m).astype(np.int64)
-        far_m = (z_m + half_m) * (1.0 + _SLACK_SHARE) + _SLACK_M
+        blocks = _blocks_in_view(frame, size_m)
+        T_camera_world = inverse(frame.T_world_camera)
+        corners = transform_points(T_camera_world, blocks * (size_m * BLOCK_SIDE)).astype(np.float32)
+        steps = ((_CELLS + 0.5) * size_m @ T_camera_world[:3, :3].T).astype(np.float32)
+        z_m = corners[:, None, 2] + steps[:, 2]
+        rows, cells = np.nonzero((z_m > _NEAR_M + half_m) & (z_m < min(_MAX_RANGE_M, float(frame.depth_m.max()))))
+        points = corners[rows] + steps[cells]
+        pixels = np.floor(project(points, camera)).astype(np.int64)
+        radius_px = np.ceil(max(camera.fx_px, camera.fy_px) * half_m / points[:, 2]).astype(np.int64)
+        far_m = (points[:, 2] + half_m) * (1.0 + _SLACK_SHARE) + _SLACK_M
         size_px = (camera.width_px, camera.height_px)
         inside = ((pixels >= radius_px[:, None]) & (pixels < size_px - radius_px[:, None])).all(axis=1)
-        chosen, pixels, radius_px, far_m = chosen[inside], pixels[inside], radius_px[inside], far_m[inside]
+        chosen = np.flatnonzero(inside & (radius_px <= _RADII_PX[-1]))
+        levels = np.searchsorted(_RADII_PX, radius_px[chosen])
         is_free = np.zeros(len(chosen), np.bool_)
-        levels = np.searchsorted(_RADII_PX, np.minimum(radius_px, _RADII_PX[-1]))
         for level in np.unique(levels):
             of_level = np.flatnonzero(levels == level)
-            columns, rows = pixels[of_level].T
-            nearest_m = _nearest_depth(frame.depth_m, int(_RADII_PX[level]))
-            is_free[of_level] = nearest_m[rows, columns] > far_m[of_level]
-        free: Int64[ndarray, "n 3"] = indices[chosen[is_free & (radius_px <= _RADII_PX[-1])]]
-        return free
+            x, y = pixels[chosen[of_level]].T
+            is_free[of_level] = _nearest_depth(frame.depth_m, int(_RADII_PX[level]))[y, x] > far_m[chosen[of_level]]
+        free = chosen[is_free]
+        indices: Int64[ndarray, "n 3"] = blocks[rows[free]] * BLOCK_SIDE + _CELLS[cells[free]]
+        return indices
 
 
 def _nearest_depth(depth_m: Float32[ndarray, "h w"], radius_px: int) -> Float32[ndarray, "h w"]:
-    """Return the smallest depth in the square around each pixel; 0 if a pixel of it has none."""
-    side = 2 * radius_px + 1
-    nearest_m: Float32[ndarray, "h w"] = cv2.erode(depth_m, np.ones((side, side), np.uint8)).astype(np.float32)
-    return nearest_m
+    """Return the smallest depth in the square around each pixel; 0 if too many pixels of it have none."""
+    side = (2 * radius_px + 1, 2 * radius_px + 1)
+    has_depth = depth_m > 0
+    nearest_m = cv2.erode(np.where(has_depth, depth_m, np.float32(np.inf)), np.ones(side, np.uint8))
+    share = cv2.blur(has_depth.astype(np.float32), side)
+    result: Float32[ndarray, "h w"] = np.where(share >= _MIN_DEPTH_SHARE, nearest_m, np.float32(0.0))
+    return result
 
 
-def _indices_in_view(frame: Frame, size_m: float) -> Int64[ndarray, "n 3"]:
-    """Return the (i, j, k) of the voxels of all blocks that touch the view up to its farthest depth.
-
-    If they are too many, those of the nearest blocks.
-    """
+def _blocks_in_view(frame: Frame, size_m: float) -> Int64[ndarray, "b 3"]:
+    """Return the blocks that touch the view up to its farthest depth; the nearest ones if they have too many voxels."""
     camera, block_m = frame.camera, size_m * BLOCK_SIDE
     corners_px = np.array([(0, 0), (camera.width_px, 0), (camera.width_px, camera.height_px), (0, camera.height_px)])
     rays = np.column_stack([(corners_px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px), np.ones(4)])
@@ -113,7 +118,5 @@ def _indices_in_view(frame: Frame, size_m: float) -> Int64[ndarray, "n 3"]:
     radius_m = 0.5 * np.sqrt(3.0) * block_m
     touches = (centres_m @ normals.T > -radius_m).all(axis=1) & (centres_m[:, 2] < reach_m + radius_m)
     blocks, z_m = blocks[touches], centres_m[touches, 2]
-    blocks = blocks[np.argsort(z_m)[: _MAX_VOXELS // BLOCK_VOXELS]]
-    offsets = np.stack(np.unravel_index(np.arange(BLOCK_VOXELS), (BLOCK_SIDE,) * 3), axis=1)
-    indices: Int64[ndarray, "n 3"] = (blocks[:, None] * BLOCK_SIDE + offsets).reshape(-1, 3)
-    return indices
+    nearest: Int64[ndarray, "b 3"] = blocks[np.argsort(z_m)[: _MAX_VOXELS // BLOCK_VOXELS]]
+    return nearest
