@@ -58,7 +58,7 @@ def test_an_exact_detector_is_right_in_every_stage():
     assert (score.frames, score.shown_frames, score.shown_objects) == (7, 7, 2)
     for stage, stage_score in score.stages.items():
         # between detections, the outline has the resolution of the surface's voxels
-        exact = 0.9 if stage is PerceptionStage.TRACKED else 1.0
+        exact = 0.9 if stage in (PerceptionStage.TRACKED, PerceptionStage.COMPLETED) else 1.0
         assert stage_score.iou >= exact
         assert (
             stage_score.marked_frames,
@@ -91,6 +91,17 @@ def test_scores_of_a_weak_detector():
     assert (missed.detected_share, set(missed.recall.values())) == (0.0, {None})
 
 
+def test_the_frame_before_an_object_was_confirmed_is_completed():
+    bench = PerceptionBench(WeakDetector(), [MUGS], REGIONS, UP)
+    for frame in frames(8):
+        bench.process(frame)
+    (mugs,) = bench.scores()
+    tracked, completed = mugs.stages[PerceptionStage.TRACKED], mugs.stages[PerceptionStage.COMPLETED]
+    assert (tracked.late_frames, tracked.marked_frames) == (1.0, 7)
+    assert (completed.late_frames, completed.marked_frames) == (0.0, 8)
+    assert tracked.recall < 0.45 < completed.recall <= 0.5
+
+
 def test_a_sheet_has_a_row_for_each_segment_and_a_column_for_each_stage():
     bench, sheet = PerceptionBench(WeakDetector(), [ABSENT], REGIONS, UP), PerceptionSheet(4, rows=2)
     for frame in frames(4):
@@ -121,7 +132,7 @@ def test_the_command_prints_its_figures(arguments, tmp_path, capsys):
     assert main([*arguments, "--json", "--task", "Find the mug=mug", "--pictures", str(tmp_path / "sheets")]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert [task["task"] for task in printed["tasks"]] == ["Find the mug", "Find the dog"]
-    assert set(printed["tasks"][0]["stages"]) == {"detected", "related", "confirmed", "tracked"}
+    assert set(printed["tasks"][0]["stages"]) == {"detected", "related", "confirmed", "tracked", "completed"}
     assert len(list((tmp_path / "sheets").iterdir())) == 2
     assert main(arguments) == 0
     printed_tables = capsys.readouterr().out

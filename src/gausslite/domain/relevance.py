@@ -37,11 +37,12 @@ class RelevanceMap:
     """Relevance of one frame.
 
     pixel_weights: the paper's w(u, v), in [0, 1]. target: for each pixel, the index of its target in TaskGraph.targets,
-    -1 for none.
+    -1 for none. known_objects: how many objects of the task were known when this was estimated.
     """
 
     pixel_weights: Float32[ndarray, "h w"]
     target: Int16[ndarray, "h w"]
+    known_objects: int = 0
 
     def __post_init__(self) -> None:
         require_array("relevance pixel_weights", self.pixel_weights, (None, None), np.float32)
@@ -54,6 +55,11 @@ class RelevanceMap:
             np.zeros((height_px, width_px), np.float32),
             np.full((height_px, width_px), NO_TARGET, np.int16),
         )
+
+    def without(self, pixels: Bool[ndarray, "h w"]) -> RelevanceMap:
+        """Return the map without the relevance of these pixels."""
+        target = np.where(pixels, np.int16(NO_TARGET), self.target)
+        return RelevanceMap(np.where(pixels, np.float32(0), self.pixel_weights), target, self.known_objects)
 
     @property
     def roi(self) -> Bool[ndarray, "h w"]:

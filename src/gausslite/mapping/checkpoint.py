@@ -14,7 +14,7 @@ from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, add_prefix, get_array, get_floats, int_array, select_prefix
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.domain.trajectory import Twist
 
 _LOW_64_BITS = (1 << 64) - 1
@@ -63,8 +63,12 @@ def _motion_from_state(state: State) -> CameraMotion | None:
 
 
 def relevance_state(relevance: RelevanceMap) -> dict[str, NDArray[Any]]:
-    """Return the pixel weights and targets of a relevance map as named arrays."""
-    return {"pixel_weights": relevance.pixel_weights, "target": relevance.target}
+    """Return a relevance map as named arrays."""
+    return {
+        "pixel_weights": relevance.pixel_weights,
+        "target": relevance.target,
+        "known_objects": int_array(relevance.known_objects),
+    }
 
 
 def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
@@ -72,7 +76,8 @@ def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
     pixel_weights = get_array(state, "pixel_weights", frame.depth_m.shape, np.float32).copy()
     if not ((pixel_weights >= 0) & (pixel_weights <= 1)).all():
         raise MapFileError("state pixel_weights: expected values in [0, 1], got others")
-    return RelevanceMap(pixel_weights, get_array(state, "target", frame.depth_m.shape, np.int16).copy())
+    (known_objects,) = get_counts(state, "known_objects", 1)
+    return RelevanceMap(pixel_weights, get_array(state, "target", frame.depth_m.shape, np.int16).copy(), known_objects)
 
 
 def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:

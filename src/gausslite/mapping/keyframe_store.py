@@ -97,6 +97,19 @@ class KeyframeStore:
         newest_first = (*(view.keyframe for view in reversed(self.window)), *reversed(self._buffer))
         return next((keyframe for keyframe in newest_first if not keyframe.evaluated), None)
 
+    def next_incomplete(self, known_objects: int) -> Keyframe | None:
+        """The newest evaluated keyframe whose relevance was estimated with fewer known objects, or None."""
+        newest_first = (*(view.keyframe for view in reversed(self.window)), *reversed(self._buffer))
+        return next((k for k in newest_first if k.evaluated and k.relevance.known_objects < known_objects), None)
+
+    def replace_keyframe(self, keyframe: Keyframe) -> None:
+        """Replace a keyframe by a version whose relevance has the same pixels."""
+        self._recent, self._long_term = (
+            [replace(view, keyframe=keyframe) if is_same_frame(view.keyframe, keyframe) else view for view in views]
+            for views in (self._recent, self._long_term)
+        )
+        self._buffer = [keyframe if is_same_frame(old, keyframe) else old for old in self._buffer]
+
     def set_evaluated(self, keyframe: Keyframe, prepare: PrepareView) -> None:
         """Replace a keyframe by its evaluated version; one that shows the ROI joins the window again."""
         self._buffer = [keyframe if is_same_frame(old, keyframe) else old for old in self._buffer]

@@ -27,7 +27,7 @@ from gausslite.mapping.pose_history import PoseHistory
 from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import CountedScheduler, SkippableStage, Stage, StageScheduler
-from gausslite.mapping.task_change import clear_roi, update_roi_evidence
+from gausslite.mapping.task_change import add_roi_evidence, clear_roi, update_roi_evidence
 from gausslite.mapping.team_voxels import InsertedVoxels, insert_team_voxels
 from gausslite.mapping.training import Trainer
 from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
@@ -177,6 +177,26 @@ class GaussianMapper:
         if not relevance.roi.any():
             return 0
         seeds = self._seeder.seed_roi(frame, relevance, table.means_m[table.active])
+        return self._insert(Seeds(seeds, Gaussians.empty()))
+
+    def next_incomplete(self, known_objects: int) -> Keyframe | None:
+        """The newest keyframe whose relevance was estimated with fewer known objects, or None."""
+        return self._keyframes.next_incomplete(known_objects)
+
+    def complete_keyframe(self, keyframe: Keyframe, relevance: RelevanceMap) -> int:
+        """Apply the relevance of a keyframe with objects that became known since; return the number of seeds.
+
+        Gaussians that it shows on the added pixels become active, unless as many completed keyframes show them outside.
+        """
+        require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
+        completed = replace(keyframe, relevance=relevance)
+        added = relevance.without(keyframe.relevance.roi)
+        if not added.roi.any():
+            self._keyframes.replace_keyframe(completed)
+            return 0
+        self._keyframes.set_evaluated(completed, self._window_view)
+        add_roi_evidence(self._table, keyframe.frame, relevance, added)
+        seeds = self._seeder.seed_roi(keyframe.frame, added, self._table.means_m[self._table.active])
         return self._insert(Seeds(seeds, Gaussians.empty()))
 
     def insert_team_voxels(self, received: VoxelBatch, grid: VoxelGrid) -> InsertedVoxels:

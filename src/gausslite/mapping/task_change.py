@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
@@ -21,7 +23,10 @@ _MAX_EVIDENCE = 100
 
 @dataclass(frozen=True, slots=True)
 class TaskChangeSettings:
-    """keyframes_per_frame: maximum number of earlier keyframes to re-evaluate with each frame after a task change."""
+    """keyframes_per_frame: maximum number of earlier keyframes to evaluate again with each frame.
+
+    They are evaluated after a task change, and when an object becomes known.
+    """
 
     keyframes_per_frame: int = 3
 
@@ -34,10 +39,14 @@ class TaskChangeSettings:
 
 @dataclass(frozen=True, slots=True)
 class Reevaluation:
-    """Keyframes re-evaluated for a new task while one frame was mapped, and Gaussians seeded from them."""
+    """Earlier keyframes that were evaluated while one frame was mapped, and Gaussians seeded from them.
+
+    keyframes: evaluated for a new task, with a detection. completed: objects that became known since were added.
+    """
 
     keyframes: int = 0
     seeded: int = 0
+    completed: int = 0
 
 
 def clear_roi(table: SplatTable) -> None:
@@ -50,6 +59,27 @@ def clear_roi(table: SplatTable) -> None:
 def update_roi_evidence(table: SplatTable, frame: Frame, relevance: RelevanceMap) -> None:
     """Count one view's evidence for each visible Gaussian; active are those with more views inside than outside."""
     visible, rows, columns = visible_means(frame, table.means_m)
+    _count_evidence(table, relevance, visible, rows, columns)
+
+
+def add_roi_evidence(table: SplatTable, frame: Frame, relevance: RelevanceMap, added: RelevanceMap) -> None:
+    """Count the evidence of a view for pixels that were added to its relevance.
+
+    Gaussians elsewhere keep their state, unless an earlier addition made them active: then the view counts against it.
+    """
+    visible, rows, columns = visible_means(frame, table.means_m)
+    is_outside = ~relevance.roi[rows, columns] & (table.roi_evidence[visible] > 0)
+    counted = added.roi[rows, columns] | is_outside
+    _count_evidence(table, relevance, visible[counted], rows[counted], columns[counted])
+
+
+def _count_evidence(
+    table: SplatTable,
+    relevance: RelevanceMap,
+    visible: Int64[ndarray, " n"],
+    rows: Int64[ndarray, " n"],
+    columns: Int64[ndarray, " n"],
+) -> None:
     inside = relevance.roi[rows, columns]
     evidence = table.roi_evidence[visible] + np.where(inside, 1, -1)
     evidence = np.clip(evidence, -_MAX_EVIDENCE, _MAX_EVIDENCE)

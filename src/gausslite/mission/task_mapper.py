@@ -231,12 +231,13 @@ class TaskMapper:
         return delayed.lag_frames
 
     def _reevaluate_keyframes(self) -> Reevaluation:
-        """Evaluate earlier keyframes for a new task: one per frame, more if there is time, up to a fixed number."""
+        """Evaluate earlier keyframes for a new task, then complete them with the objects that became known since.
+
+        One per frame, more if there is time, up to a fixed number.
+        """
         keyframes = seeded = 0
         while (keyframe := self._mapper.next_unevaluated) is not None:
-            if keyframes == self._mapper.settings.task_change.keyframes_per_frame:
-                break
-            if keyframes > 0 and not self._scheduler.has_time_for(Stage.REEVALUATION):
+            if not self._may_evaluate(keyframes):
                 break
             with self._scheduler.timing(Stage.REEVALUATION):
                 relevance = self._evaluate_past(keyframe)
@@ -244,7 +245,22 @@ class TaskMapper:
                     break
                 seeded += self._mapper.evaluate_keyframe(keyframe, relevance)
                 keyframes += 1
-        return Reevaluation(keyframes, seeded)
+        completed = 0
+        while self._may_evaluate(keyframes + completed):
+            keyframe = self._mapper.next_incomplete(self._estimator.known_objects)
+            if keyframe is None:
+                break
+            with self._scheduler.timing(Stage.REEVALUATION):
+                relevance = self._estimator.complete(keyframe.as_recorded, keyframe.relevance)
+                seeded += self._mapper.complete_keyframe(keyframe, relevance)
+                completed += 1
+        return Reevaluation(keyframes, seeded, completed)
+
+    def _may_evaluate(self, keyframes: int) -> bool:
+        """Return True if one more earlier keyframe may be evaluated with this frame."""
+        if keyframes == self._mapper.settings.task_change.keyframes_per_frame:
+            return False
+        return keyframes == 0 or self._scheduler.has_time_for(Stage.REEVALUATION)
 
     def _evaluate_past(self, keyframe: Keyframe) -> RelevanceMap | None:
         """Return the relevance of an earlier keyframe. If that fails, the keyframe is not tried again."""

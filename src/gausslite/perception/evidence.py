@@ -31,17 +31,19 @@ class EvidenceSettings:
 
     Of the frames that should show it, at least min_seen_fraction must have detected it. Its scores must sum to
     at least 1 / max_rival_ratio of those of any different thing detected in its place: the nearest class of a detector
-    is not always the class of the object.
+    is not always the class of the object. After min_seen_known detections, earlier frames get its mask too.
     """
 
     min_seen: int = 2
+    min_seen_known: int = 3
     confident_score: float = 0.6
     min_seen_fraction: float = 0.25
     max_rival_ratio: float = 1.3
 
     def __post_init__(self) -> None:
-        if self.min_seen < 1:
-            raise InvalidInputError(f"evidence min_seen: expected at least 1, got {self.min_seen}")
+        for name in ("min_seen", "min_seen_known"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"evidence {name}: expected at least 1, got {getattr(self, name)}")
         for name in ("confident_score", "min_seen_fraction"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidInputError(f"evidence {name}: expected 0 to 1, got {getattr(self, name)}")
@@ -73,6 +75,10 @@ class EvidenceSettings:
         min_seen = _RELIABLE_FACTOR * self.min_seen
         has_evidence = landmark.seen_count >= min_seen or landmark.best_score >= self.confident_score
         return has_evidence and self.is_confirmed(landmark)
+
+    def is_known(self, landmark: Landmark) -> bool:
+        """Return True if the landmark is confirmed and detected so often that earlier frames get its mask."""
+        return landmark.seen_count >= self.min_seen_known and self.is_confirmed(landmark)
 
     def is_present(self, landmark: Landmark) -> bool:
         """Return True if the latest frame with detections found the landmark, or few frames missed a reliable one."""

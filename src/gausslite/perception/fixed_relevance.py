@@ -44,6 +44,16 @@ class RegionRelevanceEstimator:
         return self.estimate(frame).relevance
 
     @property
+    def known_objects(self) -> int:
+        """Always 0: nothing becomes known during a mission."""
+        return 0
+
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        """Return the relevance."""
+        del frame
+        return relevance
+
+    @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """Empty: there is no object map."""
         return ()
@@ -78,6 +88,16 @@ class NoTaskEstimator:
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """Return the relevance as `estimate` does."""
         return self.estimate(frame).relevance
+
+    @property
+    def known_objects(self) -> int:
+        """Always 0: nothing becomes known during a mission."""
+        return 0
+
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        """Return the relevance."""
+        del frame
+        return relevance
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:

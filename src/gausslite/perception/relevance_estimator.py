@@ -54,6 +54,15 @@ class RelevanceEstimator(Protocol):
         ...
 
     @property
+    def known_objects(self) -> int:
+        """The number of the task's objects that relevance maps include from now on."""
+        ...
+
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        """Return an earlier frame's relevance with the objects that became known since, without a detection."""
+        ...
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Messages for the operator about the frames so far, one line each."""
         ...
@@ -124,6 +133,15 @@ class TaskRelevanceEstimator:
         """Return the relevance of an earlier frame after a detection on it."""
         return self._tracker.integrate(frame, frame.depth_m, self._detector.detect(frame, self._graph.queries))
 
+    @property
+    def known_objects(self) -> int:
+        """The number of targets that were detected often enough so far."""
+        return self._tracker.known_objects
+
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        """Return an earlier frame's relevance with the objects that became known since."""
+        return self._tracker.complete(frame, relevance)
+
     def state(self) -> State:
         """Return the tracker's state as named arrays."""
         return self._tracker.state()
@@ -177,6 +195,15 @@ class AsyncRelevanceEstimator:
     def nouns(self) -> tuple[NounReport, ...]:
         """What the detector searches for each noun of the task, and what it has detected."""
         return tuple(self._tracker.report(match) for match in self._detector.matches(self._graph.queries))
+
+    @property
+    def known_objects(self) -> int:
+        """The number of targets that were detected often enough so far."""
+        return self._tracker.known_objects
+
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        """Return an earlier frame's relevance with the objects that became known since."""
+        return self._tracker.complete(frame, relevance)
 
     def state(self) -> State:
         """Return the tracker's state as named arrays, without running detections."""

@@ -36,6 +36,8 @@ from gausslite.perception.spatial import SpatialFilter, lift_observation
 
 # a detection with a smaller share of its pixels outside excluded objects shows one of them
 _MIN_SHARE_LEFT = 0.3
+# a frame whose relevance has this share of an object's surface shows the object
+_MIN_SHOWN_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,12 @@ class RelevanceTracker:
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
         self._needs_observation = False
+        self._known_targets: list[int] = []
+
+    @property
+    def known_objects(self) -> int:
+        """The number of targets that were detected often enough so far."""
+        return len(self._known_targets)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -116,6 +124,7 @@ class RelevanceTracker:
         state: dict[str, NDArray[Any]] = {
             "T_world_keyframe": pose,
             "keyframe_age": int_array(self._frames_since, self._needs_observation),
+            "known_targets": int_array(*self._known_targets),
         }
         state["count"] = int_array(len(self.landmarks))
         for i, landmark in enumerate(self.landmarks):
@@ -135,6 +144,7 @@ class RelevanceTracker:
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
         self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
         self._needs_observation = needs_observation > 0
+        self._known_targets = list(get_counts(state, "known_targets", len(state.get("known_targets", ()))))
 
     def update_keyframe(self, frame: Frame) -> bool:
         """Return whether this frame needs a detection, and make it the keyframe if so.
@@ -166,18 +176,43 @@ class RelevanceTracker:
         """Return the relevance of a frame without detections: the surfaces of the targets, wherever it shows them."""
         return self._relevance(frame, [])
 
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        """Return an earlier frame's relevance with the targets that became known since, where it does not show them."""
+        new = self._known_targets[relevance.known_objects :]
+        masks = [
+            (name, surface_mask(landmark.votes, frame))
+            for landmark, name in self._filter.targets(self._viewpoint(frame))
+            if landmark.number in new
+        ]
+        missed = [
+            (name, mask)
+            for name, mask in masks
+            if np.count_nonzero(mask & relevance.roi) < _MIN_SHOWN_SHARE * np.count_nonzero(mask)
+        ]
+        added = merge_masks(missed, self._graph.targets, frame)
+        is_new = added.roi & ~relevance.roi
+        return RelevanceMap(
+            np.where(is_new, added.pixel_weights, relevance.pixel_weights),
+            np.where(is_new, added.target, relevance.target),
+            self.known_objects,
+        )
+
+    def _viewpoint(self, frame: Frame) -> Float64[ndarray, "4 4"]:
+        return frame.T_world_camera if self._T_world_keyframe is None else self._T_world_keyframe
+
     def _relevance(self, frame: Frame, detected: Sequence[tuple[Landmark, Bool[ndarray, "h w"]]]) -> RelevanceMap:
         """Return the masks of all targets. A detected mask adds pixels that no other frame shows outside its object."""
-        viewpoint = frame.T_world_camera if self._T_world_keyframe is None else self._T_world_keyframe
         masks = []
-        for landmark, name in self._filter.targets(viewpoint):
+        for landmark, name in self._filter.targets(self._viewpoint(frame)):
+            if landmark.number not in self._known_targets and self._settings.evidence.is_known(landmark):
+                self._known_targets.append(landmark.number)
             own = [mask for owner, mask in detected if owner is landmark]
             if own:
                 mask = refined_mask(np.logical_or.reduce(own), landmark.votes, frame)
             else:
                 mask = self._resegmented(surface_mask(landmark.votes, frame), frame)
             masks.append((name, mask))
-        return merge_masks(masks, self._graph.targets, frame)
+        return replace(merge_masks(masks, self._graph.targets, frame), known_objects=self.known_objects)
 
     def _resegmented(self, mask: Bool[ndarray, "h w"], frame: Frame) -> Bool[ndarray, "h w"]:
         """Return the segmenter's mask for the box of a mask; the mask itself if it finds nothing."""

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.relevance import Detection
 from gausslite.evaluation.pictures import arrange_grid, dim_outside, labelled_image, outline_roi
-from gausslite_bench.perception.stage_scores import FrameMasks, PerceptionStage
+from gausslite_bench.perception.stage_scores import FrameMasks
 
 _BOX_RGB = (80, 220, 255)
 
@@ -45,7 +45,7 @@ def row_of(masks: FrameMasks) -> list[UInt8[ndarray, "H W 3"]]:
     rgb = masks.frame.rgb
     with_boxes = _draw_boxes(outline_roi(rgb, masks.truth), masks.detections)
     row = [labelled_image(with_boxes, f"frame {masks.frame.index}: boxes, truth")]
-    return row + [labelled_image(dim_outside(rgb, masks.masks[stage]), str(stage)) for stage in PerceptionStage]
+    return row + [labelled_image(dim_outside(rgb, masks.masks[stage]), str(stage)) for stage in masks.masks]
 
 
 def _draw_boxes(image: UInt8[ndarray, "h w 3"], detections: Sequence[Detection]) -> UInt8[ndarray, "h w 3"]:

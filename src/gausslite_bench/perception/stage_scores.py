@@ -22,6 +22,7 @@ from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings, merge_detections
+from gausslite_bench.perception.past_frames import PastFrames
 
 _MIN_FOUND_SHARE = 0.25
 
@@ -31,13 +32,15 @@ class PerceptionStage(StrEnum):
 
     detected: the detector's masks. related: objects whose masks are limited to the foreground in depth, merged with the
     object's measured surface and filtered by the task's relations. confirmed: objects with sufficient evidence. These
-    three run the detector on every frame. tracked: as in a mission, with detection on keyframes only.
+    three run the detector on every frame. tracked: as in a mission, with detection on keyframes only. completed: the
+    same, and the frames before an object was known get its mask when it becomes known.
     """
 
     DETECTED = "detected"
     RELATED = "related"
     CONFIRMED = "confirmed"
     TRACKED = "tracked"
+    COMPLETED = "completed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,7 @@ class TaskQuery:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMasks:
-    """One frame and task: the detections, the mask of each stage, and the ground-truth mask."""
+    """One frame and task: the detections, the mask of each stage but the last, and the ground-truth mask."""
 
     query: TaskQuery
     frame: Frame
@@ -86,8 +89,8 @@ class ObjectScore:
     """Scores of one object of a task.
 
     shown_frames: frames that show at least MIN_ROI_PIXELS of it. detected_share: share of them in which the detector
-    marks a quarter of its pixels. recall: by stage, marked share of its pixels from its first detection on; None if it
-    is never detected.
+    marks a quarter of its pixels. recall: by stage, marked share of its pixels from its first detection on, or for the
+    stage `completed` in all these frames; None if it is never detected.
     """
 
     name: str
@@ -156,6 +159,7 @@ class _TaskEvaluation:
             stage: TaskRelevanceEstimator(query.graph, self._detector, tracker_settings, segmenter)
             for stage, tracker_settings in settings.items()
         }
+        self._past_frames = PastFrames(self._estimators[PerceptionStage.TRACKED])
         self._first_shown: dict[str, int] = {}
         self._shown_frames = self._frames = 0
         self._counters = {stage: _StageCounter() for stage in PerceptionStage}
@@ -168,7 +172,8 @@ class _TaskEvaluation:
         ]
         nouns = [noun_of(target) for target in graph.targets]
         masks = {PerceptionStage.DETECTED: merge_detections(detections, nouns, frame).roi}
-        masks |= {stage: estimator.estimate(frame).relevance.roi for stage, estimator in self._estimators.items()}
+        relevance = {stage: estimator.estimate(frame).relevance for stage, estimator in self._estimators.items()}
+        masks |= {stage: each.roi for stage, each in relevance.items()}
         has_depth = frame.depth_m > 0
         objects = {name: truths[name] & has_depth for name in self._query.objects}
         truth = np.zeros(has_depth.shape, np.bool_)
@@ -181,22 +186,34 @@ class _TaskEvaluation:
             self._counters[stage].add(self._frames, mask, has_depth, truth, objects)
         for name, pixels in objects.items():
             self._object_counters[name].add(masks, pixels)
+        self._past_frames.add(frame, relevance[PerceptionStage.TRACKED], objects)
         self._frames += 1
         return FrameMasks(self._query, frame, detections, masks, truth)
 
     def score(self) -> TaskScore:
+        """Return the scores; to be called once, after the last frame."""
+        self._count_completed()
         stages = {stage: counter.score(self._frames, self._first_shown) for stage, counter in self._counters.items()}
         query = self._query
         counts = self._frames, self._shown_frames, len(self._first_shown)
         object_scores = tuple(counter.score(name) for name, counter in self._object_counters.items())
         return TaskScore(query.graph.text, query.objects, *counts, stages, object_scores)
 
+    def _count_completed(self) -> None:
+        """Count the masks of the stage `completed`, which are final after the last frame only."""
+        stage = PerceptionStage.COMPLETED
+        for number, (frame, mask, objects) in enumerate(self._past_frames.masks()):
+            truth = np.logical_or.reduce([np.zeros(mask.shape, np.bool_), *objects.values()])
+            self._counters[stage].add(number, mask, frame.depth_m > 0, truth, objects)
+            for name, pixels in objects.items():
+                self._object_counters[name].add_completed(mask, pixels)
+
 
 class _ObjectCounter:
     """Counts of one object: its pixels from the first detection on, and those that each stage marks."""
 
     def __init__(self) -> None:
-        self._shown_frames = self._detected_frames = self._pixels = 0
+        self._shown_frames = self._detected_frames = self._pixels = self._shown_pixels = 0
         self._marked = dict.fromkeys(PerceptionStage, 0)
 
     def add(self, masks: Mapping[PerceptionStage, Bool[ndarray, "h w"]], pixels: Bool[ndarray, "h w"]) -> None:
@@ -211,9 +228,16 @@ class _ObjectCounter:
             for stage, count in marked.items():
                 self._marked[stage] += count
 
+    def add_completed(self, mask: Bool[ndarray, "h w"], pixels: Bool[ndarray, "h w"]) -> None:
+        size = int(np.count_nonzero(pixels))
+        if size >= MIN_ROI_PIXELS:
+            self._shown_pixels += size
+            self._marked[PerceptionStage.COMPLETED] += int(np.count_nonzero(mask & pixels))
+
     def score(self, name: str) -> ObjectScore:
         detected_share = self._detected_frames / max(1, self._shown_frames)
-        recall = {stage: count / self._pixels if self._pixels else None for stage, count in self._marked.items()}
+        totals = dict.fromkeys(PerceptionStage, self._pixels) | {PerceptionStage.COMPLETED: self._shown_pixels}
+        recall = {stage: self._marked[stage] / totals[stage] if self._pixels else None for stage in PerceptionStage}
         return ObjectScore(name, self._shown_frames, detected_share, recall)
 
 

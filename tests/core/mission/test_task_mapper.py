@@ -98,6 +98,7 @@ class SlowEstimator:
     """An estimator that takes ten seconds per frame, on a clock that nothing else advances."""
 
     notes = ()
+    known_objects = 0
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -111,6 +112,9 @@ class SlowEstimator:
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         return self.estimate(frame).relevance
+
+    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
+        return relevance
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
