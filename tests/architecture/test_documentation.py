@@ -20,7 +20,7 @@ PROGRAMS = {
     "gausslite-parser": "gausslite_parser",
 }
 SUB_COMMANDS = (
-    *("map", "demo", "parse", "eval", "calibrate", "fuse", "export", "view"),
+    *("map", "demo", "parse", "eval", "calibrate", "fuse", "export", "report", "view"),
     *("status", "end", "refine", "fetch", "evict", "unban", "objects"),
 )
 BENCHMARKS = (
@@ -123,6 +123,7 @@ def known_flags() -> set[str]:
 def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
     others = {"--check", "--editable", "--no-index", "--build", "--python", "--masks"}  # of pip, docker and our tools
     others |= {"--platform", "--output-dir", "--site-dir", "--dist"}  # of cibuildwheel, mkdocs and pytest-xdist
+    others |= {"--break-system-packages", "--rm", "--once"}  # of pip, docker and ros2
     unknown = []
     for page in pages():
         text = page.read_text()

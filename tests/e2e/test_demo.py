@@ -63,6 +63,9 @@ def test_the_demo_maps_fuses_scores_and_ends_its_processes(tmp_path: Path) -> No
     both = sum(len(read_ply(out / agent / "map.ply")) for agent in report["agents"])
     assert sizes["vote"] < sizes["concatenation"] == both
     assert list((out / "pictures").glob("*.png"))
+    assert f"{out / 'report.html'} shows them" in done.stdout
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert all(f"<th>{name}</th>" in page for name in report["maps"])
     assert not _children_named(str(out))
     assert "max-gaussians = 5000\n" in (out / "agent-a" / "config.toml").read_text()
 

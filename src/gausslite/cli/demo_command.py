@@ -42,6 +42,8 @@ from gausslite.mission.build import open_models
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import prepare_folder, require_writable, write_json
 from gausslite.process.messages import print_message
+from gausslite.report.page import PAGE, write_page
+from gausslite.report.run_results import read_results
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -67,7 +69,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_detector(parser)
     add_policy(parser, allow_auto=True)
     add_budget(parser)
-    add("--out", metavar="DIR", type=Path, required=True, help="folder for report.json, maps and pictures")
+    add("--out", metavar="DIR", type=Path, required=True, help="folder for report.html, report.json, maps and pictures")
     add_switch(parser, "--overwrite", "replace the results of an earlier demo in --out")
     add(
         "--world-frame",
@@ -107,7 +109,8 @@ def run(options: argparse.Namespace) -> int:
     write_json(options.out / "report.json", report)
     _write_pictures(options.out / "pictures", result)
     print(report_tables(agents, result.scores, scenario.fit_views))
-    print(f"report, maps and pictures are in {options.out}")
+    write_page(options.out / PAGE, read_results([options.out]))
+    print(f"maps and pictures are in {options.out}; {options.out / PAGE} shows them")
     return 0
 
 

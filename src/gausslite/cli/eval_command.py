@@ -41,6 +41,7 @@ from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, view_map
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import (
+    EVALUATION,
     MAP_TO_ODOM,
     TRAJECTORY,
     as_text,
@@ -48,6 +49,7 @@ from gausslite.mission.results import (
     read_corrections,
     read_report,
     read_trajectory,
+    write_evaluation,
 )
 from gausslite.mission.settings import PoseMode
 from gausslite.process.messages import print_message
@@ -83,6 +85,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"{TRAJECTORY} next to MAP, for tracked maps (default: {_POSES_DEFAULT})",
     )
     parser.add_argument("--pictures", metavar="DIR", type=Path, help="write side-by-side pictures of a few views")
+    add_switch(parser, "--save-scores", f"write the scores to {EVALUATION} next to MAP, for `gausslite report`")
     add_threads(parser)
     add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run)
@@ -107,10 +110,12 @@ def run(options: argparse.Namespace) -> int:
             f"{options.source}: expected at least one frame with depth, got none"
         )
     result = average(scores)
+    extra = {} if corrected is None else corrected.summary()
+    figures = {**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count, **extra}
+    if options.save_scores:
+        write_evaluation(options.map.absolute().parent, figures)
     if options.json:
-        extra = {} if corrected is None else corrected.summary()
-        figures = {**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count}
-        print(as_text({**figures, **extra}))
+        print(as_text(figures))
     else:
         fitted = ", pose and exposure of each view fitted" if conditions.fit_views else ""
         skipped = f" (skipped: {frames.corrupt.count} corrupt)" if frames.corrupt.count else ""

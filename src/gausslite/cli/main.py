@@ -22,6 +22,7 @@ _COMMANDS = {
     "calibrate": "estimate the camera of a recording: depth registration, lens, rolling shutter, times, pose errors",
     "fuse": "fuse map files into one by a vote in every voxel",
     "export": "write a map for other tools: splat viewers, point clouds, planners, meshes",
+    "report": "show the results of one or several runs on one HTML page: pictures, plots and tables",
     "view": "show a map, a run, an agent or a fusion server on a page in the browser",
     "status": "print the state of a running agent or fusion server",
     "end": "end the mission of a running agent: send what waits, hand over, save",

@@ -16,6 +16,7 @@ from gausslite.cli.trajectory_report import tracking_text, trajectory_report
 from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
 from gausslite.codec.object_report import noun_as_json, object_as_json
 from gausslite.codec.png import write_png
+from gausslite.codec.view_images import ViewImage, write_view_images
 from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
@@ -29,7 +30,7 @@ from gausslite.domain.region import Region
 from gausslite.domain.state import State, encode_text
 from gausslite.domain.task import TaskGraph
 from gausslite.evaluation.preview import render_preview
-from gausslite.evaluation.views import view_map
+from gausslite.evaluation.views import largest_roi_per_segment, view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.frame_stream import CorruptFrames
@@ -47,11 +48,13 @@ from gausslite.mission.runner import MissionResult, MissionRunner
 from gausslite.mission.settings import PoseMode, SceneInfo
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.mission.task_schedule import ScheduledTaskMapper
+from gausslite.mission.timeline import Timeline
 from gausslite.process.interrupts import DeferredInterrupt
 from gausslite.process.messages import print_message
 from gausslite.view.mission_view import mission_view
 
 _NOT_RESUMED = -1
+_VIEW_IMAGES = 4
 _WORLD_FRAME_HELP = (
     "name of the poses' frame, for `fuse`, which accepts only maps of one frame (default: the sequence folder's name "
     "or the simulated home)"
@@ -84,7 +87,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         type=Path,
         required=True,
-        help="folder for map.ply, report.json, keyframes.json and preview.png",
+        help="folder for map.ply, report.json, frames.csv, keyframes.json, views and preview.png",
     )
     add_switch(group, "--overwrite", "replace a map in --out (--resume does so without this option)")
     add("--world-frame", metavar="NAME", help=_WORLD_FRAME_HELP)
@@ -137,6 +140,7 @@ class _Run:
         self._inputs = inputs
         self._mapper = mapper
         self._corrupt = CorruptFrames(print_above_bar)
+        self._timeline = Timeline()
         self._gaussians = Gaussians.empty()
         self._report: dict[str, object] = {}
         self._notes: tuple[str, ...] = ()
@@ -151,6 +155,7 @@ class _Run:
 
             def report(outcome: FrameOutcome) -> None:
                 bar.count(outcome)
+                self._timeline.add(outcome)
                 draw(outcome)
 
             checkpoint = None if options.save_state is None else self._save
@@ -163,7 +168,7 @@ class _Run:
         return result
 
     def write_results(self, result: MissionResult) -> None:
-        """Write map.ply, report.json, keyframes.json, poses and preview.png. Raises StorageError."""
+        """Write map.ply, report.json, frames.csv, poses, the keyframes and preview.png. Raises StorageError."""
         options, mission = self._options, self._inputs.mission
         self._notes = (*self._mapper.notes, *_unseen_notes(options, result))
         self._report = {
@@ -183,8 +188,13 @@ class _Run:
         prepare_folder(options.out)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
         write_poses(options.out, self._mapper.poses)
+        self._timeline.write(options.out)
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
-        write_keyframe_views(options.out, [_view(frame, roi) for frame, roi in keyframes])
+        views = [_view(frame, roi) for frame, roi in keyframes]
+        write_keyframe_views(options.out, views)
+        chosen = sorted(largest_roi_per_segment([view.roi_pixels for view in views], _VIEW_IMAGES))
+        photographs = [ViewImage(frame.index, frame.rgb, roi) for frame, roi in (keyframes[i] for i in chosen)]
+        write_view_images(options.out, photographs)
         if keyframes:
             viewer = view_map(self._gaussians, mission.backend, mission.threads)
             write_png(options.out / PREVIEW, render_preview(viewer, keyframes))

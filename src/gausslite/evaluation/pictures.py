@@ -20,7 +20,7 @@ _OUTLINE_RGB = (255, 208, 0)
 _CROP_MARGIN = 0.15
 _SPECK_SHARE = 0.002
 _BRIDGED_SHARE = 0.02
-_DIFFERENCE_GAIN = 3.0
+DIFFERENCE_GAIN = 3.0
 
 
 def comparison_sheet(view: HeldOutView, renderings: Mapping[str, Float32[ndarray, "h w 3"]]) -> UInt8[ndarray, "H W 3"]:
@@ -35,15 +35,15 @@ def comparison_sheet(view: HeldOutView, renderings: Mapping[str, Float32[ndarray
     columns = {"ground truth": truth_rgb} | {name: to_uint8(rendering) for name, rendering in renderings.items()}
     rows = [[labelled_image(outline_roi(image, view.roi), label) for label, image in columns.items()]]
     rows += [
-        [labelled_image(_crop(image, component), f"{label}: detail") for label, image in columns.items()]
-        for component in _components_to_show(view.roi)
+        [labelled_image(crop_component(image, component), f"{label}: detail") for label, image in columns.items()]
+        for component in components_to_show(view.roi)
     ]
     if renderings:
         truth = truth_rgb / np.float32(255.0)
-        differences = [to_uint8(_DIFFERENCE_GAIN * np.abs(rendering - truth)) for rendering in renderings.values()]
+        differences = [to_uint8(DIFFERENCE_GAIN * np.abs(rendering - truth)) for rendering in renderings.values()]
         region = labelled_image(dim_outside(truth_rgb, view.roi), "region of the task")
         cells = [
-            labelled_image(outline_roi(difference, view.roi), f"{name}: difference x{_DIFFERENCE_GAIN:g}")
+            labelled_image(outline_roi(difference, view.roi), f"{name}: difference x{DIFFERENCE_GAIN:g}")
             for name, difference in zip(renderings, differences, strict=True)
         ]
         rows.append([region, *cells])
@@ -56,8 +56,8 @@ def comparison_row(
     """Return one grid row: photograph and rendering with the region outlined, then its largest component in both."""
     pair = ((photograph, label), (to_uint8(rendering), "map"))
     row = [labelled_image(outline_roi(image, roi), name) for image, name in pair]
-    for component in _components_to_show(roi)[:1]:
-        row += [labelled_image(_crop(image, component), f"{name}: detail") for image, name in pair]
+    for component in components_to_show(roi)[:1]:
+        row += [labelled_image(crop_component(image, component), f"{name}: detail") for image, name in pair]
     return row
 
 
@@ -83,7 +83,7 @@ def dim_outside(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UI
     return dimmed
 
 
-def _components_to_show(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
+def components_to_show(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
     """Return masks of the region's largest and smallest connected components.
 
     Both sizes matter: quality on a large object says little about a small one. Small gaps do not split a component.
@@ -100,7 +100,7 @@ def _components_to_show(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]
     return shown[:1] + shown[1:][-1:]
 
 
-def _crop(image: UInt8[ndarray, "h w 3"], component: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
+def crop_component(image: UInt8[ndarray, "h w 3"], component: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
     """Return the component's bounding box plus a margin, in the image's aspect ratio, enlarged to the image's size."""
     import cv2
 

@@ -24,6 +24,7 @@ from gausslite.mapping.pose_history import PoseHistory
 
 _MAP, _REPORT = "map.ply", "report.json"
 PREVIEW = "preview.png"
+EVALUATION = "evaluation.json"
 MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
 
 
@@ -78,7 +79,12 @@ def require_absent(path: Path) -> None:
 
 
 def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, object], world_frame: str = "") -> None:
-    """Write map.ply, with the name of its world frame, and report.json. Raises StorageError."""
+    """Write map.ply, with the name of its world frame, and report.json. Raises StorageError.
+
+    An earlier map's evaluation.json is removed, because its scores are not those of this map.
+    """
+    with contextlib.suppress(OSError):
+        (folder / EVALUATION).unlink()
     write_ply(folder / _MAP, gaussians, world_frame)
     write_json(folder / _REPORT, report)
 
@@ -109,11 +115,17 @@ def read_trajectory(folder: Path) -> Callable[[int], Float64[ndarray, "4 4"]]:
 
 def read_report(folder: Path) -> Mapping[str, object]:
     """Return the content of report.json; empty if there is none or it is not a JSON object."""
-    try:
-        report = json.loads((folder / _REPORT).read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return report if isinstance(report, dict) else {}
+    return _read_json(folder / _REPORT)
+
+
+def read_evaluation(folder: Path) -> Mapping[str, object]:
+    """Return the content of evaluation.json, see `write_evaluation`; empty if there is none or it is not an object."""
+    return _read_json(folder / EVALUATION)
+
+
+def write_evaluation(folder: Path, scores: Mapping[str, object]) -> None:
+    """Write the scores of the folder's map to evaluation.json. Raises StorageError."""
+    write_json(folder / EVALUATION, scores)
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:
@@ -129,6 +141,14 @@ def as_text(report: Mapping[str, object]) -> str:
 def peak_rss_mib() -> float:
     """Return the peak resident memory of this process in MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _read_json(path: Path) -> Mapping[str, object]:
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _rounded(value: object) -> object:

@@ -24,8 +24,16 @@ def test_a_used_folder_is_refused(name: str, tmp_path: Path, capsys: pytest.Capt
     assert line.endswith(f"{name} exists already; choose another --out, or replace it with --overwrite")
 
 
+def test_the_sheets_of_an_earlier_demo_are_removed(tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    for name in ("000-frame-000012.png", "own.png"):
+        (tmp_path / "pictures" / name).write_bytes(b"x")
+    remove_results(tmp_path)
+    assert [path.name for path in (tmp_path / "pictures").iterdir()] == ["own.png"]
+
+
 def test_the_store_of_an_earlier_demo_is_removed(tmp_path: Path) -> None:
-    for name in ("report.json", "vote.ply", "fusion.sqlite", "fusion.sqlite-wal", "notes.txt"):
+    for name in ("report.json", "report.html", "vote.ply", "fusion.sqlite", "fusion.sqlite-wal", "notes.txt"):
         (tmp_path / name).write_bytes(b"x")
     remove_results(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from gausslite.mission.results import require_absent, require_no_map
+from gausslite.report.page import PAGE
 
 STORE = "fusion.sqlite"
 """Name of the fusion server's file; it holds the voxels of all agents."""
 _REPORT = "report.json"
+_SHEETS = "pictures/[0-9][0-9][0-9]-frame-*.png"
 _FUSED_MAPS = ("concatenation.ply", "vote.ply", "refine.ply")
 _AGENTS = ("agent-a", "agent-b")
 
@@ -22,6 +24,8 @@ def require_no_demo(out: Path) -> None:
 
 
 def remove_results(out: Path) -> None:
-    """Remove the report, the fused maps and the fusion server's store of an earlier demo."""
-    for name in (_REPORT, *_FUSED_MAPS, STORE, f"{STORE}-wal", f"{STORE}-shm"):
+    """Remove the report, its page and pictures, the fused maps and the fusion server's store of an earlier demo."""
+    for name in (_REPORT, PAGE, *_FUSED_MAPS, STORE, f"{STORE}-wal", f"{STORE}-shm"):
         (out / name).unlink(missing_ok=True)
+    for sheet in out.glob(_SHEETS):
+        sheet.unlink()

@@ -1,0 +1,55 @@
+"""Record every frame of a mission as a row of frames.csv: time, iterations, Gaussians and share of the region."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.codec.files import write_atomic
+from gausslite.domain.errors import MapFileError
+from gausslite.mission.task_mapper import FrameOutcome
+
+_FILE = "frames.csv"
+COLUMNS = ("frame", "seconds", "iterations", "gaussians", "roi_share")
+
+
+@dataclass(slots=True)
+class Timeline:
+    """The rows of one run; frames that were skipped have none."""
+
+    _rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, outcome: FrameOutcome) -> None:
+        """Add one frame."""
+        if outcome.skipped is None:
+            seconds = outcome.timing.seconds
+            self._rows.append((outcome.index, seconds, outcome.iterations, outcome.gaussians, outcome.roi_share))
+
+    def write(self, folder: Path) -> None:
+        """Write frames.csv. Raises StorageError."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in self._rows)
+        write_atomic(folder / _FILE, text.getvalue().encode())
+
+
+def read_timeline(folder: Path) -> dict[str, Float64[ndarray, " n"]]:
+    """Return the columns of frames.csv by name; empty if the folder has none. Raises MapFileError."""
+    path = folder / _FILE
+    if not path.exists():
+        return {}
+    try:
+        header, *rows = csv.reader(path.read_text().splitlines())
+        values = np.array(rows, np.float64).reshape(len(rows), len(COLUMNS))
+    except (OSError, ValueError, csv.Error) as error:
+        raise MapFileError(f"{path}: expected the frames of a run, got an unreadable file: {error}") from error
+    if tuple(header) != COLUMNS or not np.isfinite(values).all():
+        raise MapFileError(f"{path}: expected finite columns {','.join(COLUMNS)}, got others")
+    return dict(zip(COLUMNS, values.T, strict=True))

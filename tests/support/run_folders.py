@@ -1,0 +1,60 @@
+"""Results folders of runs, written with the program's own writers, for the tests of reports."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from support.sample_gaussians import plain_gaussians
+
+from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
+from gausslite.codec.ply import write_ply
+from gausslite.codec.view_images import ViewImage, write_view_images
+from gausslite.datasets.pose_file import format_pose_rows
+from gausslite.domain.camera import Camera
+
+WIDTH, HEIGHT = 64, 48
+MUG = {
+    "id": "mug-1",
+    "noun": "mug",
+    "role": "target",
+    "centroid_m": [0.25, 0.5, 1.0],
+    "min_m": [0.2, 0.4, 0.9],
+    "max_m": [0.3, 0.6, 1.1],
+    "confidence": 0.9,
+    "first_seen_ns": 0,
+    "last_seen_ns": 10,
+}
+TASK = {
+    "text": "Pick up the mug on the table",
+    "targets": ["mug"],
+    "anchors": ["table"],
+    "relations": [{"predicate": "on", "target": "mug", "anchor": "table"}],
+}
+
+
+def write_run(folder: Path, world_frame: str = "room", frame: int = 3, **report: Any) -> Path:
+    """Write a run with a wall of Gaussians before its camera, one photograph and a report."""
+    folder.mkdir(parents=True)
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 21), np.linspace(-0.4, 0.4, 17))
+    means_m = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    near = np.abs(means_m[:, 0]) < 0.2
+    write_ply(folder / "map.ply", plain_gaussians(means_m, active=near, kappa=np.where(near, 9, 0)), world_frame)
+    content = {"source": "room", "frames": 4, "hz": 2.5, "seconds": 1.5, "objects": [MUG], "notes": []}
+    (folder / "report.json").write_text(json.dumps({**content, **report}))
+    camera = Camera(60.0, 60.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    write_keyframe_views(folder, [KeyframeView(frame, 0, camera, np.eye(4), 100)])
+    photograph = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    roi = np.zeros((HEIGHT, WIDTH), np.bool_)
+    roi[10:30, 20:40] = True
+    write_view_images(folder, [ViewImage(frame, photograph, roi)])
+    poses = np.repeat(np.eye(4)[None], 3, axis=0)
+    poses[:, 0, 3] = (-0.2, 0.0, 0.2)
+    rows = format_pose_rows("T_map_camera", np.arange(3, dtype=np.int64), poses)
+    (folder / "trajectory.txt").write_text(rows)
+    (folder / "frames.csv").write_text(
+        "frame,seconds,iterations,gaussians,roi_share\n0,0.5,8,100,0.1\n1,0.4,8,357,0.2\n"
+    )
+    return folder
