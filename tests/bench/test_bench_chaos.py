@@ -27,6 +27,7 @@ def test_nothing_acknowledged_is_lost_in_a_short_run(capsys: pytest.CaptureFixtu
     assert result["acknowledged_messages"] >= 8
     assert (result["lost"], result["wrong"], result["extra_at_end"]) == (0, 0, 0)
     assert result["same_map"]
+    assert result["same_watch"]
     assert 0 < result["fused_voxels"] <= result["voxels"]
 
 

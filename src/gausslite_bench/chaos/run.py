@@ -25,14 +25,16 @@ from gausslite.wire.update_streams import UpdateStreams
 from gausslite_bench.chaos.acknowledged import StoreComparison, compare_store, offline_map
 from gausslite_bench.chaos.agent_team import AgentTeam
 from gausslite_bench.chaos.fault_proxy import FaultProxy
+from gausslite_bench.chaos.map_watcher import MapWatcher
 from gausslite_bench.server.running_server import RunningServer
 
 _STORE = "store.sqlite"
 _DAY_S = 86_400.0
 _PROGRESS_MESSAGES_PER_AGENT = 2
 _PROGRESS_S = 120.0
+_WATCH_S = 60.0
 _POLL_S = 0.02
-_MAX_FAULT_S = 1.0
+_MAX_FAULT_S, _MAX_FULL_S = 1.0, 5.0
 _MAX_DELAY_S = 0.15
 _RESENT_MESSAGES = 20
 _DISK_FULL_SHARE, _RESEND_SHARE, _CLOCK_SHARE = 0.15, 0.4, 0.5
@@ -71,14 +73,15 @@ class ChaosResult:
     """Figures of a run.
 
     lost, wrong: sums over the comparisons of the store after each kill of the server, and after the run.
-    same_map: the map that the server exports at the end is the offline one, bit for bit. storage_refusals: lines in the
-    server's log about messages that it could not store; server_errors: unexpected errors there.
+    same_map: the map that the server exports at the end is the offline one, bit for bit. same_watch: a watcher that
+    continued from its last revision after each restart has the same voxels, Σkappa and counts at the end.
+    disk_errors: lines in the server's log about a disk that refuses to write; server_errors: unexpected errors there.
     """
 
     faults: dict[str, int]
     acknowledged_messages: int
     acknowledged_updates: int
-    storage_refusals: int
+    disk_errors: int
     comparisons: int
     voxels: int
     fused_voxels: int
@@ -86,6 +89,7 @@ class ChaosResult:
     wrong: int
     extra_at_end: int
     same_map: bool
+    same_watch: bool
     server_errors: int
     time_s: float
     rss_mib: tuple[float, float]
@@ -93,7 +97,8 @@ class ChaosResult:
     @property
     def is_correct(self) -> bool:
         """True if nothing that was acknowledged is lost or differs."""
-        return not (self.lost or self.wrong or self.extra_at_end or self.server_errors) and self.same_map
+        has_faults = self.lost or self.wrong or self.extra_at_end or self.server_errors
+        return self.same_map and self.same_watch and not has_faults
 
 
 def run_chaos(settings: ChaosSettings, note: Callable[[], object]) -> ChaosResult:
@@ -109,7 +114,9 @@ def run_chaos(settings: ChaosSettings, note: Callable[[], object]) -> ChaosResul
         opened.callback(proxy.close)
         team = AgentTeam(folder, agents, proxy.address)
         opened.callback(team.close)
-        return _ChaosRun(settings, folder, server, proxy, team).run(note)
+        watcher = MapWatcher(server.address)
+        opened.callback(watcher.close)
+        return _ChaosRun(settings, folder, server, proxy, team, watcher).run(note)
 
 
 @dataclass(slots=True)
@@ -121,6 +128,7 @@ class _ChaosRun:
     server: RunningServer
     proxy: FaultProxy
     team: AgentTeam
+    watcher: MapWatcher
     faults: Counter[Fault] = field(default_factory=Counter)
     comparisons: list[StoreComparison] = field(default_factory=list)
     _random: random.Random = field(init=False)
@@ -177,12 +185,18 @@ class _ChaosRun:
         size = max(path.stat().st_size for path in self.folder.glob(f"{_STORE}*"))
         _, hard = resource.prlimit(self.server.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(self.server.pid, resource.RLIMIT_FSIZE, (size + _FREE_BYTES, hard))
-        self._pause()
+        errors, limit_s = self._disk_errors(), time.monotonic() + _MAX_FULL_S
+        while self._disk_errors() == errors and time.monotonic() < limit_s:
+            threading.Event().wait(_POLL_S)
         if self._random.random() < 0.5:
             # otherwise the server is killed while its disk is full, or goes on with the space that it has got again
             self._inject(Fault.SERVER_KILL)
         elif self.server.is_running:
             resource.prlimit(self.server.pid, resource.RLIMIT_FSIZE, (hard, hard))
+
+    def _disk_errors(self) -> int:
+        """Return how often the log reports them; it sums up those of a minute."""
+        return self.server.log.read_text(errors="replace").count("disk I/O error")
 
     def _resend(self) -> None:
         """Send messages of the past again: duplicates, in another order."""
@@ -221,15 +235,15 @@ class _ChaosRun:
         offline = offline_map(self.team.acknowledged)
         with FusionClient(self.server.address, deadline_s=60.0) as client:
             exported = client.export(Export())
+        same_watch = self.watcher.reaches(offline.batch, _WATCH_S)
         rss_mib = self.server.rss_mib()
         self._kill_server()
-        log = self.server.log.read_text(errors="replace")
         parts, last = list(self.team.acknowledged.values()), self.comparisons[-1]
         return ChaosResult(
             {str(fault): self.faults[fault] for fault in Fault},
             sum(each.messages for each in parts),
             sum(each.updates for each in parts),
-            log.count("refused STORAGE"),
+            self._disk_errors(),
             len(self.comparisons),
             last.voxels,
             len(offline.batch),
@@ -237,7 +251,8 @@ class _ChaosRun:
             sum(each.wrong for each in self.comparisons),
             last.extra,
             exported == ply_bytes(offline.gaussians),
-            log.count("Traceback"),
+            same_watch,
+            self.server.log.read_text(errors="replace").count("Traceback"),
             time.monotonic() - begin_s,
             (rss_mib, max(self._peak_mib, rss_mib)),
         )

@@ -47,13 +47,17 @@ def _lines(result: ChaosResult) -> Iterator[str]:
     yield ", ".join(f"{count} {name}" for name, count in result.faults.items())
     yield (
         f"acknowledged: {result.acknowledged_messages} messages with {result.acknowledged_updates} voxel updates; "
-        f"{result.storage_refusals} times a full disk refused messages"
+        f"{result.disk_errors} disk errors in the log"
     )
     yield (
         f"store compared {result.comparisons} times: {result.lost} acknowledged voxels lost, {result.wrong} wrong; at "
         f"the end {result.voxels} voxels of all agents, {result.extra_at_end} not acknowledged"
     )
     same = "bit for bit the offline map" if result.same_map else "NOT the offline map"
-    yield f"fused map of {result.fused_voxels} voxels: {same}; {result.server_errors} unexpected errors of the server"
+    watch = "the same" if result.same_watch else "NOT the same"
+    yield f"fused map of {result.fused_voxels} voxels: {same}; a watcher has {watch}"
     end_mib, peak_mib = result.rss_mib
-    yield f"{result.time_s:.0f} s, server memory {end_mib:.0f} MiB at the end, {peak_mib:.0f} MiB at most"
+    yield (
+        f"{result.time_s:.0f} s; server: memory {end_mib:.0f} MiB at the end, {peak_mib:.0f} MiB at most; "
+        f"{result.server_errors} unexpected errors"
+    )
