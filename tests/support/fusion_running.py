@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import grpc
 import numpy as np
@@ -106,11 +108,13 @@ def fusion_server(
 
 
 @contextmanager
-def server_process(*arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], FusionClient]]:
+def server_process(
+    *arguments: str, log: Path = Path(os.devnull)
+) -> Iterator[tuple[subprocess.Popen[bytes], FusionClient]]:
     """Start a server in another process and wait until it is ready; it is killed at the end."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, log.open("wb") as stderr:
         address = f"unix:{folder}/fusion.sock"
-        process = subprocess.Popen([*COMMAND, "--listen", address, *arguments], stderr=subprocess.DEVNULL)
+        process = subprocess.Popen([*COMMAND, "--listen", address, *arguments], stderr=stderr)
         try:
             options = [("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 200)]
             with grpc.insecure_channel(address, options) as channel:

@@ -35,6 +35,7 @@ from gausslite.wire.tls import Tls
 from gausslite.wire.token_bucket import TokenBucket
 
 _log = logging.getLogger(__name__)
+_LAST_CALLS_S = 1.0
 # the longest path of a unix socket that Linux accepts
 _MAX_SOCKET_PATH_BYTES = 107
 _OPTIONS = (
@@ -73,6 +74,10 @@ class RunningServer:
         await asyncio.gather(*self._watches, return_exceptions=True)
         await self._health.enter_graceful_shutdown()
         await self._server.stop(grace_s)
+        # gRPC prints a traceback for each call that the event loop cancels when it closes
+        calls = asyncio.all_tasks() - {asyncio.current_task()}
+        if calls:
+            await asyncio.wait(calls, timeout=_LAST_CALLS_S)
 
 
 async def start_server(

@@ -31,13 +31,16 @@ def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(tmp_path:
 
 
 def test_sigterm_ends_open_streams_and_the_process_with_code_0(tmp_path: Path) -> None:
-    with server_process("--store", str(tmp_path / "team.sqlite")) as (process, client):
+    log = tmp_path / "log"
+    with server_process("--store", str(tmp_path / "team.sqlite"), log=log) as (process, client):
         watch = client.watch()
         next(watch)
         process.send_signal(signal.SIGTERM)
         with pytest.raises(UnavailableError):
             next(watch)
         assert process.wait(20) == 0
+    assert "Traceback" not in log.read_text()
+    assert log.read_text().rstrip().endswith("ended")
 
 
 def ends_with_one_line(*arguments: str) -> str:
