@@ -29,9 +29,13 @@ class AgentTeam:
     @property
     def messages(self) -> int:
         """Acknowledged messages of all agents until now."""
+        self.read()
+        return sum(each.messages for each in self.acknowledged.values())
+
+    def read(self) -> None:
+        """Take in what all journals have gained."""
         for each in self.acknowledged.values():
             each.read()
-        return sum(each.messages for each in self.acknowledged.values())
 
     def start(self, agent_id: str, seed: int, clock_offset_s: float) -> None:
         """Start an agent on its spool."""
@@ -67,8 +71,7 @@ class AgentTeam:
             if not end.get("drained"):
                 reason = end.get("stopped_because") or f"not everything was acknowledged within {_END_S:.0f} s"
                 raise UnavailableError(f"{agent_id}: expected it to send everything at the end: {reason}")
-        for each in self.acknowledged.values():
-            each.read()
+        self.read()
 
     def close(self) -> None:
         """End the processes that are left."""

@@ -176,7 +176,7 @@ class _ChaosRun:
         self._peak_mib = max(self._peak_mib, self.server.rss_mib())
         self.server.kill()
         # what has been acknowledged by now must be in the store; later acknowledgements were sent before
-        self.team.messages  # noqa: B018
+        self.team.read()
         self.comparisons.append(compare_store(self.team.acknowledged, self.folder / _STORE))
 
     def _fill_disk(self) -> None:
@@ -189,9 +189,9 @@ class _ChaosRun:
         while self._disk_errors() == errors and time.monotonic() < limit_s:
             threading.Event().wait(_POLL_S)
         if self._random.random() < 0.5:
-            # otherwise the server is killed while its disk is full, or goes on with the space that it has got again
             self._inject(Fault.SERVER_KILL)
         elif self.server.is_running:
+            # the server has to go on without a restart when there is space again
             resource.prlimit(self.server.pid, resource.RLIMIT_FSIZE, (hard, hard))
 
     def _disk_errors(self) -> int:
