@@ -14,6 +14,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.frame_stream import CorruptFrames, FrameStream
+from gausslite.mission.keyframe_results import write_keyframes
 from gausslite.mission.results import write_poses, write_results
 from gausslite.mission.runner import MissionRunner
 from gausslite.task.parser import TaskParser
@@ -253,6 +254,7 @@ class AgentMission:
         }
         write_results(folder, gaussians, report, self._settings.link.uplink.world_frame)
         self._worker.run(lambda mapper: write_poses(folder, mapper.poses)).result()
+        self._worker.run(lambda mapper: write_keyframes(folder, mapper.keyframes())).result()
 
     def _send_all(self, uplink: Uplink, request: EndRequest) -> None:
         """Send the rest of the region and the keyframes and, for a handover, the rest of the map, within one time."""

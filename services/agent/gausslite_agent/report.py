@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gausslite.codec.object_report import noun_as_json, object_as_json
+from gausslite.codec.task_json import graph_as_json
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mission.results import peak_rss_mib
 from gausslite.wire.uplink_values import UplinkCounters
@@ -19,6 +20,7 @@ def mission_report(
         "agent_id": agent_id,
         "task": "" if graph is None else graph.text,
         "targets": [] if graph is None else list(graph.targets),
+        "task_graph": None if graph is None else graph_as_json(graph),
         "frames": status.mapped,
         "frames_skipped": status.skipped,
         "frames_dropped": status.dropped,

@@ -5,35 +5,29 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Bool
-from numpy import ndarray
-
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import add_regions, add_source, report_region_file, selected_regions
 from gausslite.cli.trajectory_report import tracking_text, trajectory_report
-from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
 from gausslite.codec.object_report import noun_as_json, object_as_json
 from gausslite.codec.png import write_png
-from gausslite.codec.view_images import ViewImage, write_view_images
 from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, NONE
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import DatasetError
-from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import require_name
 from gausslite.domain.region import Region
 from gausslite.domain.state import State, encode_text
 from gausslite.domain.task import TaskGraph
 from gausslite.evaluation.preview import render_preview
-from gausslite.evaluation.views import largest_roi_per_segment, view_map
+from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.frame_stream import CorruptFrames
+from gausslite.mission.keyframe_results import write_keyframes
 from gausslite.mission.results import (
     PREVIEW,
     peak_rss_mib,
@@ -54,7 +48,6 @@ from gausslite.process.messages import print_message
 from gausslite.view.mission_view import mission_view
 
 _NOT_RESUMED = -1
-_VIEW_IMAGES = 4
 _WORLD_FRAME_HELP = (
     "name of the poses' frame, for `fuse`, which accepts only maps of one frame (default: the sequence folder's name "
     "or the simulated home)"
@@ -189,12 +182,8 @@ class _Run:
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
         write_poses(options.out, self._mapper.poses)
         self._timeline.write(options.out)
+        write_keyframes(options.out, self._mapper.keyframes())
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
-        views = [_view(frame, roi) for frame, roi in keyframes]
-        write_keyframe_views(options.out, views)
-        chosen = sorted(largest_roi_per_segment([view.roi_pixels for view in views], _VIEW_IMAGES))
-        photographs = [ViewImage(frame.index, frame.rgb, roi) for frame, roi in (keyframes[i] for i in chosen)]
-        write_view_images(options.out, photographs)
         if keyframes:
             viewer = view_map(self._gaussians, mission.backend, mission.threads)
             write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
@@ -244,11 +233,6 @@ def _report_search(options: argparse.Namespace, inputs: MapInputs, estimators: E
     for scheduled in inputs.schedule.graphs():
         for match in estimators.noun_matches(scheduled):
             print_message(match.describe())
-
-
-def _view(frame: Frame, roi: Bool[ndarray, "h w"]) -> KeyframeView:
-    pixels = int(np.count_nonzero(roi))
-    return KeyframeView(frame.index, frame.capture_time_ns, frame.camera, frame.T_world_camera, pixels)
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str:

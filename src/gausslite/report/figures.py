@@ -157,14 +157,15 @@ SETTINGS = {
 
 
 def figures_table(runs: Sequence[RunResults], figures: Sequence[Figure]) -> Element | None:
-    """Return a table with a column for each run; None if no run has one of the figures."""
+    """Return a table with a column for each run that has one of the figures; None if no run has."""
+    columns = [run for run in runs if any(figure.value(run) is not None for figure in figures)]
     rows = []
     for figure in figures:
-        values = [figure.value(run) for run in runs]
+        values = [figure.value(run) for run in columns]
         if any(value is not None for value in values):
             texts = [_MISSING if value is None else figure.text(value) for value in values]
             rows.append((figure.label, texts))
-    return comparison_table(runs, rows, "figures") if rows else None
+    return comparison_table(columns, rows, "figures") if rows else None
 
 
 def settings_table(runs: Sequence[RunResults]) -> Element | None:

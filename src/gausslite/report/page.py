@@ -59,24 +59,24 @@ def require_replaceable(path: Path) -> None:
 
 
 def _document(contents: ReportContents) -> Element:
-    names = ", ".join(run.name for run in contents.runs)
+    title = f"GaussLite: {', '.join(contents.folders)}"
     head = element(
         "head",
         element("meta", attributes={"charset": "utf-8"}),
         element("meta", attributes={"name": "generator", "content": _GENERATOR}),
         element("meta", attributes={"http-equiv": "Content-Security-Policy", "content": _POLICY}),
         element("meta", attributes={"name": "viewport", "content": "width=device-width, initial-scale=1"}),
-        element("title", f"GaussLite: {names}"),
+        element("title", title),
         element("style", (files("gausslite.report") / "page.css").read_text()),
     )
-    body = element("body", element("h1", f"GaussLite: {names}"), *_sections(contents))
+    body = element("body", element("h1", title), *_sections(contents))
     return element("html", head, body, attributes={"lang": "en"})
 
 
 def _sections(contents: ReportContents) -> Iterator[Element]:
     runs = contents.runs
     colours = {run.name: run_colour(i) for i, run in enumerate(runs)}
-    yield _section("Task", styled("div", "cards", *(task_column(run) for run in runs)))
+    yield _section("Task", styled("div", "cards", *(task_column(run) for run in runs if run.report)))
     yield from _score_section(runs)
     tables = _present(figures_table(runs, MAP_SIZE), figures_table(runs, TIMES))
     yield _section("Map and time", styled("div", "tables", *tables))

@@ -46,8 +46,9 @@ class RunResults:
 
 @dataclass(frozen=True, slots=True)
 class ReportContents:
-    """The columns of the page, and the comparison sheets (PNG files) with their captions."""
+    """The names of the folders, the columns of the page, and the comparison sheets (PNG files) with their captions."""
 
+    folders: Sequence[str]
     runs: Sequence[RunResults]
     sheets: Mapping[Path, str]
 
@@ -71,7 +72,7 @@ def read_results(folders: Sequence[Path]) -> ReportContents:
         several = len(folders) > 1 and len(found) > 1
         runs += [replace(run, name=f"{name} {run.name}") for run in found] if several else found
         sheets |= {path: f"{name}: {path.stem}" for path in sorted((folder / _PICTURES).glob("*.png"))}
-    return ReportContents(runs, sheets)
+    return ReportContents(names, runs, sheets)
 
 
 def _read_run(folder: Path, name: str, scores: Mapping[str, object] | None = None) -> RunResults:

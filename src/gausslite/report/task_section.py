@@ -17,9 +17,7 @@ _NOUN_HEADER = ("run", "noun", "searched as", "how", "detections", "best score",
 def task_column(run: RunResults) -> Element:
     """Return the run's tasks with their graphs, and its notes."""
     task, switches = run.report.get("task"), run.report.get("then")
-    parts = [_task(task, run.report)] if task else [element("p", "no task: the whole scene gets equal detail")]
-    if not run.report:
-        parts = [element("p", "fused from the agents' maps")]
+    parts = [_task(task, run.report)] if task else [element("p", "no task")]
     for switch in switches if isinstance(switches, list) else []:
         if isinstance(switch, Mapping):
             parts += [styled("p", "muted", f"from frame {short_text(switch.get('frame'))}:"), _task(switch, {})]
@@ -51,10 +49,10 @@ def nouns_table(runs: Sequence[RunResults]) -> Element | None:
 
 
 def _task(task: object, report: Mapping[str, object]) -> Element:
-    """Return a task's sentence and its graph; an agent's report holds the sentence and the targets only."""
+    """Return a task's sentence and its graph, which an agent's report holds apart."""
     if not isinstance(task, Mapping):
-        targets = report.get("targets")
-        return styled("div", "task", styled("blockquote", "sentence", short_text(task)), _chips("target", targets))
+        graph = report.get("task_graph")
+        task = {**(graph if isinstance(graph, Mapping) else {}), "text": task}
     relations = task.get("relations")
     lines = [_relation(each) for each in relations if isinstance(each, Mapping)] if isinstance(relations, list) else []
     return styled(

@@ -80,7 +80,8 @@ def test_runs_are_side_by_side_at_the_same_views(tmp_path):
     rows = table_rows(tmp_path / "both.html")
     assert rows["frame rate"] == ["2.50 Hz", "4.00 Hz"]
     assert rows["peak memory"] == ["–", "300 MiB"]
-    assert rows["region PSNR"] == ["–", "25.50 dB"]
+    assert rows["region PSNR"] == ["25.50 dB"]
+    assert "<tr><th></th><th>second</th></tr>" in (tmp_path / "both.html").read_text(encoding="utf-8")
     assert rows["Gaussians"] == ["357", "357"]
     captions = [text for text in page.texts if text.endswith(": kappa")]
     assert captions.count("first: kappa") == captions.count("second: kappa") == 2  # at the view and from above
@@ -147,7 +148,14 @@ def test_a_run_without_photographs_or_poses_has_a_page(tmp_path):
 def test_the_maps_of_a_team_are_columns(tmp_path):
     team = tmp_path / "team"
     for agent in ("agent-a", "agent-b"):
-        write_run(team / agent, agent_id=agent, bytes_sent=2_500_000, map_shared_percent=2.0, task="Find the mug")
+        write_run(
+            team / agent,
+            agent_id=agent,
+            bytes_sent=2_500_000,
+            map_shared_percent=2.0,
+            task="Find the mug",
+            task_graph=TASK,
+        )
     (team / "vote.ply").write_bytes((team / "agent-a" / "map.ply").read_bytes())
     (team / "report.json").write_text(
         json.dumps({"agents": {"agent-a": {}, "agent-b": {}, "../agent-a": {}}, "maps": {"vote": {"roi_psnr": 23.0}}})
@@ -157,11 +165,12 @@ def test_the_maps_of_a_team_are_columns(tmp_path):
     (team / "pictures" / "000-frame.png").write_bytes(sheet)
     page = report(team, out=tmp_path / "page.html")
     rows = table_rows(tmp_path / "page.html")
-    assert rows["region PSNR"] == ["–", "–", "23.00 dB"]
+    assert rows["region PSNR"] == ["23.00 dB"]
     assert rows["sent to the fusion server"] == ["2.5 MB", "2.5 MB", "–"]
     assert rows["share of the map sent"] == ["2 %", "2 %", "–"]
+    assert rows["frame rate"] == ["2.50 Hz", "2.50 Hz"]
     assert "team: 000-frame" in page.texts
-    assert "fused from the agents' maps" in page.texts
+    assert {"GaussLite: team", "Find the mug", "on"} <= set(page.texts)
 
 
 @pytest.mark.parametrize(
