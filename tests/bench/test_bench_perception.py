@@ -19,6 +19,7 @@ from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.ground_truth import RegionDetector
+from gausslite_bench.perception.absent_nouns import choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
 from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery
 
@@ -136,14 +137,32 @@ def test_the_command_prints_its_figures(arguments, tmp_path, capsys):
     assert len(list((tmp_path / "sheets").iterdir())) == 2
     assert main(arguments) == 0
     printed_tables = capsys.readouterr().out
-    assert "| Find the dog (nothing; shown in 0 of 3 frames) | detected |" in printed_tables
+    assert "Find the dog" not in printed_tables
+    assert "1 absent nouns, 1 of them searched as a class: 0 mark a pixel, 0 mark more than 0.5 %" in printed_tables
     # the network marks a corner of the mug, less than a quarter of it
     assert "| Find the mug | mug | 3 | 0 |  |" in printed_tables
+
+
+def test_absent_nouns_are_the_detectors_classes_then_a_sample_of_its_vocabulary():
+    classes = ("cup", "dining table", "cat", "bottle", "oven")
+    vocabulary = ["mug", "ant", "bee", "bottle cap", "crab", "dove", "emu", "cat"]
+    nouns = choose_absent_nouns(classes, vocabulary, ("mug_1", "table_1", "bottle"), 4)
+    assert nouns == ["cat", "oven", "ant", "crab"]
+    with pytest.raises(InvalidInputError, match="expected at most 7 nouns, got 8"):
+        choose_absent_nouns(classes, vocabulary, ("mug_1", "table_1", "bottle"), 8)
+
+
+def test_a_number_of_absent_nouns_is_chosen_and_summarised(arguments, capsys):
+    assert main([*arguments, "--threads", "1", "--absent", "1", "--present", "vase", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["absent"] == {"nouns": 1, "searched": 1, "marked": 0, "over_limit": 0}
+    assert printed["tasks"][-1]["task"] == "Find the dog"
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--absent", "9"], "expected at most 1 nouns, got 9"),
         (["--task", "Find the mug"], "expected a task and its objects"),
         (["--task", "Find the mug=cup"], "expected names among mug; got cup"),
         (["--absent", "cup"], "expected nouns of absent objects, got cup"),

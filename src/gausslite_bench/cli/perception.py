@@ -17,13 +17,17 @@ from gausslite.config.values import read_names
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.object_names import head_of, same_kind
 from gausslite.domain.region import Region
 from gausslite.mission.results import as_text, prepare_folder
+from gausslite.perception.detect import Detector
 from gausslite.task.rules import RuleParser
+from gausslite_bench.perception.absent_nouns import AbsentSummary, absent_queries, choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
 from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery, TaskScore
 
+_ANY_OBJECT = "object"
 _COLUMNS = ("IoU", "precision", "recall", "marked, %", "max, %", "frames", "right", "found", "late")
 
 
@@ -41,7 +45,18 @@ def configure_perception(parser: argparse.ArgumentParser) -> None:
         help="a task and the objects of its target; repeatable (default: a search for each kind of object)",
     )
     add(
-        "--absent", metavar="A,B", type=read_names, default=(), help="also search for these nouns, which must be absent"
+        "--absent",
+        metavar="A,B|N",
+        type=read_absent,
+        default=(),
+        help="also search for these nouns, which must be absent, or for N nouns that the detector knows",
+    )
+    add(
+        "--present",
+        metavar="A,B",
+        type=read_names,
+        default=(),
+        help="objects of the scene without ground truth: --absent N searches for none of them",
     )
     add("--threads", metavar="N", type=int, help="the detector's threads (default: the runtime's choice)")
     add("--pictures", metavar="DIR", type=Path, help="write a contact sheet for each task to this folder")
@@ -58,10 +73,11 @@ def run_perception(options: argparse.Namespace) -> int:
     source, _ = open_with_warnings(options.source, options.up, options.register_depth)
     positions, size = select_frames(source, options.frames), frame_size(options.size, source)
     regions = _regions(options, source)
-    queries = [*_task_queries(options.task, regions), *_absent_queries(options.absent, regions)]
+    models = ModelRegistry(options.detector, options.segmenter, options.vocabulary, options.threads)
+    absent = _absent_queries(options, models.detector, regions)
+    queries = [*_task_queries(options.task, regions), *absent]
     if options.pictures is not None:
         prepare_folder(options.pictures)
-    models = ModelRegistry(options.detector, options.segmenter, options.vocabulary, options.threads)
     segmenter = models.segmenter if options.resegment else None
     bench = PerceptionBench(models.detector, queries, regions, source.up_axis, segmenter)
     sheets = [PerceptionSheet(len(positions)) for _ in queries] if options.pictures is not None else []
@@ -71,12 +87,22 @@ def run_perception(options: argparse.Namespace) -> int:
             sheet.add(task_masks)
     for number, sheet in enumerate(sheets, start=1):
         write_png(options.pictures / f"task-{number}.png", sheet.draw())
-    command = shlex.join(["gausslite", *sys.argv[1:]])
-    if options.json:
-        print(as_text({"command": command, "tasks": [asdict(score) for score in bench.scores()]}))
-    else:
-        print(f"`{command}`\n\n{perception_table(bench.scores())}\n\n{object_table(bench.scores())}")
+    matches = models.detector.matches([noun for query in absent for noun in query.graph.queries])
+    _print_scores(bench.scores(), matches, options.json)
     return 0
+
+
+def _print_scores(scores: Sequence[TaskScore], absent: Sequence[NounMatch], as_json: bool) -> None:
+    """Print the scores; of searches for absent nouns, the table has those that mark a pixel. absent: their matches."""
+    command = shlex.join(["gausslite", *sys.argv[1:]])
+    summary = AbsentSummary.from_scores(scores, absent)
+    if as_json:
+        print(as_text({"command": command, "tasks": [asdict(s) for s in scores], "absent": asdict(summary)}))
+        return
+    shown = [s for s in scores if s.objects or any(stage.marked_frames for stage in s.stages.values())]
+    print(f"`{command}`\n\n{perception_table(shown)}\n\n{object_table(shown)}")
+    if summary.nouns:
+        print(f"\n{summary.describe()}")
 
 
 def perception_table(scores: Sequence[TaskScore]) -> str:
@@ -143,11 +169,26 @@ def _task_queries(texts: Sequence[str], regions: Mapping[str, Region]) -> list[T
     return [TaskQuery(parser.parse(f"Find the {kind}"), tuple(objects)) for kind, objects in kinds.items()]
 
 
-def _absent_queries(nouns: Sequence[str], regions: Mapping[str, Region]) -> list[TaskQuery]:
-    for noun in nouns:
+def read_absent(text: str) -> tuple[str, ...] | int:
+    """Return the nouns of "a,b", or the number of nouns to choose."""
+    return int(text) if text.isdecimal() else read_names(text)
+
+
+def _absent_queries(options: argparse.Namespace, detector: Detector, regions: Mapping[str, Region]) -> list[TaskQuery]:
+    """Return a search for each noun of --absent, or for as many nouns that the detector knows."""
+    if isinstance(options.absent, int):
+        from gausslite.perception.text_embeddings import TextEmbeddings
+
+        embeddings = TextEmbeddings.from_model_folder(options.detector)
+        vocabulary = () if embeddings is None else tuple(embeddings.noun_index)
+        (every,) = detector.matches((_ANY_OBJECT,))
+        return absent_queries(
+            choose_absent_nouns(every.classes, vocabulary, [*regions, *options.present], options.absent)
+        )
+    for noun in options.absent:
         matches = [name for name in regions if same_kind(noun, name)]
         if matches:
             raise InvalidInputError(
                 f"--absent: expected nouns of absent objects, got {noun}, which matches {matches[0]}"
             )
-    return [TaskQuery(RuleParser().parse(f"Find the {noun}"), ()) for noun in nouns]
+    return absent_queries(options.absent)
