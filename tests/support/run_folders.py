@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.sample_gaussians import plain_gaussians
+from sample_gaussians import plain_gaussians
 
 from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
 from gausslite.codec.ply import write_ply
