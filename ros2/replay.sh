@@ -1,14 +1,19 @@
 #!/usr/bin/env bash
-# Replay a bag through the node to an agent, on a machine with ROS 2: replay.sh BAG [PARAMETER:=VALUE ...]
-# Prints the node's last diagnostics and the mission's summary. Fails if no frame was mapped.
+# Replay a bag through the node to an agent, on a machine with ROS 2:
+#   replay.sh BAG DETECTOR.onnx "Pick up the mug on the table" [PARAMETER:=VALUE ...]
+# Prints the node's last diagnostics and the mission's counts. Fails if no frame was mapped.
 set -euo pipefail
-bag=${1:?expected a bag: replay.sh BAG [PARAMETER:=VALUE ...]}
-shift
+if (($# < 3)); then
+  echo 'replay.sh: expected BAG DETECTOR.onnx TASK [PARAMETER:=VALUE ...]' >&2
+  exit 2
+fi
+bag=$1 detector=$2 task=$3
+shift 3
 out=$(mktemp -d)
 listen=unix:$out/agent.sock
 trap 'kill $(jobs -p) 2>/dev/null || true' EXIT
 
-gausslite-agent --agent-id replay --policy uniform --listen "$listen" --out "$out/mission" &
+gausslite-agent --agent-id replay --detector "$detector" --task "$task" --listen "$listen" --out "$out/mission" &
 agent=$!
 parameters=(-p "agent:=$listen" -p use_sim_time:=true)
 for parameter in "$@"; do parameters+=(-p "$parameter"); done

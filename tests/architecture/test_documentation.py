@@ -21,7 +21,7 @@ PROGRAMS = {
 }
 SUB_COMMANDS = (
     *("map", "demo", "parse", "eval", "calibrate", "fuse", "export", "report", "view"),
-    *("status", "end", "refine", "fetch", "evict", "unban", "objects"),
+    *("status", "end", "refine", "fetch", "evict", "unban", "objects", "doctor"),
 )
 BENCHMARKS = (
     "raster",
@@ -123,7 +123,6 @@ def known_flags() -> set[str]:
 def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
     others = {"--check", "--editable", "--no-index", "--build", "--python", "--masks"}  # of pip, docker and our tools
     others |= {"--platform", "--output-dir", "--site-dir", "--dist"}  # of cibuildwheel, mkdocs and pytest-xdist
-    others |= {"--break-system-packages", "--rm", "--once"}  # of pip, docker and ros2
     unknown = []
     for page in pages():
         text = page.read_text()

@@ -70,7 +70,7 @@ def main() -> None:
         pass
     finally:
         try:
-            print(node.session.close(), file=sys.stderr)
+            print(node.session.close() or "no mission was ended", file=sys.stderr)
         except GaussLiteError as error:
             sys.exit(f"gausslite: the mission was not ended: {error}")
         finally:

@@ -97,7 +97,7 @@ def diagnostics(
         }
     received, sent = counters
     values |= {f"images {name.replace('_', ' ')}": number for name, number in asdict(received).items()}
-    values |= {f"frames {name.replace('_', ' ')}": number for name, number in asdict(sent).items()}
+    values |= {f"sent frames {name.replace('_', ' ')}": number for name, number in asdict(sent).items()}
     values |= {f"problem {i}": problem for i, problem in enumerate(problems, start=1)}
     status = {
         "level": level,

@@ -77,19 +77,23 @@ class AgentLink:
     def close(self, end_mission: bool = True) -> str:
         """Send the waiting frames, end the mission if requested, close the client; return the mission's summary.
 
-        The summary is empty without end_mission. Raises GaussLiteError if the mission could not be ended.
+        The summary is empty without end_mission, and for an agent that has had no task. Raises GaussLiteError if the
+        mission could not be ended.
         """
         with self._changed:
             self._closing = True
             self._changed.notify_all()
         try:
             self._sender.close(_CLOSE_S)
-            if not end_mission:
+            if not end_mission or self._waits_for_task():
                 return ""
             return self._client.end_mission(self._settings.handover, self._settings.drain_s).summary
         finally:
             self._client.close()
             self._thread.join(_CLOSE_S)
+
+    def _waits_for_task(self) -> bool:
+        return self._snapshot is not None and self._snapshot.state == "waiting_for_task"
 
     def _run(self) -> None:
         while True:
