@@ -102,6 +102,13 @@ def test_frames_before_a_task_are_lost_and_counted_and_later_ones_are_mapped() -
         link.close()
 
 
+def test_closing_before_any_task_ends_no_mission() -> None:
+    with agent() as running:
+        link = open_link(running)
+        wait_until(lambda: link.snapshot is not None)
+        assert link.close() == ""
+
+
 def test_frames_with_another_lens_are_sent_by_another_stream() -> None:
     with agent() as running:
         running.client.assign_task(TASK)
