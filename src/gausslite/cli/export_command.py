@@ -39,6 +39,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=0.3,
         help="for octomap and nav2 (default: 0.3)",
     )
+    add(
+        "--seconds",
+        metavar="S",
+        type=Number("seconds", float, 0.1, 600),
+        default=12.0,
+        help="length of a video (default: 12)",
+    )
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
@@ -59,7 +66,8 @@ def run(options: argparse.Namespace) -> int:
     prepare_folder(out.absolute().parent)
     voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
     occupancy = OccupancySettings(voxel_m=voxel_m, min_opacity=options.min_opacity)
-    chosen.write(out, content, ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress))
+    settings = ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress, options.seconds)
+    chosen.write(out, content, settings)
     size = out.stat().st_size
     if options.json:
         print(as_text({"file": str(out), "format": options.to, "gaussians": len(content.chosen), "bytes": size}))
@@ -84,7 +92,7 @@ def _require_separate(out: Path, source: Path) -> None:
 
 def _with_progress(views: Iterable[KeyframeView]) -> Iterator[KeyframeView]:
     listed = list(views)
-    with progress_bar(len(listed), "fusing depth", "view") as bar:
+    with progress_bar(len(listed), "rendering", "view") as bar:
         for view in listed:
             yield view
             bar.update()

@@ -19,6 +19,7 @@ from gausslite.export.mesh import write_mesh
 from gausslite.export.occupancy import OccupancySettings, write_nav2, write_octomap
 from gausslite.export.point_formats import write_las, write_pcd
 from gausslite.export.splat_formats import write_gltf, write_splat, write_spz
+from gausslite.export.video import write_video
 
 Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
 
@@ -41,13 +42,14 @@ class MapContent:
 class ExportSettings:
     """How to write a map.
 
-    renderer: returns a function that renders a map; only meshes need it. occupancy: for octomap and nav2; its voxel
-    size is also the mesh's. progress: wraps the rendered views.
+    renderer: returns a function that renders a map; meshes and videos need it. occupancy: for octomap and nav2; its
+    voxel size is also the mesh's. progress: wraps the rendered views. video_s: length of a video.
     """
 
     renderer: Callable[[Gaussians], Render]
     occupancy: OccupancySettings = field(default_factory=OccupancySettings)
     progress: Progress = iter
+    video_s: float = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,10 @@ def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
     write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
+def _video(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    write_video(path, content.views, settings.renderer(content.chosen), settings.video_s, settings.progress)
+
+
 FORMATS: Mapping[str, Format] = MappingProxyType(
     {
         "ply": Format(
@@ -120,6 +126,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
             ".yaml", "2D grid", lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy)
         ),
         "mesh": Format(".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True),
+        "video": Format(".mp4", "fly-through along the keyframes", _video),
         "json": Format(".json", "objects of the mission", _objects, region_only=True),
     }
 )

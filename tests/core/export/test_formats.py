@@ -39,7 +39,7 @@ def random_map(seed: int = 0) -> Gaussians:
 
 
 def no_rendering(gaussians):
-    raise AssertionError("only meshes are rendered")
+    raise AssertionError("only meshes and videos are rendered")
 
 
 def export(tmp_path: Path, name: str, gaussians: Gaussians, region: str = "all", voxel_m: float = 0.05) -> Path:
