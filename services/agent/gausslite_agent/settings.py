@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gausslite.config.default_addresses import AGENT_ADDRESS
 from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import (
     HOLD_OUT_HELP,
@@ -204,7 +205,7 @@ def _parser() -> argparse.ArgumentParser:
         "the agent replays a sequence; otherwise it receives frames by the IngestFrames call.",
     )
     add = parser.add_argument
-    add("--listen", default="127.0.0.1:50053", metavar="ADDRESS", help="HOST:PORT or unix:PATH (default: %(default)s)")
+    add("--listen", default=AGENT_ADDRESS, metavar="ADDRESS", help="HOST:PORT or unix:PATH (default: %(default)s)")
     add("--agent-id", default="agent", metavar="NAME", help="unique name of this agent (default: %(default)s)")
     add("--task", metavar="TEXT", help="the robot's task (default: wait for the AssignTask call)")
     add("--out", metavar="DIR", type=Path, help="folder for map.ply and report.json; replaces earlier ones at the end")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gausslite.config.default_addresses import FUSION_ADDRESS
 from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
@@ -34,7 +35,7 @@ class ServerSettings:
     view: port of the page that shows the server, None for no page.
     """
 
-    listen: str = "127.0.0.1:50052"
+    listen: str = FUSION_ADDRESS
     store: Path | None = None
     store_max_bytes: int | None = None
     fusion: FusionSettings = field(default_factory=FusionSettings)

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from gausslite.config.default_addresses import PARSER_ADDRESS
 from gausslite.config.layers import parse_options
 from gausslite.config.task_parser_options import add_backend, backend_settings
 from gausslite.config.tls_options import add_tls, read_server_tls
@@ -14,14 +15,12 @@ from gausslite.process.messages import print_message
 from gausslite.task.backends import BackendSettings
 from gausslite.wire.tls import Tls
 
-DEFAULT_LISTEN = "127.0.0.1:50051"
-
 
 @dataclass(frozen=True, slots=True)
 class ParserSettings:
     """Address of the service, HOST:PORT (port 0: any free one) or unix:PATH, and the backend that parses tasks."""
 
-    listen: str = DEFAULT_LISTEN
+    listen: str = PARSER_ADDRESS
     backend: BackendSettings = field(default_factory=BackendSettings)
     tls: Tls | None = None
 
@@ -38,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--listen",
-        default=DEFAULT_LISTEN,
+        default=PARSER_ADDRESS,
         metavar="ADDRESS",
         help="HOST:PORT (port 0: any free one) or unix:PATH (default: %(default)s)",
     )

@@ -32,6 +32,7 @@ _COMMANDS = {
     "unban": "let a banned agent join a fusion server again",
     "objects": "print where the objects of a task are, from a fusion server or from the report of a run",
     "models": "list, download, verify and inspect model files for detection and segmentation",
+    "doctor": "check the machine and the installation: CPU, GPU, memory, disk, clock, ports, models, extras",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }
 _CONFIGURABLE = frozenset({"map", "demo", "eval", "bench"})

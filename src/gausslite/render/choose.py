@@ -9,7 +9,7 @@ from gausslite.domain.errors import KernelError
 from gausslite.render.rasterizer import Rasterizer
 
 BACKENDS = ("auto", "cpu", "cuda", "reference")
-_DRIVER_DEVICES = (Path("/dev/nvidia0"), Path("/dev/dxg"))
+DRIVER_DEVICES = (Path("/dev/nvidia0"), Path("/dev/dxg"))
 """Device files of the NVIDIA driver on Linux and in the Windows Subsystem for Linux."""
 
 
@@ -19,7 +19,7 @@ def choose_rasterizer(name: str = "auto", threads: int | None = None) -> Rasteri
     threads: of the `cpu` backend; by default one per core that the process may use. Raises KernelError.
     """
     if name == "auto":
-        return _fastest(threads)
+        return choose_with_reason(threads)[0]
     if name == "cpu":
         from gausslite.render.cpu import CpuRasterizer
 
@@ -37,15 +37,23 @@ def choose_rasterizer(name: str = "auto", threads: int | None = None) -> Rasteri
     raise KernelError(f"backend: expected one of {', '.join(BACKENDS)}, got {name}")
 
 
-def _fastest(threads: int | None) -> Rasterizer:
-    """Create the cuda backend if driver, torch and gsplat are present, else cpu; torch is imported only if they are."""
-    if any(device.exists() for device in _DRIVER_DEVICES) and _installed("torch") and _installed("gsplat"):
+def choose_with_reason(threads: int | None = None) -> tuple[Rasterizer, str]:
+    """Create the backend that `auto` means, and return it with the reason. Raises KernelError.
+
+    torch is imported only if the driver, torch and gsplat are present.
+    """
+    missing = [package for package in ("torch", "gsplat") if not _installed(package)]
+    if not any(device.exists() for device in DRIVER_DEVICES):
+        reason = "this machine has no NVIDIA driver"
+    elif missing:
+        reason = f"{' and '.join(missing)} of the extra cuda: not installed (pip install 'gausslite[cuda]')"
+    else:
         try:
-            return choose_rasterizer("cuda")
-        except KernelError:
+            return choose_rasterizer("cuda"), "driver, torch and gsplat are usable"
+        except KernelError as error:
             # the driver has no usable device, or torch has no CUDA support
-            return choose_rasterizer("cpu", threads)
-    return choose_rasterizer("cpu", threads)
+            reason = str(error)
+    return choose_rasterizer("cpu", threads), reason
 
 
 def _require_packages(backend: str, *packages: str) -> None:
