@@ -17,7 +17,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.fuzz.run import FuzzResult, FuzzSettings, run_fuzz
 
 _LEAST_MESSAGES = 1000
-_MAX_WRITTEN = 200
+_MAX_SHOWN, _MAX_WRITTEN = 20, 200
 
 
 def configure_fuzz(parser: argparse.ArgumentParser) -> None:
@@ -39,11 +39,15 @@ def run_command(options: argparse.Namespace) -> int:
     defaults = FuzzSettings()
     settings = FuzzSettings(options.messages, options.seed, options.corpus or defaults.corpus, options.detector)
     with tqdm(total=settings.messages, unit="message", disable=None, leave=False) as progress:
-        results = run_fuzz(settings, progress.update)
+        results = []
+        for result in run_fuzz(settings, progress.update):
+            results.append(result)
+            if not options.json:
+                progress.write("\n".join(_lines(result)))
+    if options.json:
+        sys.stdout.write(json.dumps(list(map(_values, results)), indent=1) + "\n")
     if options.out is not None:
         _write_faults(options.out, results)
-    text = json.dumps(list(map(_values, results)), indent=1) if options.json else "\n".join(_lines(results))
-    sys.stdout.write(text + "\n")
     return 1 if any(each.crashes or each.hangs for each in results) else 0
 
 
@@ -51,15 +55,14 @@ def _values(result: FuzzResult) -> dict[str, object]:
     return asdict(result) | {"faults": sorted({description for description, _ in result.faults})}
 
 
-def _lines(results: list[FuzzResult]) -> Iterator[str]:
-    for result in results:
-        yield (
-            f"{result.target}: {result.messages} messages, {result.crashes} crashes, {result.hangs} hangs over 1 s, "
-            f"memory {result.rss_mib:.0f} MiB, {result.growth_mib:+.1f} MiB over the last 70 % of the messages"
-        )
-        yield "  " + ", ".join(f"{count} {name}" for name, count in result.results.items())
-        for description in sorted({description for description, _ in result.faults})[:20]:
-            yield f"  fault: {description}"
+def _lines(result: FuzzResult) -> Iterator[str]:
+    yield (
+        f"{result.target}: {result.messages} messages, {result.crashes} crashes, {result.hangs} hangs over 1 s, "
+        f"memory {result.rss_mib:.0f} MiB, {result.growth_mib:+.1f} MiB over the last 70 % of the messages"
+    )
+    yield "  " + ", ".join(f"{count} {name}" for name, count in result.results.items())
+    for description in sorted({description for description, _ in result.faults})[:_MAX_SHOWN]:
+        yield f"  fault: {description}"
 
 
 def _write_faults(folder: Path, results: list[FuzzResult]) -> None:

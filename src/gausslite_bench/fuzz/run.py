@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,18 +52,17 @@ class FuzzResult:
     faults: list[tuple[str, bytes]] = field(repr=False)
 
 
-def run_fuzz(settings: FuzzSettings, note: Callable[[int], object]) -> list[FuzzResult]:
-    """Fuzz the codec and each service; `note` receives numbers of sent messages. Raises UnavailableError."""
+def run_fuzz(settings: FuzzSettings, note: Callable[[int], object]) -> Iterator[FuzzResult]:
+    """Fuzz the codec, then each service, and yield each result; `note` receives numbers of sent messages.
+
+    Raises UnavailableError if a service does not start.
+    """
     corpus = read_corpus(settings.corpus)
-    runs: list[_Run] = []
+    options = () if settings.detector is None else ("--detector", str(settings.detector))
     for index, (target, share) in enumerate(_SHARES.items()):
         mutator = Mutator(settings.seed * len(_SHARES) + index)
-        runs.append(_Run(target, corpus, mutator, round(settings.messages * share), note))
-    options = () if settings.detector is None else ("--detector", str(settings.detector))
-    return [
-        _fuzz_codec(each) if each.target == "codec" else _fuzz_service(each, options if each.target == AGENT else ())
-        for each in runs
-    ]
+        run = _Run(target, corpus, mutator, round(settings.messages * share), note)
+        yield _fuzz_codec(run) if target == "codec" else _fuzz_service(run, options if target == AGENT else ())
 
 
 @dataclass(frozen=True, slots=True)
