@@ -17,13 +17,16 @@ gausslite-agent --agent-id replay --detector "$detector" --task "$task" --listen
 agent=$!
 parameters=(-p "agent:=$listen" -p use_sim_time:=true)
 for parameter in "$@"; do parameters+=(-p "$parameter"); done
-ros2 run gausslite_ros gausslite_node --ros-args "${parameters[@]}" &
+# not through `ros2 run`, which does not pass signals on
+"$(ros2 pkg prefix gausslite_ros)/lib/gausslite_ros/gausslite_node" --ros-args "${parameters[@]}" &
 node=$!
 ros2 topic echo --field status /diagnostics > "$out/diagnostics.txt" &
-until ros2 node list | grep -q /gausslite; do :; done
+until ros2 node list | grep -q /gausslite; do
+  kill -0 "$node" || { echo 'replay.sh: the node did not start' >&2; exit 1; }
+done
 
 ros2 bag play --clock 100 "$bag"
-kill -INT "$node"
+kill -TERM "$node"
 wait "$node" || true
 kill -TERM "$agent"
 wait "$agent" || true
