@@ -113,7 +113,8 @@ def run(options: argparse.Namespace) -> int:
     extra = {} if corrected is None else corrected.summary()
     figures = {**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count, **extra}
     if options.save_scores:
-        write_evaluation(options.map.absolute().parent, figures)
+        views = {"source": str(options.source), "frames": options.frames, "test_every": options.test_every}
+        write_evaluation(options.map.absolute().parent, {**figures, **views})
     if options.json:
         print(as_text(figures))
     else:

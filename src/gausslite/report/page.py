@@ -102,11 +102,24 @@ def _score_section(runs: Sequence[RunResults]) -> Iterator[Element]:
         hint = "The maps were not scored on held-out views: see gausslite eval --save-scores."
         yield _section("Quality", styled("p", "muted", hint))
         return
-    notes = ["Means over held-out views, which did not train the maps."]
-    counts = {run.scores.get("n_views") for run in runs if run.scores}
-    if len(counts) > 1:
+    scored = [run for run in runs if run.scores]
+    notes = ["Means over the views that were scored."]
+    trained = [run.name for run in scored if not _is_held_out(run)]
+    if trained:
+        notes.append(f"Views that also trained the map may be among them for {', '.join(trained)}.")
+    else:
+        notes.append("They were held out: no map was trained on them.")
+    if len({run.scores.get("n_views") for run in scored}) > 1:
         notes.append("The runs were scored on different numbers of views: their figures are not comparable.")
     yield _section("Quality", styled("p", "muted", " ".join(notes)), table)
+
+
+def _is_held_out(run: RunResults) -> bool:
+    """True if the scored views are those that the run held out. Those of a demo always are; other frames may not be."""
+    scores = run.scores
+    if "test_every" not in scores:
+        return True
+    return scores["test_every"] is not None and scores["test_every"] == run.report.get("hold_out")
 
 
 def _bars(runs: Sequence[RunResults], colours: dict[str, str]) -> Iterator[Element]:

@@ -17,7 +17,7 @@ _NOUN_HEADER = ("run", "noun", "searched as", "how", "detections", "best score",
 def task_column(run: RunResults) -> Element:
     """Return the run's tasks with their graphs, and its notes."""
     task, switches = run.report.get("task"), run.report.get("then")
-    parts = [_task(task, run.report)] if task else [element("p", "no task")]
+    parts = [_task(task, run.report)] if task else [_without_task(run.report)]
     for switch in switches if isinstance(switches, list) else []:
         if isinstance(switch, Mapping):
             parts += [styled("p", "muted", f"from frame {short_text(switch.get('frame'))}:"), _task(switch, {})]
@@ -46,6 +46,13 @@ def nouns_table(runs: Sequence[RunResults]) -> Element | None:
             else []
         )
     return list_table(_NOUN_HEADER, rows) if rows else None
+
+
+def _without_task(report: Mapping[str, object]) -> Element:
+    is_uniform = report.get("policy") == "uniform"
+    return element(
+        "p", "no task: the whole scene gets equal detail" if is_uniform else "no sentence: known regions, or none"
+    )
 
 
 def _task(task: object, report: Mapping[str, object]) -> Element:

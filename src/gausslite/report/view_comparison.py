@@ -36,16 +36,17 @@ _MAX_WIDTH_PX = 640
 class SharedView:
     """A photograph at which all runs of one world frame are rendered.
 
-    source: the sequence that holds the frame. view: the camera and pose of the run that recorded the photograph.
+    source: the sequence that holds the frame, empty if unknown. view: the camera and pose of the run that recorded the
+    photograph.
     """
 
-    source: object
+    source: str
     image: ViewImage
     view: KeyframeView
 
     def pose_of(self, run: RunResults) -> Float64[ndarray, "4 4"]:
         """Return T_world_camera: the run's own refined pose if it kept this frame, else that of the photograph."""
-        if run.report.get("source") == self.source:
+        if self.source and _source_of(run) == self.source:
             for own in run.contents.keyframes:
                 if own.index == self.image.index:
                     return own.T_world_camera
@@ -75,12 +76,18 @@ def shared_views(runs: Sequence[RunResults]) -> list[SharedView]:
             view = by_index.get(image.index)
             if view is None or image.roi.shape != (view.camera.height_px, view.camera.width_px):
                 continue
-            source = run.report.get("source")
-            key = (str(source), image.index)
+            source = _source_of(run)
+            # without a known sequence, equal indices of two runs are different frames
+            key = (source or str(run.map_file), image.index)
             if key not in found or image.roi.sum() > found[key].image.roi.sum():
                 found[key] = SharedView(source, image, view)
     ranked = sorted(found.values(), key=lambda each: not each.image.roi.any())[:_MAX_VIEWS]
     return sorted(ranked, key=lambda each: each.image.index)
+
+
+def _source_of(run: RunResults) -> str:
+    """Return the run's sequence; empty for agents, which report none."""
+    return str(run.report.get("source") or "")
 
 
 def view_sections(runs: Sequence[RunResults], views: Sequence[SharedView]) -> list[Element]:

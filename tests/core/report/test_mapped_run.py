@@ -55,23 +55,17 @@ def test_saved_scores_are_in_the_report_until_the_map_is_replaced(
     assert main(["report", str(out)]) == 0
     assert "The maps were not scored" in (out / "report.html").read_text(encoding="utf-8")
     capsys.readouterr()
-    score = [
-        "eval",
-        str(out / "map.ply"),
-        str(kitchen),
-        "--threads",
-        "1",
-        "--test-every",
-        "5",
-        "--save-scores",
-        "--json",
-    ]
-    assert main(score) == 0
+    score = ["eval", str(out / "map.ply"), str(kitchen), "--threads", "1", "--save-scores"]
+    assert main([*score, "--test-every", "5", "--json"]) == 0
     scores = json.loads(capsys.readouterr().out)
-    assert json.loads((out / "evaluation.json").read_text()) == scores
+    views = {"source": str(kitchen), "frames": ":", "test_every": 5}
+    assert json.loads((out / "evaluation.json").read_text()) == {**scores, **views}
     assert main(["report", str(out)]) == 0
     page = (out / "report.html").read_text(encoding="utf-8")
     assert f"<td>{scores['full_psnr']:.2f} dB</td>" in page
-    assert "The maps were not scored" not in page
+    assert "no map was trained on them" in page
+    assert main(score) == 0
+    assert main(["report", str(out)]) == 0
+    assert "also trained the map may be among them for out" in (out / "report.html").read_text(encoding="utf-8")
     map_region(kitchen, out, "--overwrite")
     assert not (out / "evaluation.json").exists()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from browser import open_browser
 from run_folders import MUG, TASK, write_run
 
 from gausslite.cli.main import main
+from gausslite.report.run_results import read_results
+from gausslite.report.view_comparison import shared_views
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -95,6 +98,25 @@ def test_maps_of_other_world_frames_are_not_rendered_at_the_same_views(tmp_path)
     page = report(*runs, out=tmp_path / "page.html")
     assert page.texts.count("Frame 3") == 2
     assert page.texts.count("photograph") == 2
+
+
+def test_frames_of_unknown_sequences_are_not_the_same_view(tmp_path):
+    same = [write_run(tmp_path / name) for name in ("a", "b")]
+    assert report(*same, out=tmp_path / "same.html").texts.count("Frame 3") == 1
+    unknown = [write_run(tmp_path / name, source=None) for name in ("c", "d")]
+    assert report(*unknown, out=tmp_path / "unknown.html").texts.count("Frame 3") == 2
+
+
+def test_a_run_is_rendered_at_its_own_pose_of_a_frame_only_in_the_same_sequence(tmp_path):
+    first, second = write_run(tmp_path / "a"), write_run(tmp_path / "b")
+    keyframes = json.loads((second / "keyframes.json").read_text())
+    keyframes["keyframes"][0]["T_world_camera"][0][3] = 0.1
+    (second / "keyframes.json").write_text(json.dumps(keyframes))
+    runs = read_results([first, second]).runs
+    [view] = shared_views(runs)
+    assert [view.pose_of(run)[0, 3] for run in runs] == [0.0, 0.1]
+    unknown = [replace(run, report={}) for run in runs]
+    assert [[view.pose_of(run)[0, 3] for run in unknown] for view in shared_views(unknown)] == [[0.0, 0.0], [0.1, 0.1]]
 
 
 def test_texts_of_files_are_escaped(tmp_path):
