@@ -127,4 +127,3 @@ class Record3dSource(FolderSource):
         if self._metadata.depth_size is None:
             raise DatasetError(f"{self._metadata_place}: expected the size of the depth images, dw and dh, got none")
         return self._metadata.depth_size
-
