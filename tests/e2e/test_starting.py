@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from gausslite.process.interrupts import restore_default_handlers
+from gausslite.process.interrupts import raise_interrupts
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -53,17 +53,20 @@ def test_a_started_program_keeps_its_own_handlers() -> None:
 
     before = signal.signal(signal.SIGTERM, chosen)
     try:
-        restore_default_handlers()
+        raise_interrupts()
         assert signal.getsignal(signal.SIGTERM) is chosen
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_the_end_of_the_start_restores_the_default_handlers() -> None:
+def test_after_the_start_both_signals_raise() -> None:
     code = (
-        "import signal\nfrom gausslite.process.interrupts import end_quietly_while_starting, restore_default_handlers\n"
-        "end_quietly_while_starting('x')\nrestore_default_handlers()\n"
-        "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
-        "assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL\n"
+        "import signal\n"
+        "from gausslite.process.interrupts import Terminated, end_quietly_while_starting, raise_interrupts\n"
+        "end_quietly_while_starting('x')\nraise_interrupts()\n"
+        "for number, expected in ((signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)):\n"
+        "    try:\n        signal.raise_signal(number)\n"
+        "    except KeyboardInterrupt as interrupt:\n        assert type(interrupt) is expected\n"
+        "    else:\n        raise SystemExit(1)\n"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

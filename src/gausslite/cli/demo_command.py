@@ -82,8 +82,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the services, score the maps, write and print the report. Returns the exit code."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _raise_interrupt)
+    signal.signal(signal.SIGHUP, _raise_interrupt)
     _require_valid(options)
     require_name("--world-frame", options.world_frame or "")
     if not options.overwrite:

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping, Sequence
 
 from gausslite.domain.errors import GaussLiteError
-from gausslite.process.interrupts import Terminated, restore_default_handlers
+from gausslite.process.interrupts import Terminated, raise_interrupts
 from gausslite.process.messages import print_message
 
 _COMMANDS = {
@@ -84,7 +84,7 @@ def _dispatch(arguments: list[str]) -> int:
             importlib.import_module(_MODULES[name]).configure(command)
     options = _parse(parser, commands.choices, arguments)
     run = options.run
-    restore_default_handlers()
+    raise_interrupts()
     return int(run(options))
 
 

@@ -26,7 +26,7 @@ class _QuietEnd:
 
 
 def end_quietly_while_starting(program: str) -> None:
-    """End the process with code 130 on SIGINT and 143 on SIGTERM, until `restore_default_handlers` is called.
+    """End the process with code 130 on SIGINT and 143 on SIGTERM, until `raise_interrupts` is called.
 
     Call it on the main thread.
     """
@@ -34,16 +34,20 @@ def end_quietly_while_starting(program: str) -> None:
         signal.signal(number, _QuietEnd(program))
 
 
-def restore_default_handlers() -> None:
-    """Restore Python's own handling of both signals, unless another handler has been installed."""
+def raise_interrupts() -> None:
+    """Let SIGINT raise KeyboardInterrupt and SIGTERM raise Terminated, unless another handler has been installed."""
     if isinstance(signal.getsignal(signal.SIGINT), _QuietEnd):
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if isinstance(signal.getsignal(signal.SIGTERM), _QuietEnd):
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, _raise_terminated)
 
 
 class Terminated(KeyboardInterrupt):
     """SIGTERM, raised as Python raises KeyboardInterrupt for SIGINT."""
+
+
+def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
+    raise Terminated
 
 
 class DeferredInterrupt:
