@@ -105,6 +105,7 @@ def fusion_messages() -> Iterator[tuple[str, str, Message]]:
     yield "FusionService.RenderView", "small", view
     yield "FusionService.GetSessionStatus", "plain", fusion.GetSessionStatusRequest(mission_id="mission")
     yield "FusionService.KeepSession", "plain", fusion.KeepSessionRequest(session_id=SESSION)
+    yield "FusionService.GetUpdateDigests", "plain", fusion.GetUpdateDigestsRequest(session_id=SESSION)
     yield "FusionService.LeaveSession", "forget", fusion.LeaveSessionRequest(session_id=SESSION, forget=True)
     yield "FusionService.EvictAgent", "ban", fusion.EvictAgentRequest(agent_id="other", ban=True)
     yield "FusionService.UnbanAgent", "plain", fusion.UnbanAgentRequest(agent_id="other")

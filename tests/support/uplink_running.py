@@ -74,7 +74,16 @@ class ScriptedServer(pb_grpc.FusionServiceServicer):
 
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         self.joined.append(request.fresh_map)
-        return pb.JoinSessionResponse(session_id=f"s{len(self.joined)}", highest_update_seq=max([100, *self.revisions]))
+        # a server without a store: every session begins with an empty one
+        return pb.JoinSessionResponse(
+            session_id=f"s{len(self.joined)}",
+            highest_update_seq=max([100, *self.revisions]),
+            incarnation_id=f"i{len(self.joined)}",
+        )
+
+    async def GetUpdateDigests(self, request: pb.GetUpdateDigestsRequest, context: Any) -> Any:
+        for _ in ():
+            yield pb.GetUpdateDigestsResponse()
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
         return pb.LeaveSessionResponse()

@@ -34,11 +34,11 @@ def _run(options: MaintenanceSettings) -> int:
         case "restore":
             report, replaced = store_maintenance.restore(options.other, options.store)
             earlier = "" if replaced is None else f"; the earlier file is now {replaced}"
-            text = f"{options.store}: {_summary(report)}; agents will send everything again{earlier}"
+            text = f"{options.store}: {_summary(report)}; agents will send what is missing{earlier}"
             _print(options, text, dataclasses.asdict(report) | {"replaced": str(replaced or "")})
         case "verify":
             report = store_maintenance.verify(options.store, options.repair)
-            done = " deleted; agents will send everything again" if options.repair and report.damaged_rows else ""
+            done = " deleted; agents will send what is missing" if options.repair and report.damaged_rows else ""
             text = f"{options.store}: {_summary(report)}, {report.damaged_rows} damaged rows{done}"
             _print(options, text, dataclasses.asdict(report))
             return int(report.damaged_rows > 0 and not options.repair)

@@ -37,6 +37,7 @@ from gausslite.wire.convert import (
 )
 from gausslite.wire.convert_objects import object_to_message, report_from_message
 from gausslite.wire.convert_task import graph_from_message
+from gausslite.wire.digest_messages import digests_to_messages
 from gausslite.wire.rejection_log import RejectionLog
 from gausslite.wire.server import Service
 from gausslite_fusion_server.change_blocks import ChangeBlocks, WatchedPart
@@ -137,6 +138,15 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         return pb.KeepSessionResponse(
             highest_update_seq=self._engine.highest_update_seq(agent_id), incarnation_id=self._engine.incarnation_id
         )
+
+    async def GetUpdateDigests(
+        self, request: pb.GetUpdateDigestsRequest, context: Any
+    ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
+        """Return the digests of the agent's stored updates."""
+        agent_of_session(self._engine, request.session_id, Caller.of(context))
+        for block in digests_to_messages(await self._work(self._engine.stored_digests, request.session_id)):
+            with read_deadline():
+                yield block
 
     async def ContributeSubsets(
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any

@@ -84,6 +84,11 @@ def tile_of(key: int) -> int:
     return key & _TILE_MASK
 
 
+def tiles_of(keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
+    """Return the tile of each voxel, see tile_of."""
+    return keys & np.int64(_TILE_MASK)
+
+
 def _pack(axes: Float64[ndarray, "3 n"]) -> Int64[ndarray, " n"]:
     i, j, k = axes.astype(np.int64) + _OFFSET
     packed: Int64[ndarray, " n"] = (i << (2 * _BITS_PER_AXIS)) | (j << _BITS_PER_AXIS) | k

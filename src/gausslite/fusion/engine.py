@@ -17,6 +17,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import quote_name
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.agent_data import AgentData
@@ -129,6 +130,10 @@ class FusionEngine:
     def storage(self) -> StorageProbe:
         """The check whether the store can write."""
         return self._storage
+
+    def stored_digests(self, session_id: str) -> TileDigests:
+        """Return the digests of the stored updates of the session's agent. Raises SessionUnknownError."""
+        return self._store.digests(self.session(session_id).agent_id)
 
     @property
     def revision(self) -> int:

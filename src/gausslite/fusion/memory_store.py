@@ -12,6 +12,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.records import from_bytes
+from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of, voxel_records
@@ -72,6 +73,11 @@ class MemoryStore:
         """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
         with self._lock:
             return self._index.totals(agent_id)
+
+    def digests(self, agent_id: str) -> TileDigests:
+        """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
+        with self._lock:
+            return self._index.digests(agent_id)
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
         """Return the agent's totals on these voxels, in their order."""

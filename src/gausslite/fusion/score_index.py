@@ -18,6 +18,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec.records import RECORD, to_records
+from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
 
@@ -45,6 +46,11 @@ class ScoreIndex:
         """Return the sums over an agent's rows; zero for an unknown one."""
         rows = self._rows.get(agent_id)
         return AgentTotals() if rows is None else rows.totals
+
+    def digests(self, agent_id: str) -> TileDigests:
+        """Return the digests of an agent's rows; empty for an unknown one."""
+        rows = self._rows.get(agent_id)
+        return TileDigests.sum_of(()) if rows is None else TileDigests.of(*rows.sorted_columns(None)[:2])
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
         """Return the agent's totals on these voxels, in their order; update_seq is -1 where it has none."""

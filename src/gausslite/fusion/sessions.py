@@ -82,9 +82,7 @@ class SessionRegistry:
             error = NameInUseError(f"session: {_NAME_TAKEN}")
             error.retry_after_s = self._lease_s
             raise error
-        raise SessionUnknownError(
-            f"session {quote_name(session_id)}: unknown to this server; join, then send every voxel again"
-        )
+        raise SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
 
     def end(self, session_id: str) -> None:
         """End a session and its lease. Raises SessionUnknownError, MismatchError, NameInUseError, StorageError."""

@@ -109,7 +109,7 @@ def open_or_create(path: Path) -> sqlite3.Connection:
 
 
 def renew_incarnation(db: sqlite3.Connection) -> None:
-    """Give the content a new id, so that the agents send everything again."""
+    """Give the content a new id, so that the agents compare digests."""
     db.execute("INSERT OR REPLACE INTO properties VALUES ('incarnation_id', ?)", (secrets.token_hex(16),))
 
 

@@ -17,6 +17,7 @@ from numpy import ndarray
 
 from gausslite.codec.records import RECORD, from_bytes
 from gausslite.domain.errors import StorageError
+from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch
 from gausslite.fusion.mission_config import MissionConfig
@@ -127,6 +128,11 @@ class SqliteStore:
         """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
         with self._index_lock:
             return self._index.totals(agent_id)
+
+    def digests(self, agent_id: str) -> TileDigests:
+        """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
+        with self._index_lock:
+            return self._index.digests(agent_id)
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
         """Return the agent's totals on these voxels, in their order."""

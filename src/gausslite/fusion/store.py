@@ -17,6 +17,7 @@ from jaxtyping import Int32, Int64, UInt32, UInt64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.mission_config import MissionConfig
 
@@ -92,7 +93,7 @@ class FusionStore(Protocol):
     """Owns the voxel updates, the mission's configuration and the sessions. Thread-safe.
 
     incarnation_id changes when the content may be older than what was acknowledged: with a new store, after a restore
-    and after a repair. Then the agents send everything again.
+    and after a repair. Then the agents compare digests and send what is missing.
 
     When a method of a durable store has returned, its effect survives a crash. All methods raise StorageError if the
     storage refuses; the store stays usable for other calls.
@@ -121,6 +122,10 @@ class FusionStore(Protocol):
 
     def totals(self, agent_id: str) -> AgentTotals:
         """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
+        ...
+
+    def digests(self, agent_id: str) -> TileDigests:
+        """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
         ...
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:

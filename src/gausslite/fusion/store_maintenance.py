@@ -35,7 +35,7 @@ class StoreReport:
 def verify(path: Path, repair: bool = False) -> StoreReport:
     """Check every row, also while a server uses the store. Raises StorageError if the file is damaged as a whole.
 
-    repair: delete the damaged rows, without a server; then the agents send everything again.
+    repair: delete the damaged rows, without a server; then the agents send what is missing.
     """
     with contextlib.ExitStack() as held:
         if repair:
@@ -62,7 +62,7 @@ def back_up(store: Path, target: Path) -> StoreReport:
 
 
 def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
-    """Put a verified copy of the backup in the store's place, without a server; agents then send everything again.
+    """Put a verified copy of the backup in the store's place, without a server; agents then send what is missing.
 
     Returns the report and the new name of the file that was there before. Raises StorageError.
     """

@@ -283,11 +283,11 @@ class KeepSessionResponse(_message.Message):
     INCARNATION_ID_FIELD_NUMBER: _builtins.int
     highest_update_seq: _builtins.int
     """If this is lower than a sequence number that the server has acknowledged, it has lost updates, for example with the
-    end of its log. The agent then sends everything again.
+    end of its log. The agent then joins again and compares digests.
     """
     incarnation_id: _builtins.str
-    """The id of the store's content. It changes with a new store, a restored backup and a repair. The agent then sends
-    everything again.
+    """The id of the store's content. It changes with a new store, a restored backup and a repair. The agent then joins
+    again and compares digests.
     """
     def __init__(
         self,
@@ -302,6 +302,57 @@ class KeepSessionResponse(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___KeepSessionResponse: _TypeAlias = KeepSessionResponse  # noqa: Y015
+
+@_typing.final
+class GetUpdateDigestsRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SESSION_ID_FIELD_NUMBER: _builtins.int
+    session_id: _builtins.str
+    def __init__(
+        self,
+        *,
+        session_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["session_id", b"session_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GetUpdateDigestsRequest: _TypeAlias = GetUpdateDigestsRequest  # noqa: Y015
+
+@_typing.final
+class GetUpdateDigestsResponse(_message.Message):
+    """Some of the tiles that have updates, each once."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TILES_FIELD_NUMBER: _builtins.int
+    HASHES_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def tiles(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """The smallest voxel key of each tile, ascending."""
+
+    @_builtins.property
+    def hashes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """For each tile the sum, modulo 2^64, of a hash of (voxel key, update_seq) over its voxels, tombstones included.
+        docs/wire.md defines the hash.
+        """
+
+    def __init__(
+        self,
+        *,
+        tiles: _abc.Iterable[_builtins.int] | None = ...,
+        hashes: _abc.Iterable[_builtins.int] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["hashes", b"hashes", "tiles", b"tiles"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GetUpdateDigestsResponse: _TypeAlias = GetUpdateDigestsResponse  # noqa: Y015
 
 @_typing.final
 class ContributeSubsetsRequest(_message.Message):

@@ -94,6 +94,11 @@ class FusionServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.FromString,
                 _registered_method=True)
+        self.GetUpdateDigests = channel.unary_stream(
+                '/gausslite.v1.FusionService/GetUpdateDigests',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsResponse.FromString,
+                _registered_method=True)
         self.LeaveSession = channel.unary_unary(
                 '/gausslite.v1.FusionService/LeaveSession',
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.SerializeToString,
@@ -126,7 +131,7 @@ class FusionServiceServicer(object):
     def ContributeSubsets(self, request_iterator, context):
         """Send voxel updates; the server answers with cumulative acknowledgements. An acknowledged update is as durable as
         the server's store. An invalid subset is REJECTED and the stream continues. The stream ends with NOT_FOUND
-        SESSION_UNKNOWN for an unknown session (join and send everything again), FAILED_PRECONDITION for another grid,
+        SESSION_UNKNOWN for an unknown session (join again and compare digests), FAILED_PRECONDITION for another grid,
         RESOURCE_EXHAUSTED if the disk is full.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -199,6 +204,14 @@ class FusionServiceServicer(object):
 
     def KeepSession(self, request, context):
         """Renews the lease of an agent that has nothing to send, and says what the server has of it.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetUpdateDigests(self, request, context):
+        """Digests of the agent's stored updates by tile of 16 x 16 x 16 voxels. An agent that has to assume that the server has
+        lost updates compares them with its own, and sends the tiles that differ.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -286,6 +299,11 @@ def add_FusionServiceServicer_to_server(servicer, server):
                     servicer.KeepSession,
                     request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.SerializeToString,
+            ),
+            'GetUpdateDigests': grpc.unary_stream_rpc_method_handler(
+                    servicer.GetUpdateDigests,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsResponse.SerializeToString,
             ),
             'LeaveSession': grpc.unary_unary_rpc_method_handler(
                     servicer.LeaveSession,
@@ -627,6 +645,33 @@ class FusionService(object):
             '/gausslite.v1.FusionService/KeepSession',
             gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.SerializeToString,
             gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetUpdateDigests(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/gausslite.v1.FusionService/GetUpdateDigests',
+            gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -42,7 +42,7 @@ class FusionServiceStub:
     ContributeSubsets: _grpc.StreamStreamMultiCallable[_fusion_service_pb2.ContributeSubsetsRequest, _fusion_service_pb2.ContributeSubsetsResponse]
     """Send voxel updates; the server answers with cumulative acknowledgements. An acknowledged update is as durable as
     the server's store. An invalid subset is REJECTED and the stream continues. The stream ends with NOT_FOUND
-    SESSION_UNKNOWN for an unknown session (join and send everything again), FAILED_PRECONDITION for another grid,
+    SESSION_UNKNOWN for an unknown session (join again and compare digests), FAILED_PRECONDITION for another grid,
     RESOURCE_EXHAUSTED if the disk is full.
     """
     ContributeKeyframes: _grpc.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]
@@ -68,6 +68,10 @@ class FusionServiceStub:
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
     KeepSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.KeepSessionRequest, _fusion_service_pb2.KeepSessionResponse]
     """Renews the lease of an agent that has nothing to send, and says what the server has of it."""
+    GetUpdateDigests: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.GetUpdateDigestsRequest, _fusion_service_pb2.GetUpdateDigestsResponse]
+    """Digests of the agent's stored updates by tile of 16 x 16 x 16 voxels. An agent that has to assume that the server has
+    lost updates compares them with its own, and sends the tiles that differ.
+    """
     LeaveSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]
     EvictAgent: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]
     """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED."""
@@ -85,7 +89,7 @@ class FusionServiceAsyncStub(FusionServiceStub):
     ContributeSubsets: _aio.StreamStreamMultiCallable[_fusion_service_pb2.ContributeSubsetsRequest, _fusion_service_pb2.ContributeSubsetsResponse]  # type: ignore[assignment]
     """Send voxel updates; the server answers with cumulative acknowledgements. An acknowledged update is as durable as
     the server's store. An invalid subset is REJECTED and the stream continues. The stream ends with NOT_FOUND
-    SESSION_UNKNOWN for an unknown session (join and send everything again), FAILED_PRECONDITION for another grid,
+    SESSION_UNKNOWN for an unknown session (join again and compare digests), FAILED_PRECONDITION for another grid,
     RESOURCE_EXHAUSTED if the disk is full.
     """
     ContributeKeyframes: _aio.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]  # type: ignore[assignment]
@@ -111,6 +115,10 @@ class FusionServiceAsyncStub(FusionServiceStub):
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
     KeepSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.KeepSessionRequest, _fusion_service_pb2.KeepSessionResponse]  # type: ignore[assignment]
     """Renews the lease of an agent that has nothing to send, and says what the server has of it."""
+    GetUpdateDigests: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.GetUpdateDigestsRequest, _fusion_service_pb2.GetUpdateDigestsResponse]  # type: ignore[assignment]
+    """Digests of the agent's stored updates by tile of 16 x 16 x 16 voxels. An agent that has to assume that the server has
+    lost updates compares them with its own, and sends the tiles that differ.
+    """
     LeaveSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]  # type: ignore[assignment]
     EvictAgent: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]  # type: ignore[assignment]
     """For operators: end an agent's session and delete all data of it; with `ban` its later joins get PERMISSION_DENIED."""
@@ -137,7 +145,7 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_abc.Iterator[_fusion_service_pb2.ContributeSubsetsResponse], _abc.AsyncIterator[_fusion_service_pb2.ContributeSubsetsResponse]]:
         """Send voxel updates; the server answers with cumulative acknowledgements. An acknowledged update is as durable as
         the server's store. An invalid subset is REJECTED and the stream continues. The stream ends with NOT_FOUND
-        SESSION_UNKNOWN for an unknown session (join and send everything again), FAILED_PRECONDITION for another grid,
+        SESSION_UNKNOWN for an unknown session (join again and compare digests), FAILED_PRECONDITION for another grid,
         RESOURCE_EXHAUSTED if the disk is full.
         """
 
@@ -223,6 +231,16 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.KeepSessionResponse, _abc.Awaitable[_fusion_service_pb2.KeepSessionResponse]]:
         """Renews the lease of an agent that has nothing to send, and says what the server has of it."""
+
+    @_abc_1.abstractmethod
+    def GetUpdateDigests(
+        self,
+        request: _fusion_service_pb2.GetUpdateDigestsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_abc.Iterator[_fusion_service_pb2.GetUpdateDigestsResponse], _abc.AsyncIterator[_fusion_service_pb2.GetUpdateDigestsResponse]]:
+        """Digests of the agent's stored updates by tile of 16 x 16 x 16 voxels. An agent that has to assume that the server has
+        lost updates compares them with its own, and sends the tiles that differ.
+        """
 
     @_abc_1.abstractmethod
     def LeaveSession(

@@ -22,6 +22,7 @@ from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.lens import Lens
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
+from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.v1 import (
     agent_service_pb2,
@@ -37,6 +38,7 @@ from gausslite.wire.camera_view import CameraView, camera_view_from_message
 from gausslite.wire.channel import DEADLINE_S, ServiceChannel
 from gausslite.wire.connection import MAX_MESSAGE_BYTES
 from gausslite.wire.convert_objects import report_to_message, team_object_from_message
+from gausslite.wire.digest_messages import digests_from_messages
 from gausslite.wire.images import decode_colour, decode_depth
 from gausslite.wire.tls import Tls
 
@@ -226,6 +228,12 @@ class FusionClient(ServiceChannel):
         request = fusion_service_pb2.KeepSessionRequest(session_id=session_id)
         response: fusion_service_pb2.KeepSessionResponse = self._call(self._stub.KeepSession, request)
         return response
+
+    def stored_digests(self, session_id: str) -> TileDigests:
+        """Return the digests of the updates that the server has of the session's agent."""
+        request = fusion_service_pb2.GetUpdateDigestsRequest(session_id=session_id)
+        blocks = self._stream(self._stub.GetUpdateDigests(request, timeout=self._deadline_s))
+        return digests_from_messages(blocks)
 
     def contribute(
         self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float

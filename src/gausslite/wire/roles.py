@@ -26,6 +26,7 @@ ROLES_OF_METHOD: Final = {
     _FUSION + "ContributeFreeSpace": _ROBOT,
     _FUSION + "ReportObjects": _ROBOT,
     _FUSION + "KeepSession": _ROBOT,
+    _FUSION + "GetUpdateDigests": _ROBOT,
     _FUSION + "LeaveSession": _ROBOT,
     _FUSION + "WatchFusedMap": _ANY,
     _FUSION + "ExportFusedMap": _ANY,

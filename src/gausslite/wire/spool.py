@@ -29,8 +29,11 @@ from numpy import ndarray
 
 from gausslite.codec.records import from_bytes, to_records
 from gausslite.domain.errors import MismatchError, StorageError
+from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.wire.sent_updates import SCHEMA as SENT_SCHEMA
+from gausslite.wire.sent_updates import SentUpdateTable
 from gausslite.wire.spooled_keyframes import SCHEMA as KEYFRAME_SCHEMA
 from gausslite.wire.spooled_keyframes import KeyframeTable, SpooledKeyframe
 
@@ -95,14 +98,15 @@ class Spool:
 
     def __init__(self, path: Path | None, agent_id: str, grid: VoxelGrid) -> None:
         """Open or create the spool. Raises MismatchError if the file is another agent's or of another grid."""
-        self._path = path
+        self._path, self.agent_id = path, agent_id
         self._error_prefix = "spool" if path is None else f"spool {path}"
         self._lock = threading.Lock()
         with self._storage_errors():
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
-            self._database.executescript(_SCHEMA + KEYFRAME_SCHEMA)
+            self._database.executescript(_SCHEMA + KEYFRAME_SCHEMA + SENT_SCHEMA)
+            self._sent = SentUpdateTable(self._database)
             self._keyframes = KeyframeTable(self._database)
             self.is_new = self._property("agent_id") is None
             if self.is_new:
@@ -196,16 +200,31 @@ class Spool:
             acknowledged = int(self._property("acknowledged_seq") or 0)
             return self._property("incarnation_id") == incarnation_id and highest_update_seq >= acknowledged
 
-    def begin_sending_to(self, incarnation_id: str) -> None:
-        """Mark every voxel as pending and never sent; the updates acknowledged from now on are stored there."""
-        self.mark_all_unsent()
+    def acknowledged_digests(self) -> TileDigests:
+        """Return the digests of the updates that were acknowledged."""
         with self._transaction():
-            properties = [("incarnation_id", incarnation_id), ("acknowledged_seq", 0)]
-            self._database.executemany("INSERT OR REPLACE INTO properties VALUES (?, ?)", properties)
+            return self._sent.digests()
 
-    def record_acknowledged(self, update_seq: int) -> None:
-        """Record that the server has stored the updates with this sequence number."""
+    def begin_sending_to(self, incarnation_id: str, highest_update_seq: int, lost: Int64[ndarray, " t"]) -> int:
+        """Mark the voxels of the tiles in `lost` as pending and never sent; returns their number.
+
+        The server with this content has all acknowledged updates of the other tiles.
+        """
         with self._transaction():
+            keys = self._sent.forget(lost)
+            self._database.executemany(
+                "UPDATE voxel_updates SET pending = 1, sent_kappa = ? WHERE key = ?",
+                ((_NEVER_SENT, key) for key in keys),
+            )
+            acknowledged = min(int(self._property("acknowledged_seq") or 0), highest_update_seq)
+            properties = [("incarnation_id", incarnation_id), ("acknowledged_seq", acknowledged)]
+            self._database.executemany("INSERT OR REPLACE INTO properties VALUES (?, ?)", properties)
+        return len(keys)
+
+    def record_acknowledged(self, keys: Int64[ndarray, " v"], update_seq: int) -> None:
+        """Record that the server has stored the updates of these voxels, with this sequence number."""
+        with self._transaction():
+            self._sent.record(keys.tolist(), update_seq)
             self._database.execute(
                 "UPDATE properties SET value = max(value, ?) WHERE name = 'acknowledged_seq'", (update_seq,)
             )
@@ -219,11 +238,6 @@ class Spool:
             self._database.executemany(
                 "UPDATE voxel_updates SET pending = (enqueue_count != ?), sent_kappa = ? WHERE key = ?", triples
             )
-
-    def mark_all_unsent(self) -> None:
-        """Mark every voxel as pending and never sent, because the server has lost all updates."""
-        with self._transaction():
-            self._database.execute("UPDATE voxel_updates SET pending = 1, sent_kappa = ?", (_NEVER_SENT,))
 
     @property
     def pending_voxels(self) -> int:

@@ -11,10 +11,9 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_batch
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -24,13 +23,11 @@ from gausslite.domain.errors import (
     QuotaError,
     SessionUnknownError,
     StorageError,
-    UnavailableError,
 )
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.objects import ObjectReport
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.free_space_outbox import FreeSpaceOutbox
@@ -39,13 +36,12 @@ from gausslite.wire.retry_delay import RetryDelay
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 from gausslite.wire.spooled_keyframes import SpooledKeyframe
 from gausslite.wire.token_bucket import TokenBucket
-from gausslite.wire.uplink_values import SentPart, UplinkCounters, UplinkSettings
+from gausslite.wire.update_sender import UpdateSender
+from gausslite.wire.uplink_values import UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
-_MIN_SUBSET_BYTES = 1 << 16
 _MIN_INTERVAL_S = 0.02
 _LEAVE_S = 1.0
-_PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
 
 
 class Uplink:
@@ -65,11 +61,8 @@ class Uplink:
         self._settings = settings or UplinkSettings()
         self._has_restored_map = has_restored_map
         self._counters = UplinkCounters()
-        self._roi_voxels: set[int] = set()
-        self._resent_damaged: set[int] = set()
         self._session: Session | None = None
-        self._message_seq = 0
-        self._subset_bytes = MAX_SUBSET_BYTES
+        self._sender = UpdateSender(client, spool, grid, self._settings.deadline_s, self._count)
         self._token_bucket = TokenBucket(self._settings.kbps)
         self._retry_delay = RetryDelay(self._settings.first_backoff_s)
         self._last_error = ""
@@ -138,7 +131,7 @@ class Uplink:
         with self._changed:
             return replace(
                 self._counters,
-                voxels_sent=len(self._roi_voxels),
+                voxels_sent=self._sender.sent_roi_voxels,
                 voxels_waiting=self._spool.pending_voxels,
                 keyframes_sent=len(self._sent_keyframes),
                 keyframes_waiting=self._spool.pending_keyframes,
@@ -160,6 +153,10 @@ class Uplink:
         self._client.close()
         self._thread.join()
         self._spool.close()
+
+    def _count(self, add: Callable[[UplinkCounters], UplinkCounters]) -> None:
+        with self._changed:
+            self._counters = add(self._counters)
 
     def _is_finished(self) -> bool:
         return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
@@ -209,7 +206,11 @@ class Uplink:
         due = self._spool.next_round(max_bytes, resend_threshold)
         if due is None and self._objects.pending is None and not self._free_space.has_pending:
             return False
+        is_new_session = self._session is None
         session = self._join_if_needed()
+        if is_new_session:
+            # the comparison of digests may have added updates
+            due = self._spool.next_round(max_bytes, resend_threshold)
         self._token_bucket.spend(self._objects.send(self._client, session.session_id))
         self._token_bucket.spend(self._free_space.send(self._client, session.session_id, self._grid))
         if due is None:
@@ -221,32 +222,39 @@ class Uplink:
         return True
 
     def _check_server(self) -> None:
-        """Ask the server whether it has every acknowledged update; if not, join again and send everything."""
+        """Ask the server whether it has every acknowledged update; if not, join again and send what it lacks."""
         if self._session is None:
-            self._next_check_s = math.inf
+            # the server did not know the session
+            self._join_if_needed()
             return
         kept = self._client.keep_session(self._session.session_id)
         self._next_check_s = time.monotonic() + self._settings.check_interval_s
         if not self._spool.is_stored_by(kept.incarnation_id, kept.highest_update_seq):
-            _log.warning("uplink: %s has lost updates; everything is sent again", self._client)
             self._forget_session()
+            self._join_if_needed()
 
     def _forget_session(self) -> None:
-        """Mark everything as unsent, so that the next round joins again and sends it."""
+        """Join again with the next round, and send objects and free space again; digests find the other updates."""
         self._session = None
-        self._spool.mark_all_unsent()
         self._objects.mark_unsent()
         self._free_space.mark_unsent()
 
+    def _resend_missing(self, session: Session) -> None:
+        """If the server may have lost updates, compare digests and mark as unsent what differs."""
+        if self._spool.is_stored_by(session.incarnation_id, session.highest_update_seq):
+            return
+        acknowledged = self._spool.acknowledged_digests()
+        stored = self._client.stored_digests(session.session_id) if len(acknowledged.tiles) else acknowledged
+        resent = self._spool.begin_sending_to(
+            session.incarnation_id, session.highest_update_seq, acknowledged.differing(stored)
+        )
+        if len(acknowledged.tiles):
+            _log.warning("uplink: %s lacks some of what it had; %d voxels are sent again", self._client, resent)
+
     def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
-        sent: dict[int, SentPart] = {}
-        requests = list(self._requests(due, session, sent))
+        requests, sent = self._sender.encode(due, session)
         self._token_bucket.spend(sum(each.size_bytes for each in sent.values()))
-        error = self._exchange(requests, sent)
-        if error is not None:
-            raise error
-        if sent:
-            raise UnavailableError(f"{self._client}: the stream ended before {len(sent)} subsets were answered")
+        self._sender.send(requests, sent)
 
     def _send_keyframes(self, due: Sequence[SpooledKeyframe], session: Session) -> None:
         """Send keyframes on one stream. A rejected keyframe is dropped, because it would be rejected again."""
@@ -264,106 +272,21 @@ class Uplink:
             self._sent_keyframes |= {each.frame_index for each in due} - rejected
             self._counters = replace(self._counters, keyframe_bytes=self._counters.keyframe_bytes + byte_count)
 
-    def _exchange(
-        self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, SentPart]
-    ) -> GaussLiteError | None:
-        """Send on one stream and handle the outcomes; returns the last error that needs a retry."""
-        error_to_retry: GaussLiteError | None = None
-        try:
-            for response in self._client.contribute(requests, self._settings.deadline_s):
-                for outcome in response.outcomes:
-                    if outcome.sequence in sent:
-                        error_to_retry = self._handle_outcome(outcome, sent.pop(outcome.sequence)) or error_to_retry
-        except InvalidInputError as error:
-            # the server refuses these messages permanently
-            for each in sent.values():
-                self._drop(each.batch, str(error))
-            sent.clear()
-        return error_to_retry
-
     def _join_if_needed(self) -> Session:
         if self._session is None:
             # a robot with a new map cannot send tombstones for the updates of its earlier map
             fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
             report, frame = self._objects.latest, self._settings.world_frame
             task = None if report is None else report.graph
-            self._session = self._client.join(
-                self._agent_id, self._grid, frame, fresh, task, self._settings.T_fused_agent
-            )
-            if not self._spool.is_stored_by(self._session.incarnation_id, self._session.highest_update_seq):
-                self._spool.begin_sending_to(self._session.incarnation_id)
-            self._spool.mark_keyframes_missing(self._session.keyframes)
-            self._message_seq = 0
+            session = self._client.join(self._agent_id, self._grid, frame, fresh, task, self._settings.T_fused_agent)
+            self._resend_missing(session)
+            self._session = session
+            self._spool.mark_keyframes_missing(session.keyframes)
+            self._sender.begin_session(session.max_subset_bytes)
             self._next_check_s = time.monotonic() + self._settings.check_interval_s
-            self._subset_bytes = min(self._subset_bytes, self._session.max_subset_bytes or MAX_SUBSET_BYTES)
             with self._changed:
                 self._counters = replace(self._counters, connected=True, joins=self._counters.joins + 1)
         return self._session
-
-    def _requests(
-        self, due: SpoolBatch, session: Session, sent: dict[int, SentPart]
-    ) -> Iterator[pb.ContributeSubsetsRequest]:
-        start = 0
-        for part in split_batch(due.batch, self._subset_bytes):
-            stop = start + len(part)
-            self._message_seq += 1
-            update_seq = self._spool.next_update_seq(session.highest_update_seq)
-            spooled = SpoolBatch(due.purpose, part, due.enqueue_counts[start:stop])
-            start = stop
-            try:
-                data = encode_subset(
-                    RoiSubset(self._agent_id, session.session_id, self._message_seq, update_seq, part), self._grid
-                )
-            except InvalidInputError as error:
-                self._drop(spooled, str(error))
-                continue
-            sent[self._message_seq] = SentPart(spooled, len(data), update_seq)
-            yield pb.ContributeSubsetsRequest(
-                session_id=session.session_id,
-                sequence=self._message_seq,
-                purpose=_PURPOSES[due.purpose],
-                subset=data,
-            )
-
-    def _handle_outcome(self, outcome: pb.SubsetOutcome, sent: SentPart) -> GaussLiteError | None:
-        """Mark one subset as acknowledged or dropped; returns the error if it must be sent again."""
-        part = sent.batch
-        keys = set(part.batch.keys.tolist())
-        rejected = outcome.status == pb.SUBSET_STATUS_REJECTED
-        if outcome.status == pb.SUBSET_STATUS_ACCEPTED:
-            self._spool.record_acknowledged(sent.update_seq)
-        self._count(part, sent.size_bytes, keys, rejected)
-        if rejected and outcome.reason in ("QUOTA", "STORAGE"):
-            return QuotaError(outcome.message)
-        if rejected and outcome.reason == "CHECKSUM" and not keys & self._resent_damaged:
-            self._resent_damaged |= keys
-            return UnavailableError(outcome.message)
-        self._resent_damaged -= keys
-        if rejected:
-            self._drop(part, f"{outcome.reason} {outcome.message}")
-        else:
-            self._spool.mark_done(part)
-        return None
-
-    def _drop(self, part: SpoolBatch, reason: str) -> None:
-        _log.warning("uplink: updates of %d voxels are dropped: %s", len(part.batch), reason)
-        self._spool.mark_done(part)
-        with self._changed:
-            self._counters = replace(self._counters, subsets_rejected=self._counters.subsets_rejected + 1)
-
-    def _count(self, part: SpoolBatch, size: int, keys: set[int], rejected: bool) -> None:
-        is_roi = part.purpose is Purpose.ROI
-        with self._changed:
-            counters = self._counters
-            self._counters = replace(
-                counters,
-                roi_bytes=counters.roi_bytes + size * is_roi,
-                handover_bytes=counters.handover_bytes + size * (not is_roi),
-                gaussians_sent=counters.gaussians_sent + len(part.batch.gaussians) * (not rejected),
-                subsets_sent=counters.subsets_sent + 1,
-            )
-            if is_roi and not rejected:
-                self._roi_voxels |= keys
 
     def _recover(self, error: GaussLiteError) -> None:
         """Prepare a retry: join again, send smaller messages, or only wait."""
@@ -376,7 +299,7 @@ class Uplink:
         if isinstance(error, SessionUnknownError):
             self._forget_session()
         if isinstance(error, (QuotaError, StorageError)):
-            self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
+            self._sender.halve_messages()
         with self._changed:
             self._counters = replace(self._counters, connected=False)
             self._next_round_s = time.monotonic() + self._retry_delay.after(error)

@@ -119,5 +119,5 @@ def test_every_error_message_is_one_short_line() -> None:
             attempt()
         assert len(str(caught.value)) < 300
         assert "\n" not in str(caught.value)
-    with pytest.raises(SessionUnknownError, match="join, then send every voxel again"):
+    with pytest.raises(SessionUnknownError, match="join again"):
         engine.session("gone")
