@@ -113,7 +113,7 @@ SCORES = (
     Figure("region depth error", _of_scores("roi_depth_l1_m"), _metres),
     Figure("image depth error", _of_scores("full_depth_l1_m"), _metres),
     Figure("region covered", _of_scores("roi_covered"), as_percent),
-    Figure("held-out views", _of_scores("n_views"), as_count),
+    Figure("scored views", _of_scores("n_views"), as_count),
     Figure("of them with the region", _of_scores("n_roi_views"), as_count),
 )
 MAP_SIZE = (

@@ -36,10 +36,11 @@ _MAX_WIDTH_PX = 640
 class SharedView:
     """A photograph at which all runs of one world frame are rendered.
 
-    source: the sequence that holds the frame, empty if unknown. view: the camera and pose of the run that recorded the
-    photograph.
+    recorder: the name of the run that kept the photograph. view: the camera and pose of that run. source: the sequence
+    that holds the frame, empty if unknown.
     """
 
+    recorder: str
     source: str
     image: ViewImage
     view: KeyframeView
@@ -68,21 +69,21 @@ def kappa_legend(contents: ViewContents) -> Element:
 
 
 def shared_views(runs: Sequence[RunResults]) -> list[SharedView]:
-    """Return at most four views of the runs' photographs by frame index; those that show a region come first."""
-    found: dict[tuple[str, int], SharedView] = {}
+    """Return at most four views by frame index; those with a region come first, and the runs take turns."""
+    found: dict[tuple[str, int], tuple[int, SharedView]] = {}
     for run in runs:
         by_index = {view.index: view for view in run.contents.keyframes}
-        for image in run.views:
+        for turn, image in enumerate(run.views):
             view = by_index.get(image.index)
             if view is None or image.roi.shape != (view.camera.height_px, view.camera.width_px):
                 continue
             source = _source_of(run)
             # without a known sequence, equal indices of two runs are different frames
             key = (source or str(run.map_file), image.index)
-            if key not in found or image.roi.sum() > found[key].image.roi.sum():
-                found[key] = SharedView(source, image, view)
-    ranked = sorted(found.values(), key=lambda each: not each.image.roi.any())[:_MAX_VIEWS]
-    return sorted(ranked, key=lambda each: each.image.index)
+            if key not in found or image.roi.sum() > found[key][1].image.roi.sum():
+                found[key] = turn, SharedView(run.name, source, image, view)
+    ranked = sorted(found.values(), key=lambda each: (not each[1].image.roi.any(), each[0]))[:_MAX_VIEWS]
+    return sorted((view for _, view in ranked), key=lambda each: each.image.index)
 
 
 def _source_of(run: RunResults) -> str:
@@ -111,7 +112,8 @@ def _section(
     # row by row, so that equal pictures are next to each other in the grid
     cells = [cell for row in zip(*columns, strict=True) for cell in row]
     grid = element("div", *cells, attributes={"class": "grid", "style": f"--columns:{len(columns)}"})
-    return element("section", element("h3", f"Frame {image.index}"), grid)
+    recorder = [styled("span", "muted", f" photograph kept by {view.recorder}")] if len(runs) > 1 else []
+    return element("section", element("h3", f"Frame {image.index}", *recorder), grid)
 
 
 def _photograph_cells(image: ViewImage, component: Bool[ndarray, "h w"] | None) -> list[Element]:
