@@ -21,7 +21,7 @@ PROGRAMS = {
 }
 SUB_COMMANDS = (
     *("map", "demo", "parse", "eval", "calibrate", "fuse", "export", "report", "view"),
-    *("status", "end", "refine", "fetch", "evict", "unban", "objects", "doctor"),
+    *("status", "end", "refine", "fetch", "evict", "unban", "objects", "doctor", "completion"),
 )
 BENCHMARKS = (
     "raster",

@@ -1,0 +1,52 @@
+"""`gausslite completion`: print the script with which a shell completes commands, options and file names."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+from gausslite.cli.commands import build_parser
+from gausslite.config.paths import read_path
+from gausslite.domain.errors import InvalidInputError
+
+_SHELLS = ("bash", "zsh", "fish")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the shell."""
+    parser.add_argument("shell", choices=_SHELLS, help="the shell that reads the script")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the script. Returns the exit code. Raises InvalidInputError if shtab is not installed."""
+    shtab = _import_shtab()
+    parser = build_parser()
+    for action in _actions(parser):
+        if action.type in (Path, read_path):
+            # shtab reads this attribute of an action
+            vars(action)["complete"] = shtab.DIRECTORY if action.metavar == "DIR" else shtab.FILE
+    print(shtab.complete(parser, options.shell))
+    return 0
+
+
+def _import_shtab() -> ModuleType:
+    try:
+        import shtab
+    except ImportError:
+        raise InvalidInputError(
+            "completion: expected the package 'shtab'; install it with: pip install 'gausslite[completion]'"
+        ) from None
+    return shtab
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Yield the options and arguments of the parser and of all its sub-commands."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)
+        else:
+            yield action
