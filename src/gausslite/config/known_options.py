@@ -27,7 +27,7 @@ KNOWN_OPTIONS: Final = frozenset(
         *("limit-calls", "limit-connections", "limit-idle", "limit-kbps", "log-format", "metrics"),
         *("fused-from-agent", "lens", "shutter", "speeds", "team-sizes", "vote"),
         *("llm-key-variable", "llm-model", "llm-timeout", "llm-url", "loop", "lpips-weights", "map", "masks"),
-        *("max-gaussians", "min-iterations", "mission", "objects", "out", "overwrite", "pair", "pairs"),
+        *("max-gaussians", "max-shown", "min-iterations", "mission", "objects", "out", "overwrite", "pair", "pairs"),
         *(
             "parser",
             "perception",
