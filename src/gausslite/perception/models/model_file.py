@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
+from gausslite.process.telemetry import disable_telemetry
 
 CHECKSUM_FILE: Final = "SHA256SUMS"
 """Optional list of checksums in a model's folder, in the format of `sha256sum`; listed files must match."""
@@ -125,8 +126,8 @@ def require_listed_checksum(path: Path) -> None:
 
 
 def _runtime() -> Any:
-    # must be set before the import: newer runtimes send telemetry by default
-    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    # before the import: newer runtimes send telemetry by default
+    disable_telemetry()
     import onnxruntime
 
     return onnxruntime

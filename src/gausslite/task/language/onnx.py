@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gausslite.domain.errors import InvalidInputError, LanguageModelError, ModelFileError
+from gausslite.process.telemetry import disable_telemetry
 from gausslite.task.language.model import Message
 from gausslite.task.language.prompt import ANSWER_SCHEMA
 
@@ -26,6 +27,8 @@ class OnnxLanguageModel:
     def __init__(self, folder: Path, timeout_s: float = 30.0, max_answer_tokens: int = 1024) -> None:
         """Load the model, which takes seconds. Raises ModelFileError, and InvalidInputError without the extra `llm`."""
         config = _config_of(folder)
+        # before the import, which loads ONNX Runtime
+        disable_telemetry()
         try:
             import onnxruntime_genai
         except ImportError as error:
