@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ import grpc
 import pytest
 from certificates import identity, make_certificates
 from fusion_running import GRID, fusion_server
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, RateLimitError
@@ -21,6 +23,7 @@ from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.token_bucket import TokenBucket
 from gausslite_parser.servicer import parser_service
 
+SERVING = health_pb2.HealthCheckResponse.SERVING
 ROBOT = Caller("10.0.0.7")
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\x04" + bytes(5)
 
@@ -115,6 +118,25 @@ def test_connections_are_limited() -> None:
             connection.close()
         with ParserClient(server.address) as client:
             assert client.parse("Pick up the mug").targets == ("mug",)
+
+
+def test_idle_connections_do_not_lock_out_who_is_connected_already() -> None:
+    with serving([parser_service(RuleParser())], limits=CallLimits(connections=5)) as server:
+        with grpc.insecure_channel(server.address) as channel:
+            check = health_pb2_grpc.HealthStub(channel).Check
+            assert check(health_pb2.HealthCheckRequest(), timeout=20, wait_for_ready=True).status == SERVING
+            opened = list(connections(server.address, 20))
+            # until the server refuses the newest one
+            opened[-1].settimeout(20)
+            with contextlib.suppress(ConnectionError):
+                while opened[-1].recv(4096):
+                    pass
+            assert check(health_pb2.HealthCheckRequest(), timeout=20).status == SERVING
+        for connection in opened:
+            connection.close()
+        with grpc.insecure_channel(server.address) as channel:
+            check = health_pb2_grpc.HealthStub(channel).Check
+            assert check(health_pb2.HealthCheckRequest(), timeout=20, wait_for_ready=True).status == SERVING
 
 
 def test_a_connection_without_a_call_is_closed() -> None:
