@@ -133,9 +133,9 @@ def _verification_text(fetched: FetchedModel) -> str:
 @contextmanager
 def _byte_progress_bar(label: str) -> Iterator[Progress]:
     """Show a progress bar of bytes on stderr."""
-    from tqdm import tqdm
+    from gausslite.cli.progress import progress_bar
 
-    with tqdm(desc=label, unit="B", unit_scale=True, mininterval=0.5) as bar:
+    with progress_bar(None, label, "B") as bar:
 
         def show(done: int, total: int | None) -> None:
             bar.total = total

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from tqdm import tqdm
-
+from gausslite.cli.progress import progress_bar
 from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.chaos.run import ChaosResult, ChaosSettings, run_chaos
@@ -36,7 +35,7 @@ def run_command(options: argparse.Namespace) -> int:
     if not 1 <= options.agents <= _MAX_AGENTS:
         raise InvalidInputError(f"--agents: expected 1 to {_MAX_AGENTS}, got {options.agents}")
     settings = ChaosSettings(options.kills, options.agents, options.seed, options.out)
-    with tqdm(total=settings.kills, unit="fault", disable=None, leave=False) as progress:
+    with progress_bar(settings.kills, "chaos", "fault") as progress:
         result = run_chaos(settings, progress.update)
     values = asdict(result) | {"seed": settings.seed, "agents": settings.agents, "correct": result.is_correct}
     sys.stdout.write(json.dumps(values, indent=1) + "\n" if options.json else "\n".join(_lines(result)) + "\n")

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from tqdm import tqdm
-
+from gausslite.cli.progress import progress_bar
 from gausslite.codec.files import write_atomic
 from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
@@ -38,7 +37,7 @@ def run_command(options: argparse.Namespace) -> int:
         raise InvalidInputError(f"--messages: expected at least {_LEAST_MESSAGES}, got {options.messages}")
     defaults = FuzzSettings()
     settings = FuzzSettings(options.messages, options.seed, options.corpus or defaults.corpus, options.detector)
-    with tqdm(total=settings.messages, unit="message", disable=None, leave=False) as progress:
+    with progress_bar(settings.messages, "fuzz", "message") as progress:
         results = []
         for result in run_fuzz(settings, progress.update):
             results.append(result)

@@ -8,8 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 
-from tqdm import tqdm
-
+from gausslite.cli.progress import progress_bar
 from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.server.agent_load import LoadResult
@@ -44,7 +43,7 @@ def run_server(options: argparse.Namespace) -> int:
         options.watchers,
         options.hostile,
     )
-    with tqdm(total=len(settings.held), unit="server", disable=None, leave=False) as progress:
+    with progress_bar(len(settings.held), "server", "server") as progress:
         results = []
         for held in settings.held:
             results.append(measure(settings, held, progress.set_description))
