@@ -1,4 +1,4 @@
-"""Read the size of an encoded image from its header, before memory is allocated for its pixels."""
+"""Check the sizes that an encoded image declares, before memory is allocated for them."""
 
 from __future__ import annotations
 
@@ -25,3 +25,14 @@ def image_size(data: bytes) -> tuple[int, int] | None:
         # repeated FF bytes are padding before a marker
         offset += 1 if marker == 0xFF else 2 + struct.unpack_from(">H", data, offset + 2)[0]
     return None
+
+
+def has_whole_chunks(data: bytes) -> bool:
+    """Return False for a PNG with a chunk that ends outside the file: decoders allocate the length that it declares."""
+    offset = len(_PNG)
+    while data.startswith(_PNG) and offset + 8 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, offset)
+        offset += 12 + length
+        if kind == b"IEND":
+            break
+    return offset <= len(data)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.image_bytes import image_size
+from gausslite.domain.image_bytes import has_whole_chunks, image_size
 
 JPEG_QUALITY = 95
 PNG_COMPRESSION = 1
@@ -84,6 +84,8 @@ def _require_size(name: str, data: bytes, width_px: int, height_px: int) -> None
         raise InvalidInputError(f"{name}: expected a JPEG or PNG, got {len(data)} bytes of something else")
     if size != (width_px, height_px):
         raise InvalidInputError(f"{name}: expected the camera's {width_px}x{height_px}, got {size[0]}x{size[1]}")
+    if not has_whole_chunks(data):
+        raise InvalidInputError(f"{name}: expected a whole PNG, got damaged bytes: a chunk ends outside of them")
 
 
 def _decode(data: bytes, flags: int) -> ndarray | None:

@@ -267,6 +267,15 @@ def test_image_sizes() -> None:
     assert image_size(encode_colour(image)) == image_size(encode_colour(image, lossless=True)) == (64, 48)
 
 
+@pytest.mark.parametrize("length", [0x2B000048, 0xFFFFFFFF])
+def test_a_png_chunk_longer_than_the_message_is_refused_before_it_is_allocated(length: int) -> None:
+    data = bytearray(encode_colour(np.zeros((48, 64, 3), np.uint8), lossless=True))
+    start = data.index(b"IDAT") - 4
+    data[start : start + 4] = length.to_bytes(4, "big")
+    with pytest.raises(InvalidInputError, match="a chunk ends outside"):
+        decode_colour(bytes(data), 64, 48)
+
+
 def test_a_map_block_is_checked() -> None:
     grid = VoxelGrid()
     batch = VoxelBatch(np.array([5, 9]), np.zeros(2, np.uint64), np.zeros(2, np.uint32), Gaussians.empty())
