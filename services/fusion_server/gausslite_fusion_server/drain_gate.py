@@ -38,6 +38,8 @@ class DrainGate:
             while True:
                 self.require_open()
                 reading = asyncio.ensure_future(_next(requests))
+                # a call that is cancelled during the wait never reads an invalid request's error
+                reading.add_done_callback(_retrieve_error)
                 await asyncio.wait([reading, closing], return_when=asyncio.FIRST_COMPLETED)
                 if not reading.done():
                     reading.cancel()
@@ -53,3 +55,8 @@ class DrainGate:
 
 async def _next(requests: AsyncIterator[_Message]) -> _Message | None:
     return await anext(requests, None)
+
+
+def _retrieve_error(reading: asyncio.Future[_Message | None]) -> None:
+    if not reading.cancelled():
+        reading.exception()
