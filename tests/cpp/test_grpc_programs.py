@@ -19,7 +19,7 @@ from gausslite.wire.images import encode_colour, encode_depth
 ROOT = Path(__file__).resolve().parents[2]
 
 pytestmark = pytest.mark.skipif(
-    os.environ.get("GAUSSLITE_CPP_CLIENT") != "1", reason="the C++ client takes minutes to build: GAUSSLITE_CPP_CLIENT=1"
+    os.environ.get("GAUSSLITE_CPP_CLIENT") != "1", reason="the build takes a minute: set GAUSSLITE_CPP_CLIENT=1"
 )
 
 

@@ -1,4 +1,4 @@
-"""The C++ decoder, written from docs/wire.md, agrees with the Python one value by value and refuses damaged messages."""
+"""The C++ decoder, written from docs/wire.md, gives the Python decoder's values and refuses damaged messages."""
 
 from __future__ import annotations
 
