@@ -71,9 +71,7 @@ def test_every_value_is_that_of_the_python_decoder(program, tmp_path):
         assert float(first[5]) == grid.size_m
         voxels = [tuple(map(int, line[1:])) for line in lines if line[0] == "voxel"]
         batch = subset.batch
-        assert voxels == list(
-            zip(batch.keys.tolist(), batch.kappa_sums.tolist(), batch.counts.tolist(), strict=True)
-        )
+        assert voxels == list(zip(batch.keys.tolist(), batch.kappa_sums.tolist(), batch.counts.tolist(), strict=True))
         rows = [line[1:] for line in lines if line[0] == "gaussian"]
         g = batch.gaussians
         expected = np.column_stack([g.means_m, g.quats_wxyz, g.scales_m, g.opacities, g.rgb])
