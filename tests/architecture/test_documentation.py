@@ -122,7 +122,8 @@ def known_flags() -> set[str]:
 
 def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
     others = {"--check", "--editable", "--no-index", "--build", "--python", "--masks"}  # of pip, docker and our tools
-    others |= {"--platform", "--output-dir", "--site-dir", "--dist"}  # of cibuildwheel, mkdocs and pytest-xdist
+    # of cibuildwheel, mkdocs, pytest-xdist and cmake
+    others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel"}
     unknown = []
     for page in pages():
         text = page.read_text()

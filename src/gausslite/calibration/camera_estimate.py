@@ -24,7 +24,7 @@ from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.lens import Lens, LensModel
 
 _MIN_PAIRS = 4
-_MIN_PIXELS = 160 * 120
+_MIN_LENS_PIXELS = 160 * 120
 _READOUTS_S = (0.0, 0.015, 0.03, 0.045)
 _OFFSETS_S = (-0.02, 0.0, 0.02)
 _FINE_STEP_S = 0.0075
@@ -52,10 +52,6 @@ def estimate_camera(source: Source, known: CameraCorrection) -> CameraEstimate:
 
     A lens of `known` is kept. Frames that cannot be read are skipped. Depth must be registered to colour.
     """
-    width_px, height_px = source.camera.width_px, source.camera.height_px
-    if width_px * height_px < _MIN_PIXELS:
-        # noise of tiny images looks like a lens
-        return CameraEstimate(known, (f"images of {width_px}x{height_px} pixels, expected at least 160x120",))
     moving = MovingPairs.read(source, downscaled_size(source.camera))
     if len(moving.pairs) < _MIN_PAIRS:
         reason = f"{len(moving.pairs)} pairs of frames turn fast enough, expected at least {_MIN_PAIRS}"
@@ -66,7 +62,11 @@ def estimate_camera(source: Source, known: CameraCorrection) -> CameraEstimate:
         return CameraEstimate(known, (reason,))
     evidence = []
     correction, coarse = known, moving.halved()
-    if known.lens is None:
+    width_px, height_px = source.camera.width_px, source.camera.height_px
+    if known.lens is None and width_px * height_px < _MIN_LENS_PIXELS:
+        # noise of tiny images looks like a lens
+        evidence.append(f"lens: images of {width_px}x{height_px} pixels, expected at least 160x120")
+    elif known.lens is None:
         correction, reason = _with_lens(moving, coarse, known)
         evidence.append(f"lens: {reason}")
     correction, reason = _with_times(moving, coarse, correction)

@@ -15,7 +15,9 @@ from gausslite.export.formats import FORMATS, ExportSettings, read_map
 from gausslite.export.occupancy import OccupancySettings
 from gausslite.mission.results import as_text, prepare_folder, read_report, require_absent
 
-_MESH_VOXEL_M, _OCCUPANCY_VOXEL_M = 0.01, 0.05
+_MESH_VOXEL_M, _OCCUPANCY_VOXEL_M, _MIN_OPACITY, _VIDEO_S = 0.01, 0.05, 0.3, 12.0
+_FORMATS_OF = {"voxel": ("octomap", "nav2", "mesh"), "min_opacity": ("octomap", "nav2"), "seconds": ("video",)}
+"""The formats on which an option has an effect."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,15 +38,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--min-opacity",
         metavar="A",
         type=Number("min-opacity", float, 0, 1),
-        default=0.3,
-        help="for octomap and nav2 (default: 0.3)",
+        help=f"for octomap and nav2 (default: {_MIN_OPACITY:g})",
     )
     add(
         "--seconds",
         metavar="S",
         type=Number("seconds", float, 0.1, 600),
-        default=12.0,
-        help="length of a video (default: 12)",
+        help=f"length of a video (default: {_VIDEO_S:g})",
     )
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--json", action="store_true", help="print JSON for scripts")
@@ -53,6 +53,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read the map and write the file. Returns the exit code."""
+    _require_effect(options)
     chosen = FORMATS[options.to]
     region = options.region or ("roi" if chosen.region_only else "all")
     report = read_report(options.map)
@@ -65,8 +66,10 @@ def run(options: argparse.Namespace) -> int:
         require_absent(out)
     prepare_folder(out.absolute().parent)
     voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
-    occupancy = OccupancySettings(voxel_m=voxel_m, min_opacity=options.min_opacity)
-    settings = ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress, options.seconds)
+    min_opacity = _MIN_OPACITY if options.min_opacity is None else options.min_opacity
+    occupancy = OccupancySettings(voxel_m=voxel_m, min_opacity=min_opacity)
+    seconds = options.seconds or _VIDEO_S
+    settings = ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress, seconds)
     chosen.write(out, content, settings)
     size = out.stat().st_size
     if options.json:
@@ -75,6 +78,14 @@ def run(options: argparse.Namespace) -> int:
         part = "of the task's region" if region == "roi" else "of the map"
         print(f"{len(content.chosen)} Gaussians {part} → {out} ({chosen.summary}, {size / 1e6:.2f} MB)")
     return 0
+
+
+def _require_effect(options: argparse.Namespace) -> None:
+    """Raise InvalidInputError for an option that the chosen format does not use."""
+    for name, formats in _FORMATS_OF.items():
+        if getattr(options, name) is not None and options.to not in formats:
+            flag = "--" + name.replace("_", "-")
+            raise InvalidInputError(f"{flag}: expected with --to {' or '.join(formats)}, got --to {options.to}")
 
 
 def _default_file(source: Path, suffix: str) -> Path:

@@ -59,9 +59,15 @@ def test_a_slow_camera_gives_no_estimate() -> None:
     assert "turn fast enough" in estimate.evidence[0]
 
 
-def test_nothing_is_estimated_from_tiny_images(tmp_path: Path) -> None:
-    estimate = estimate_camera(open_source(str(write_home(tmp_path / "recording"))), CameraCorrection())
-    assert estimate.correction.is_identity
+def test_times_are_not_estimated_from_a_few_tiny_frames(tmp_path: Path) -> None:
+    correction = estimate_camera(open_source(str(write_home(tmp_path / "recording"))), CameraCorrection()).correction
+    assert (correction.readout_s, correction.time_offset_s, correction.exposure_s) == (0.0, 0.0, 0.0)
+
+
+def test_no_lens_is_estimated_from_tiny_images() -> None:
+    home = "sim:home-1?frames=40&size=96x72&noise=0&exposure=0&speed=60&lens=radtan:-0.2,0,0,0"
+    estimate = estimate_camera(open_source(home), CameraCorrection())
+    assert estimate.correction.lens is None
     assert "expected at least 160x120" in estimate.evidence[0]
 
 

@@ -24,13 +24,35 @@ def test_map_writes_the_cameras_of_its_keyframes(results):
     assert (views[0].camera.width_px, views[0].camera.height_px) == (160, 120)
 
 
-@pytest.mark.parametrize("name", ["ply", "spz", "splat", "gltf", "pcd", "las", "octomap", "nav2", "mesh", "json"])
+OPTIONS = {
+    **dict.fromkeys(("octomap", "nav2", "mesh"), ("--voxel", "0.1")),
+    "video": ("--seconds", "0.2"),
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["ply", "spz", "splat", "gltf", "pcd", "las", "octomap", "nav2", "mesh", "video", "json"]
+)
 def test_every_format_writes_its_default_file(results, name, capsys):
-    assert main(["export", str(results), "--to", name, "--region", "all", "--voxel", "0.1", "--json"]) == 0
+    command = ["export", str(results), "--to", name, "--region", "all", *OPTIONS.get(name, ())]
+    assert main([*command, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["format"], report["gaussians"] > 0, report["bytes"] > 0) == (name, True, True)
-    assert main(["export", str(results), "--to", name, "--region", "all", "--voxel", "0.1"]) == 2
+    assert main(command) == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--voxel", "0.1"), "--voxel: expected with --to octomap or nav2 or mesh, got --to spz"),
+        (("--min-opacity", "0.1"), "--min-opacity: expected with --to octomap or nav2, got --to spz"),
+        (("--seconds", "3"), "--seconds: expected with --to video, got --to spz"),
+    ],
+)
+def test_an_option_without_effect_is_refused(results, capsys, option, message):
+    assert main(["export", str(results), "--to", "spz", *option]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_the_map_itself_is_never_the_output(results, capsys):
