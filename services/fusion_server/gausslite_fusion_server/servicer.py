@@ -62,6 +62,8 @@ from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRe
 _log = logging.getLogger(__name__)
 _MAX_REPORTED_REJECTIONS = 1000
 _WORKERS = 4
+_ALIGN_DELAY_S = 0.1
+"""The messages of this time share one look at which frames are due."""
 
 _Result = TypeVar("_Result")
 
@@ -73,6 +75,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._engine = engine
         self._refinement_worker = refinement_worker
         self._workers = ThreadPoolExecutor(_WORKERS, "fusion")
+        # one thread: several would contend for the interpreter's lock, which costs more than they gain
+        self._decoder = ThreadPoolExecutor(1, "decode")
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
         self._change_blocks = ChangeBlocks(engine.maps, engine.grid)
@@ -103,6 +107,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Wait until the work in threads has ended."""
         self._background.shutdown(wait=True, cancel_futures=True)
         self._workers.shutdown(wait=True)
+        self._decoder.shutdown(wait=True)
         self._committer.shutdown(wait=True)
         self._refinement_worker.close()
 
@@ -152,9 +157,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
     ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
         """Store voxel updates; one acknowledgement for each message."""
-        acknowledged, caller = 0, Caller.of(context)
+        acknowledged, caller, loop = 0, Caller.of(context), asyncio.get_running_loop()
         async for request in self._gate.admit(request_iterator):
-            queued = await self._work(enqueue_subset, self._engine, request, caller)
+            self._gate.require_open()
+            queued = await loop.run_in_executor(self._decoder, enqueue_subset, self._engine, request, caller)
             if not queued.put.done():
                 self._committer.submit(self._engine.commit_updates)
             outcome = await outcome_of(self._engine, queued)
@@ -335,10 +341,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 raise InvalidInputError(f"strategy: expected VOTE, CONCATENATION or REFINED, got {other}")
 
     def _align_in_background(self) -> None:
-        """Start an estimate of the agents' frames, unless one is running. Use on the event loop."""
-        if self._aligning or not self._gate.is_open:
+        """Estimate the agents' frames soon, unless an estimate is pending or running. Use on the event loop."""
+        if not self._aligning:
+            self._aligning = True
+            asyncio.get_running_loop().call_later(_ALIGN_DELAY_S, self._align)
+
+    def _align(self) -> None:
+        if not self._gate.is_open:
             return
-        self._aligning = True
         future = asyncio.get_running_loop().run_in_executor(self._background, self._engine.align_due)
         future.add_done_callback(self._after_aligning)
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int64, UInt8
+from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import CodecError
+
+MAX_WIDTH_BITS = 17
+_WINDOW_BYTES = 3
 
 
 def pack_bits(values: Int64[ndarray, " n"], widths: Int64[ndarray, " n"]) -> bytes:
@@ -17,15 +20,19 @@ def pack_bits(values: Int64[ndarray, " n"], widths: Int64[ndarray, " n"]) -> byt
 
 
 def unpack_bits(data: bytes, widths: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
-    """Return the values of these widths. Raises CodecError if the data has another size or a bit after the last."""
-    total = int(widths.sum())
+    """Return the values of these widths of at most MAX_WIDTH_BITS.
+
+    Raises CodecError if the data has another size or a bit after the last.
+    """
+    ends = np.cumsum(widths)
+    total = int(ends[-1]) if len(ends) else 0
     if len(data) != (total + 7) // 8:
         raise CodecError(f"subset: expected {(total + 7) // 8} bytes of bit fields, got {len(data)}")
-    flat: UInt8[ndarray, " b"] = np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little")
-    if flat[total:].any():
+    if total % 8 and data[-1] >> total % 8:
         raise CodecError("subset: expected zeros after the last bit field, got other bits")
-    places = np.arange(int(widths.max(initial=0)))
-    bits = np.zeros((len(widths), len(places)), np.uint8)
-    bits[places < widths[:, None]] = flat[:total]
-    values: Int64[ndarray, " n"] = bits.astype(np.int64) @ (np.int64(1) << places)
+    starts = ends - widths
+    first, padded = starts >> 3, np.frombuffer(data + bytes(_WINDOW_BYTES), np.uint8).astype(np.int64)
+    # a field of MAX_WIDTH_BITS that begins at the last bit of a byte ends in the second byte after it
+    window = padded[first] | padded[first + 1] << 8 | padded[first + 2] << 16
+    values: Int64[ndarray, " n"] = window >> (starts & 7) & (np.int64(1) << widths) - 1
     return values

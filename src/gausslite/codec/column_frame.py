@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +27,7 @@ class Column:
     @property
     def byte_count(self) -> int:
         """Bytes before compression."""
-        return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
+        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
 
 
 def compress_columns(arrays: Sequence[NDArray[Any]], columns: Sequence[Column]) -> bytes:
@@ -43,7 +44,8 @@ def compress_columns(arrays: Sequence[NDArray[Any]], columns: Sequence[Column]) 
 
 def decompress_columns(frame: bytes, columns: Sequence[Column]) -> list[NDArray[Any]]:
     """Return the arrays. Raises CodecError, before memory is allocated, if the frame declares another size."""
-    size = sum(column.byte_count for column in columns)
+    sizes = [column.byte_count for column in columns]
+    size = sum(sizes)
     try:
         header = zstandard.get_frame_parameters(frame)
         if header.content_size != size or header.window_size > max(size, _MIN_WINDOW_BYTES):
@@ -52,9 +54,9 @@ def decompress_columns(frame: bytes, columns: Sequence[Column]) -> list[NDArray[
     except zstandard.ZstdError as error:
         raise CodecError(f"subset: body is not one zstd frame: {error}") from error
     arrays, start = [], 0
-    for column in columns:
-        arrays.append(_unshuffle(raw[start : start + column.byte_count], column))
-        start += column.byte_count
+    for column, byte_count in zip(columns, sizes, strict=True):
+        arrays.append(_unshuffle(raw[start : start + byte_count], column))
+        start += byte_count
     return arrays
 
 

@@ -120,8 +120,18 @@ def decode_positions(
     codes = totals[1:] - np.repeat(totals[starts], np.diff(starts, append=n))
     if (codes >> 3 * coarse_bits).any():
         raise CodecError("subset positions: expected cells inside their voxels, got one outside")
-    cells = values[n:].reshape(3, n).T.copy()
-    for place in range(coarse_bits):
-        for axis in range(3):
-            cells[:, axis] |= (codes >> (3 * place + 2 - axis) & 1) << (place + fine)
+    cells: Int64[ndarray, "n 3"] = values[n:].reshape(3, n).T | _COARSE_CELLS[codes] << fine[:, None]
     return cells
+
+
+def _coarse_cells() -> Int64[ndarray, "c 3"]:
+    """Return the three indices that each Morton code interleaves."""
+    codes = np.arange(1 << 3 * MAX_COARSE_BITS)
+    cells = np.zeros((len(codes), 3), np.int64)
+    for place in range(MAX_COARSE_BITS):
+        for axis in range(3):
+            cells[:, axis] |= (codes >> (3 * place + 2 - axis) & 1) << place
+    return cells
+
+
+_COARSE_CELLS = _coarse_cells()
