@@ -61,9 +61,17 @@ def write_tiny_yolo(
     return path
 
 
-def write_boxes_only(path: Path) -> Path:
-    """Write a detector without prototypes."""
-    output = np.zeros((1, 6, 3), np.float32)
+def write_boxes_only(
+    path: Path,
+    names: Sequence[str],
+    boxes: Sequence[tuple[float, float, float, float, int, float]],
+    more_rows: int = 0,
+) -> Path:
+    """Write a detector with these constant boxes and without masks: [1, 4+c, A], after it more_rows of zeros."""
+    output = np.zeros((1, 4 + len(names) + more_rows, len(boxes)), np.float32)
+    for column, (x, y, width, height, index, score) in enumerate(boxes):
+        output[0, :4, column] = x, y, width, height
+        output[0, 4 + index, column] = score
     graph = helper.make_graph(
         [helper.make_node("Identity", ["boxes"], ["output0"])],
         "boxes_only",
@@ -72,6 +80,6 @@ def write_boxes_only(path: Path) -> Path:
         [numpy_helper.from_array(output, "boxes")],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    helper.set_model_props(model, {"names": "{0: 'cup', 1: 'chair'}"})
+    helper.set_model_props(model, {"names": str(dict(enumerate(names)))})
     onnx.save(model, str(path))
     return path

@@ -11,7 +11,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.perception.detect import box_iou
 from gausslite.perception.yolo_decode import suppress
-from gausslite.perception.yolo_network import YoloSegNetwork
+from gausslite.perception.yolo_network import YoloNetwork
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class ClassAgnosticSettings:
 class ClassAgnosticSegmenter:
     """A Segmenter that gives each box the mask of the instance, of any class, with the largest overlap."""
 
-    def __init__(self, network: YoloSegNetwork, settings: ClassAgnosticSettings | None = None) -> None:
+    def __init__(self, network: YoloNetwork, settings: ClassAgnosticSettings | None = None) -> None:
         """Without settings, use the defaults for the network's number of classes."""
         self._network = network
         self._settings = settings or ClassAgnosticSettings.for_classes(network.classes)

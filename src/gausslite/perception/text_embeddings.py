@@ -25,11 +25,9 @@ from gausslite.domain.object_names import SYNONYMS, head_of, is_generic, is_stru
 _MIN_SIMILARITY: Final = 0.6
 _MIN_MARGIN: Final = 0.2
 _MIN_REPORTED_SIMILARITY: Final = 0.4
-_NOUN_VECTORS_FILE, _NOUN_NAMES_FILE, _COCO_VECTORS_FILE = (
-    "lvis_v1_clip_a+cname.npy",
-    "lvis_v1_train_cat_info.json",
-    "coco_clip_a+cname.npy",
-)
+NOUN_VECTORS_FILE: Final = "lvis_v1_clip_a+cname.npy"
+NOUN_NAMES_FILE: Final = "lvis_v1_train_cat_info.json"
+_COCO_VECTORS_FILE: Final = "coco_clip_a+cname.npy"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,14 +44,10 @@ class TextEmbeddings:
     @classmethod
     def from_model_folder(cls, model_path: Path) -> TextEmbeddings | None:
         """Read the embedding files in the model's folder; None if there are none. Raises ModelFileError."""
-        vectors_path, names_path = model_path.parent / _NOUN_VECTORS_FILE, model_path.parent / _NOUN_NAMES_FILE
-        if not (vectors_path.is_file() and names_path.is_file()):
+        table = read_noun_vectors(model_path.parent)
+        if table is None:
             return None
-        raw, noun_index = _read_vectors(vectors_path), _read_names(names_path)
-        if max(noun_index.values(), default=-1) >= len(raw):
-            raise ModelFileError(
-                f"{names_path}: expected at most {len(raw)} names, as many as {_NOUN_VECTORS_FILE} has rows"
-            )
+        noun_index, raw = table
         mean = raw.mean(axis=0)
         coco_vectors_path = model_path.parent / _COCO_VECTORS_FILE
         coco_vectors = _unit(_read_vectors(coco_vectors_path) - mean) if coco_vectors_path.is_file() else None
@@ -115,6 +109,22 @@ def match_noun(
     if similarity >= _MIN_SIMILARITY and margin >= _MIN_MARGIN:
         return NounMatch(phrase, MatchBasis.TEXT_FEATURES, (class_names[index],), similarity)
     return NounMatch(phrase, MatchBasis.SIMILAR, (class_names[index],), similarity, accept_similar)
+
+
+def read_noun_vectors(folder: Path) -> tuple[dict[str, int], Float32[ndarray, "n d"]] | None:
+    """Return the row of each noun and the unit vectors in a model's folder; None without the files.
+
+    Raises ModelFileError.
+    """
+    vectors_path, names_path = folder / NOUN_VECTORS_FILE, folder / NOUN_NAMES_FILE
+    if not (vectors_path.is_file() and names_path.is_file()):
+        return None
+    vectors, noun_index = _read_vectors(vectors_path), _read_names(names_path)
+    if max(noun_index.values(), default=-1) >= len(vectors):
+        raise ModelFileError(
+            f"{names_path}: expected at most {len(vectors)} names, as many as {NOUN_VECTORS_FILE} has rows"
+        )
+    return noun_index, vectors
 
 
 def _unit(vectors: Float32[ndarray, "n d"]) -> Float32[ndarray, "n d"]:

@@ -1,4 +1,4 @@
-"""Detect nouns with a YOLO-seg network in an ONNX file: boxes and masks of a fixed set of classes."""
+"""Detect nouns with a YOLO network in an ONNX file: boxes, and masks if it has them, of a fixed set of classes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gausslite.perception.detect import DetectedBox, box_iou
 from gausslite.perception.models.model_file import OpenModel
 from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
 from gausslite.perception.yolo_decode import Candidates, suppress
-from gausslite.perception.yolo_network import YoloSegNetwork
+from gausslite.perception.yolo_network import YoloNetwork
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +44,8 @@ class YoloSettings:
             raise InvalidInputError(f"detector max_boxes: expected 1 to 1000, got {self.max_boxes}")
 
 
-class YoloSegDetector:
-    """A Detector and BoxDetector for one YOLO-seg file with class names in its metadata."""
+class YoloDetector:
+    """A BoxDetector for one YOLO file with class names in its metadata; with masks also a Detector."""
 
     def __init__(
         self, model: OpenModel, embeddings: TextEmbeddings | None = None, settings: YoloSettings | None = None
@@ -56,7 +56,7 @@ class YoloSegDetector:
         """
         self._settings = settings or YoloSettings()
         self._embeddings = embeddings
-        self._network = YoloSegNetwork(model)
+        self._network = YoloNetwork(model)
         if not self._network.names:
             raise ModelFileError(f"model {model.path}: expected class names in the metadata field 'names', got none")
 
@@ -64,6 +64,11 @@ class YoloSegDetector:
     def class_names(self) -> tuple[str, ...]:
         """The names of the network's classes."""
         return self._network.names
+
+    @property
+    def has_masks(self) -> bool:
+        """True if the network has masks; without them `detect` finds nothing, and `boxes` everything."""
+        return self._network.has_masks
 
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return the network's classes that match each query."""
@@ -141,7 +146,7 @@ class YoloSegDetector:
         return match_noun(query, self.class_names, self._embeddings, self._settings.accept_similar)
 
 
-def load_yolo(model: OpenModel, accept_similar: bool = False) -> YoloSegDetector:
+def load_yolo(model: OpenModel, accept_similar: bool = False) -> YoloDetector:
     """Return the detector with the text embeddings of the model's folder. Raises ModelFileError."""
     settings = YoloSettings(accept_similar=accept_similar)
-    return YoloSegDetector(model, TextEmbeddings.from_model_folder(model.path), settings)
+    return YoloDetector(model, TextEmbeddings.from_model_folder(model.path), settings)

@@ -1,4 +1,4 @@
-"""Pre- and post-processing of YOLO-seg: letterboxing, box decoding, non-maximum suppression, masks."""
+"""Pre- and post-processing of YOLO networks: letterboxing, box decoding, non-maximum suppression, masks."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Letterbox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Boxes (left, top, right, bottom) in image pixels with their best class and mask coefficients."""
+    """Boxes (left, top, right, bottom) in image pixels with their best class, and k mask coefficients (0 or 32)."""
 
     boxes_px: Float32[ndarray, "n 4"]
     scores: Float32[ndarray, " n"]
     classes: Int64[ndarray, " n"]
-    coefficients: Float32[ndarray, "n 32"]
+    coefficients: Float32[ndarray, "n k"]
 
     def take(self, rows: Int64[ndarray, " m"]) -> Candidates:
         """Return the candidates of these rows."""
@@ -54,12 +54,19 @@ def letterbox(
 
 
 def decode(
-    output: Float32[ndarray, "rows a"], letterboxing: Letterbox, size_px: tuple[int, int], min_score: float
+    output: Float32[ndarray, "rows a"],
+    classes: int,
+    letterboxing: Letterbox,
+    size_px: tuple[int, int],
+    min_score: float,
 ) -> Candidates:
-    """Return the anchors whose best class reaches min_score, clipped to an image of size_px (height, width)."""
-    class_scores = output[4:-MASK_COEFFICIENTS]
-    classes = class_scores.argmax(axis=0)
-    scores = class_scores[classes, np.arange(output.shape[1])]
+    """Return the anchors whose best class reaches min_score, clipped to an image of size_px (height, width).
+
+    The rows of output are centre x, y, width, height, the scores of the classes, and the mask coefficients.
+    """
+    class_scores = output[4 : 4 + classes]
+    best = class_scores.argmax(axis=0)
+    scores = class_scores[best, np.arange(output.shape[1])]
     kept = np.flatnonzero(scores >= min_score)
     centre_x, centre_y, width, height = output[:4, kept]
     height_px, width_px = size_px
@@ -75,8 +82,8 @@ def decode(
     return Candidates(
         boxes,
         scores[kept].astype(np.float32),
-        classes[kept].astype(np.int64),
-        np.ascontiguousarray(output[-MASK_COEFFICIENTS:, kept].T).astype(np.float32),
+        best[kept].astype(np.int64),
+        np.ascontiguousarray(output[4 + classes :, kept].T).astype(np.float32),
     )
 
 
@@ -94,8 +101,8 @@ def suppress(candidates: Candidates, max_iou: float, max_boxes: int, across_clas
 
 
 def mask_of(
-    coefficients: Float32[ndarray, "32"],
-    prototypes: Float32[ndarray, "32 ph pw"],
+    coefficients: Float32[ndarray, " k"],
+    prototypes: Float32[ndarray, "k ph pw"],
     box_px: Float32[ndarray, "4"],
     letterboxing: Letterbox,
     sizes_px: tuple[tuple[int, int], tuple[int, int]],

@@ -1,4 +1,4 @@
-"""Run a YOLO-seg or FastSAM network: an image in, candidate boxes and masks by class index out."""
+"""Run a YOLO or FastSAM network: an image in, candidate boxes by class index out, with masks if it has prototypes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ _DEFAULT_SIDE_PX: Final = 640
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NetworkOutput:
-    """Raw output for one image, before any threshold."""
+    """Raw output for one image, before any threshold. prototypes: of the masks; k is 0 in a network without masks."""
 
     output: Float32[ndarray, "rows a"]
-    prototypes: Float32[ndarray, "32 ph pw"]
+    prototypes: Float32[ndarray, "k ph pw"]
     letterboxing: Letterbox
     size_px: tuple[int, int]
     network_size_px: tuple[int, int]
 
     def candidates(self, min_score: float) -> Candidates:
         """Return the boxes whose best class reaches min_score, unordered."""
-        return decode(self.output, self.letterboxing, self.size_px, min_score)
+        classes = len(self.output) - 4 - len(self.prototypes)
+        return decode(self.output, classes, self.letterboxing, self.size_px, min_score)
 
     def masks(self, candidates: Candidates) -> list[Bool[ndarray, "h w"]]:
-        """Return one mask per candidate, False outside its box."""
+        """Return one mask per candidate, False outside its box; empty masks in a network without masks."""
         sizes_px = (self.size_px, self.network_size_px)
         return [
             mask_of(coefficients, self.prototypes, box, self.letterboxing, sizes_px)
@@ -42,8 +43,11 @@ class NetworkOutput:
         ]
 
 
-class YoloSegNetwork:
-    """A network from one image to [1, 4+c+32, A] (boxes, c class scores, mask coefficients) and [1, 32, h, w]."""
+class YoloNetwork:
+    """A network from one image to [1, 4+c+32, A] (boxes, c class scores, mask coefficients) and [1, 32, h, w].
+
+    A network without masks has only [1, 4+c, A], and class names, which state c.
+    """
 
     def __init__(self, model: OpenModel) -> None:
         """Run the model once to check its outputs. Raises ModelFileError."""
@@ -51,10 +55,16 @@ class YoloSegNetwork:
         self._input, self._height_px, self._width_px = _input_of(model.path, self._session)
         blank = np.zeros((1, 3, self._height_px, self._width_px), np.float32)
         outputs = run_once(model, {self._input: blank})
-        self.names = _class_names(self._session)
+        self.names = class_names(self._session)
         self._boxes_index, self._prototypes_index = _output_order(model.path, outputs, len(self.names))
-        self.classes = int(outputs[self._boxes_index].shape[1]) - 4 - MASK_COEFFICIENTS
+        rows = int(outputs[self._boxes_index].shape[1])
+        self.classes = rows - 4 - (MASK_COEFFICIENTS if self.has_masks else 0)
         self._latest: tuple[Frame, NetworkOutput] | None = None
+
+    @property
+    def has_masks(self) -> bool:
+        """True if the network also returns masks."""
+        return self._prototypes_index is not None
 
     def run(self, frame: Frame) -> NetworkOutput:
         """Return the network's output for a frame; the latest output is cached."""
@@ -68,9 +78,9 @@ class YoloSegNetwork:
         outputs = self._session.run(None, {self._input: tensor})
         size_px = (frame.camera.height_px, frame.camera.width_px)
         network_size_px = (self._height_px, self._width_px)
-        return NetworkOutput(
-            outputs[self._boxes_index][0], outputs[self._prototypes_index][0], letterboxing, size_px, network_size_px
-        )
+        index = self._prototypes_index
+        prototypes = np.zeros((0, 1, 1), np.float32) if index is None else outputs[index][0]
+        return NetworkOutput(outputs[self._boxes_index][0], prototypes, letterboxing, size_px, network_size_px)
 
 
 def _input_of(path: Path, session: Any) -> tuple[str, int, int]:
@@ -83,7 +93,7 @@ def _input_of(path: Path, session: Any) -> tuple[str, int, int]:
     return str(inputs[0].name), height, width
 
 
-def _class_names(session: Any) -> tuple[str, ...]:
+def class_names(session: Any) -> tuple[str, ...]:
     """Return the class names in the file's metadata; empty if they are missing or invalid."""
     text = session.get_modelmeta().custom_metadata_map.get("names", "")
     try:
@@ -93,20 +103,21 @@ def _class_names(session: Any) -> tuple[str, ...]:
         return ()
 
 
-def _output_order(path: Path, outputs: list[Float32[ndarray, "..."]], classes: int) -> tuple[int, int]:
-    """Return the indices of boxes and prototypes among the outputs; classes 0 accepts any number of classes."""
+def _output_order(path: Path, outputs: list[Float32[ndarray, "..."]], classes: int) -> tuple[int, int | None]:
+    """Return the indices of boxes and prototypes among the outputs; None without masks.
+
+    classes 0 accepts any number of classes, but only with masks.
+    """
+    if len(outputs) == 1 and classes and outputs[0].ndim == 3 and outputs[0].shape[:2] == (1, 4 + classes):
+        return 0, None
     received = " and ".join(str(list(each.shape)) for each in outputs)
     min_rows = 4 + max(classes, 1) + MASK_COEFFICIENTS
-    rows = str(min_rows) if classes else "4+c+32"
+    rows = f"{min_rows}, A] and [1, 32, h, w], or [1, {4 + classes}, A]" if classes else "4+c+32, A] and [1, 32, h, w]"
     boxes = [
         i for i, each in enumerate(outputs)
         if each.ndim == 3 and (each.shape[1] == min_rows if classes else each.shape[1] >= min_rows) and len(each) == 1
     ]  # fmt: skip
     prototypes = [i for i, each in enumerate(outputs) if each.ndim == 4 and each.shape[:2] == (1, MASK_COEFFICIENTS)]
     if len(boxes) != 1 or len(prototypes) != 1:
-        hint = " (boxes only, no masks)" if len(outputs) == 1 else ""
-        raise ModelFileError(
-            f"model {path}: expected a YOLO-seg network with outputs [1, {rows}, A] and [1, 32, h, w], "
-            f"got {received}{hint}"
-        )
+        raise ModelFileError(f"model {path}: expected a YOLO network with outputs [1, {rows}, got {received}")
     return boxes[0], prototypes[0]

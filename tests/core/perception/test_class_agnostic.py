@@ -11,7 +11,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter, ClassAgnosticSettings
 from gausslite.perception.models.model_file import open_model
-from gausslite.perception.yolo_network import YoloSegNetwork
+from gausslite.perception.yolo_network import YoloNetwork
 
 SURE = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
 # the same square in the image's pixels, which are half the network's, moved down by 16 rows of padding
@@ -26,7 +26,7 @@ def frame_with_red_square() -> Frame:
 
 def segmenter(tmp_path, *boxes, names=("object",)):
     return ClassAgnosticSegmenter(
-        YoloSegNetwork(open_model(write_tiny_yolo(tmp_path / "tiny.onnx", names, boxes, named=False)))
+        YoloNetwork(open_model(write_tiny_yolo(tmp_path / "tiny.onnx", names, boxes, named=False)))
     )
 
 

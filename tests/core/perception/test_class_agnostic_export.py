@@ -11,7 +11,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.perception.models.model_file import open_model
 from gausslite.perception.yolo_decode import letterbox
-from gausslite.perception.yolo_network import YoloSegNetwork
+from gausslite.perception.yolo_network import YoloNetwork
 
 torch = pytest.importorskip("torch", reason="torch, which this network is made with, is not installed")
 pytest.importorskip("onnx", reason="onnx, which torch exports with, is not installed")
@@ -42,7 +42,7 @@ def test_boxes_scores_coefficients_and_prototypes_are_torchs(tmp_path) -> None:
         warnings.simplefilter("ignore")
         blank = torch.zeros(1, 3, HEIGHT_PX, WIDTH_PX)
         torch.onnx.export(network, (blank,), str(path), opset_version=17, dynamo=False)
-    read = YoloSegNetwork(open_model(path, 1))
+    read = YoloNetwork(open_model(path, 1))
     assert read.classes == 1
     rgb = np.random.default_rng(1).integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     camera = Camera(60, 60, 32, 24, WIDTH_PX, HEIGHT_PX)

@@ -42,9 +42,26 @@ def test_a_family_is_identified_by_inputs_and_outputs(tmp_path):
     grounding = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
     assert identify_family(open_model(grounding, 1)) is ModelFamily.GROUNDING_DINO
     assert identify_family(open_model(yolo(tmp_path), 1)) is ModelFamily.YOLO_SEG
-    boxes = write_boxes_only(tmp_path / "boxes.onnx")
-    with pytest.raises(ModelFileError, match=r"boxes only, no masks"):
-        identify_family(open_model(boxes, 1))
+    boxes = write_boxes_only(tmp_path / "boxes.onnx", ("cup", "chair"), [CUP])
+    assert identify_family(open_model(boxes, 1)) is ModelFamily.YOLO_BOXES
+    # rows of box, objectness and classes, as other detectors have them
+    other = write_boxes_only(tmp_path / "other.onnx", ("cup", "chair"), [CUP], more_rows=1)
+    with pytest.raises(ModelFileError, match=r"expected Grounding DINO or .* or YOLO with text features, got images"):
+        identify_family(open_model(other, 1))
+
+
+def test_boxes_with_class_names_get_masks_from_depth(tmp_path):
+    """As an export of YOLO-World whose classes were set before the export: [1, 4+c, A] and names in the metadata."""
+    path = write_boxes_only(tmp_path / "world.onnx", ("wall clock", "cup"), [(24.0, 32.0, 16.0, 16.0, 1, 0.8)])
+    networks = ModelRegistry(path, None, None, 1)
+    (found,) = networks.detector.detect(frame(), ["mug", "clock"])
+    assert (found.phrase, found.score) == ("mug", pytest.approx(0.8))
+    assert found.box_px == pytest.approx((32, 16, 64, 48))
+    assert found.mask.sum() == 24 * 24
+    with pytest.raises(InvalidInputError, match="finds boxes only; expected depth or a FastSAM file"):
+        ModelRegistry(path, "yolo", None, 1)
+    with pytest.raises(InvalidInputError, match=r"expected depth or a FastSAM file, got .*world\.onnx"):
+        ModelRegistry(path, str(path), None, 1)
 
 
 @pytest.mark.parametrize("name", [None, "yolo"])

@@ -15,7 +15,7 @@ from gausslite.perception.models.model_file import open_model
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
 from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
-from gausslite.perception.yolo import YoloSegDetector, load_yolo
+from gausslite.perception.yolo import YoloDetector, load_yolo
 from gausslite.task.rules import RuleParser
 
 
@@ -25,11 +25,11 @@ def kitchen(shared_dir: Path) -> Source:
 
 
 @pytest.fixture(scope="module")
-def detector(shared_dir: Path) -> YoloSegDetector:
+def detector(shared_dir: Path) -> YoloDetector:
     return load_yolo(open_model(shared_dir / "models" / "yolo11n-seg_int8.onnx"))
 
 
-def estimator_for(text: str, kitchen: Source, detector: YoloSegDetector) -> TaskRelevanceEstimator:
+def estimator_for(text: str, kitchen: Source, detector: YoloDetector) -> TaskRelevanceEstimator:
     settings = RelevanceTrackerSettings(up_axis=kitchen.up_axis, max_frames=1)
     return TaskRelevanceEstimator(RuleParser().parse(text), detector, settings)
 

@@ -18,12 +18,12 @@ from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.models.model_file import open_model
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.yolo import YoloSegDetector, YoloSettings, load_yolo
+from gausslite.perception.yolo import YoloDetector, YoloSettings, load_yolo
 
 NAMES = ("cup", "chair", "dining table")
 
 
-def detector_from(path: Path) -> YoloSegDetector:
+def detector_from(path: Path) -> YoloDetector:
     return load_yolo(open_model(path, threads=1))
 
 
@@ -86,7 +86,7 @@ def test_boxes_too_large_for_their_class_are_dropped_whatever_else_is_asked_for(
     for queries in (["cup"], ["cup", "chair", "table"]):
         assert len(detector_from(path).detect(near, queries)) == 1
         assert detector_from(path).detect(far, queries) == []
-    lenient = YoloSegDetector(open_model(path), None, YoloSettings(box_limits=BoxSizeLimits(small_m=2.0)))
+    lenient = YoloDetector(open_model(path), None, YoloSettings(box_limits=BoxSizeLimits(small_m=2.0)))
     assert len(lenient.detect(far, ["cup"])) == 1
 
 
@@ -164,8 +164,17 @@ def test_a_truncated_file_is_refused(tmp_path):
     _refused(path, "expected a readable ONNX model")
 
 
-def test_a_model_of_boxes_only_is_refused(tmp_path):
-    _refused(write_boxes_only(tmp_path / "boxes.onnx"), r"boxes only, no masks")
+def test_boxes_without_masks_are_those_of_the_network_with_masks(tmp_path):
+    chair = (40.0, 30.0, 10.0, 12.0, 1, 0.7)
+    boxes_only = detector_from(write_boxes_only(tmp_path / "boxes.onnx", NAMES, [CUP, chair]))
+    with_masks = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP, chair]))
+    assert (boxes_only.has_masks, with_masks.has_masks) == (False, True)
+    frame = frame_with_red_square()
+    assert boxes_only.boxes(frame, ["mug", "chair"]) == with_masks.boxes(frame, ["mug", "chair"])
+
+
+def test_a_model_with_other_rows_than_its_class_names_is_refused(tmp_path):
+    _refused(write_boxes_only(tmp_path / "boxes.onnx", NAMES, [CUP], more_rows=1), r"or \[1, 7, A\], got \[1, 8, 1\]")
 
 
 def test_a_model_without_class_names_is_refused(tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
-from gausslite.perception.detect import Detector, SegmentedDetector, Segmenter
+from gausslite.perception.detect import BoxDetector, Detector, SegmentedDetector, Segmenter
 from gausslite.perception.models.model_file import OpenModel, open_model
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS
 
@@ -20,24 +20,38 @@ class ModelFamily(StrEnum):
 
     GROUNDING_DINO = "Grounding DINO"
     YOLO_SEG = "YOLO-seg or FastSAM"
+    YOLO_BOXES = "YOLO with class names"
+    PROMPTED_YOLO = "YOLO with text features"
 
 
 def identify_family(model: OpenModel) -> ModelFamily:
     """Return the family of an open model. Raises ModelFileError if it is not supported."""
     from gausslite.perception.grounding import is_grounding
+    from gausslite.perception.prompted_yolo import is_prompted
 
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
     if is_grounding([each.name for each in inputs], [each.name for each in outputs]):
         return ModelFamily.GROUNDING_DINO
+    if is_prompted(model.session):
+        return ModelFamily.PROMPTED_YOLO
     has_image_input = len(inputs) == 1 and len(inputs[0].shape) == 4
     # a dynamic size is known only after the network has run
     channels = [each.shape[1] for each in outputs if len(each.shape) == 4]
     has_prototypes = any(not isinstance(count, int) or count == MASK_COEFFICIENTS for count in channels)
     if has_image_input and has_prototypes and len(outputs) == 2:
         return ModelFamily.YOLO_SEG
+    if has_image_input and _has_named_boxes(model):
+        return ModelFamily.YOLO_BOXES
     received = " → ".join(", ".join(f"{each.name} {each.shape}" for each in ports) for ports in (inputs, outputs))
-    hint = " (boxes only, no masks)" if has_image_input and len(outputs) == 1 else ""
-    raise ModelFileError(f"model {model.path}: expected {' or '.join(ModelFamily)}, got {received}{hint}")
+    raise ModelFileError(f"model {model.path}: expected {' or '.join(ModelFamily)}, got {received}")
+
+
+def _has_named_boxes(model: OpenModel) -> bool:
+    """Return True if the only output is [1, 4+c, A] for the c class names in the metadata."""
+    from gausslite.perception.yolo_network import class_names
+
+    (rows, *more), names = [each.shape for each in model.session.get_outputs()], class_names(model.session)
+    return not more and bool(names) and len(rows) == 3 and rows[1] in (4 + len(names), None)
 
 
 class ModelRegistry:
@@ -50,15 +64,28 @@ class ModelRegistry:
         """Open the detector's file and build the segmenter.
 
         segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour), or the path of a FastSAM file. None
-        selects the detector's own masks if it has them, else "depth". accept_similar: also detect classes that are only
+        selects the detector's own masks if it has them, else "depth". vocabulary: the text encoder's tokenizer,
+        by default next to the detector. accept_similar: also detect classes that are only
         similar to a noun. Raises ModelFileError, InvalidInputError,
         KernelError.
         """
         model = open_model(detector, threads)
-        if identify_family(model) is ModelFamily.GROUNDING_DINO:
-            self._use_grounding(model, segmenter, vocabulary, threads)
+        family = identify_family(model)
+        if family is ModelFamily.YOLO_SEG:
+            self._use_yolo_masks(model, segmenter, threads, accept_similar)
+            return
+        if segmenter == OWN_MASKS:
+            raise InvalidInputError(
+                f"segmenter: {model.path} finds boxes only; expected depth or a FastSAM file, got {OWN_MASKS}"
+            )
+        self._segmenter: Segmenter = _segmenter(segmenter or DEPTH, threads)
+        if family is ModelFamily.YOLO_BOXES:
+            from gausslite.perception.yolo import load_yolo
+
+            boxes: BoxDetector = load_yolo(model, accept_similar)
         else:
-            self._use_yolo(model, segmenter, threads, accept_similar)
+            boxes = _open_vocabulary(model, family, vocabulary, threads)
+        self._detector: Detector = SegmentedDetector(boxes, _with_depth_fallback(self._segmenter))
 
     @property
     def detector(self) -> Detector:
@@ -70,22 +97,9 @@ class ModelRegistry:
         """The segmenter of propagated boxes."""
         return self._segmenter
 
-    def _use_grounding(
-        self, model: OpenModel, segmenter: str | None, vocabulary: Path | None, threads: int | None
+    def _use_yolo_masks(
+        self, model: OpenModel, segmenter: str | None, threads: int | None, accept_similar: bool
     ) -> None:
-        from gausslite.perception.grounding import GroundingDino
-        from gausslite.perception.grounding_text import BertTokenizer
-
-        if segmenter == OWN_MASKS:
-            raise InvalidInputError(
-                f"segmenter: {model.path} finds boxes only; expected depth or a FastSAM file, got {OWN_MASKS}"
-            )
-        tokenizer = BertTokenizer(vocabulary or model.path.parent / VOCABULARY)
-        network = GroundingDino(model, tokenizer)
-        self._segmenter: Segmenter = _segmenter(segmenter or DEPTH, threads)
-        self._detector: Detector = SegmentedDetector(network, _with_depth_fallback(self._segmenter))
-
-    def _use_yolo(self, model: OpenModel, segmenter: str | None, threads: int | None, accept_similar: bool) -> None:
         from gausslite.perception.yolo import load_yolo
 
         network = load_yolo(model, accept_similar)
@@ -96,6 +110,21 @@ class ModelRegistry:
             self._detector = SegmentedDetector(network, _with_depth_fallback(self._segmenter))
 
 
+def _open_vocabulary(
+    model: OpenModel, family: ModelFamily, vocabulary: Path | None, threads: int | None
+) -> BoxDetector:
+    """Return a detector of any phrase with its text encoder."""
+    if family is ModelFamily.GROUNDING_DINO:
+        from gausslite.perception.grounding import GroundingDino
+        from gausslite.perception.grounding_text import BertTokenizer
+
+        return GroundingDino(model, BertTokenizer(vocabulary or model.path.parent / VOCABULARY))
+    from gausslite.perception.phrase_vectors import open_phrase_vectors
+    from gausslite.perception.prompted_yolo import PromptedYolo
+
+    return PromptedYolo(model, open_phrase_vectors(model.path.parent, vocabulary, threads))
+
+
 def _segmenter(name: str, threads: int | None) -> Segmenter:
     """Return the depth segmenter, or a class-agnostic segmenter from a file."""
     from gausslite.perception.depth_segmenter import DepthSegmenter
@@ -103,9 +132,12 @@ def _segmenter(name: str, threads: int | None) -> Segmenter:
     if name == DEPTH:
         return DepthSegmenter()
     from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
-    from gausslite.perception.yolo_network import YoloSegNetwork
+    from gausslite.perception.yolo_network import YoloNetwork
 
-    return ClassAgnosticSegmenter(YoloSegNetwork(open_model(Path(name), threads)))
+    network = YoloNetwork(open_model(Path(name), threads))
+    if not network.has_masks:
+        raise InvalidInputError(f"segmenter: expected depth or a FastSAM file, got {name}, which finds boxes only")
+    return ClassAgnosticSegmenter(network)
 
 
 def _with_depth_fallback(first: Segmenter) -> tuple[Segmenter, ...]:
