@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Iterator, Mapping
 from itertools import cycle, islice
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exported_recordings import home_frames, quaternion_row
+from tool_modules import load_tool
 
 from gausslite.datasets.ros.address import BagOptions
 from gausslite.datasets.ros.bag_file import BagFile
@@ -31,14 +30,7 @@ DELAYS_NS = {DEPTH: 60_000_000, "/tf": 250_000_000, DEPTH_INFO: 40_000_000}
 def load_write_bag() -> ModuleType:
     """Return tools/write_bag.py as a module."""
     pytest.importorskip("rosbags", reason="bags need the extra ros")
-    path = Path(__file__).resolve().parents[2] / "tools" / "write_bag.py"
-    spec = importlib.util.spec_from_file_location("write_bag", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_tool("write_bag")
 
 
 def write_robot_bag(path: Path, frames: int = 6, axes: str = "optical") -> BagOptions:

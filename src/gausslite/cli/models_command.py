@@ -1,4 +1,4 @@
-"""`gausslite models`: list, download, verify and inspect model files for detection and segmentation."""
+"""`gausslite models`: list, locate, download, verify and inspect model files for detection and segmentation."""
 
 from __future__ import annotations
 
@@ -21,9 +21,13 @@ if TYPE_CHECKING:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add list, fetch, verify and inspect with their options."""
+    """Add list, source, fetch, verify and inspect with their options."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     _add_list(actions.add_parser("list", help="list the usable files, and which of them are downloaded"))
+    source = actions.add_parser("source", help="print where a file comes from, its licence, and how to export it")
+    source.add_argument("name", metavar="NAME", help="a name that `gausslite models list` prints")
+    _add_catalogue_option(source)
+    source.set_defaults(run=_source)
     _add_fetch(actions.add_parser("fetch", help="download files over HTTPS; resumes interrupted downloads"))
     verify = actions.add_parser("verify", help="check the SHA-256 of files; exit code 2 if one differs")
     verify.add_argument("files", metavar="FILE", type=read_path, nargs="+")
@@ -78,6 +82,17 @@ def _list(options: argparse.Namespace) -> int:
         state = "local" if (options.folder / entry.file_name).is_file() else "-"
         pinned = f"SHA-256 {entry.sha256[:12]}…" if entry.sha256 else "not pinned"
         print(f"{entry.name:16} {state:5} {entry.purpose} ({entry.licence}, {pinned}, at most {entry.max_mib} MiB)")
+    return 0
+
+
+def _source(options: argparse.Namespace) -> int:
+    from gausslite.perception.models.catalogue import entry_named
+
+    entry = entry_named(_entries(options), options.name)
+    print(f"file      {entry.file_name}: {entry.purpose}\nlicence   {entry.licence}")
+    print(f"project   {entry.project or 'not stated in the catalogue'}")
+    if entry.export:
+        print(f"export:\n{entry.export}")
     return 0
 
 

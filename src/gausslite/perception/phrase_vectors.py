@@ -19,7 +19,7 @@ TEXT_ENCODER: Final = "text_encoder.onnx"
 TOKENIZER: Final = "tokenizer.json"
 _DEFAULT_TOKENS: Final = 77
 _MAX_TOKENIZER_BYTES: Final = 1 << 24
-_IDS_TYPES: Final = {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
+TOKEN_ID_TYPES: Final = {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
 # the encoder's hidden state before its projection into the space of the image features
 _UNPROJECTED: Final = "pooler_output"
 
@@ -87,7 +87,7 @@ class ClipTextEncoder:
         """Encode one phrase to check the files. Raises ModelFileError, KernelError without package `tokenizers`."""
         self._model, self._tokenizer = model, _read_tokenizer(tokenizer)
         inputs = {each.name: each for each in model.session.get_inputs()}
-        self._types = {name: _IDS_TYPES.get(each.type) for name, each in inputs.items()}
+        self._types = {name: TOKEN_ID_TYPES.get(each.type) for name, each in inputs.items()}
         ids = [name for name in inputs if name != "attention_mask"]
         if len(ids) != 1 or None in self._types.values() or any(len(each.shape) != 2 for each in inputs.values()):
             received = ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs.values())

@@ -1,25 +1,28 @@
-"""A tiny random Grounding DINO: the exported file equals torch to 1e-4."""
+"""Small random Grounding DINO and CLIP text encoder: the files that tools/export_model.py writes equal torch."""
 
 from __future__ import annotations
 
-import warnings
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tiny_grounding import TinyTokenizer
+from tool_modules import load_tool
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.perception.box_size import BoxSizeLimits
-from gausslite.perception.grounding import INPUTS, OUTPUTS, GroundingDino, GroundingSettings, preprocess
+from gausslite.perception.grounding import INPUTS, GroundingDino, GroundingSettings, preprocess
 from gausslite.perception.grounding_text import encode_phrase
 from gausslite.perception.models.model_file import open_model
+from gausslite.perception.phrase_vectors import open_phrase_vectors
 
 torch = pytest.importorskip("torch", reason="the reference extra brings torch, which this network is made with")
 transformers = pytest.importorskip("transformers", reason="transformers, which has Grounding DINO, is not installed")
 
-HEIGHT_PX, WIDTH_PX, TOKENS = 64, 96, 5
+export_model = load_tool("export_model")
+HEIGHT_PX, WIDTH_PX, TOKENS = 64, 96, 6
 SEEDS = range(3)
 
 
@@ -46,30 +49,17 @@ def network():
             if weights.dim() > 1 and "embeddings" not in name:
                 weights.normal_(0, weights[0].numel() ** -0.5, generator=generator)
 
-    class WithNamedInputs(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.model = model
-
-        def forward(self, *inputs):
-            result = self.model(**dict(zip(INPUTS, inputs, strict=True)))
-            return result.logits, result.pred_boxes
-
-    return WithNamedInputs().eval()
+    return model
 
 
 @pytest.fixture(scope="module")
 def path(network, tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("grounding") / "tiny.onnx"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            torch.onnx.export(
-                network, network_inputs(0, "red mug"), str(file), opset_version=17, dynamo=False,
-                input_names=list(INPUTS), output_names=list(OUTPUTS),
-            )  # fmt: skip
-        except torch.onnx.errors.UnsupportedOperatorError as error:
-            pytest.skip(f"transformers {transformers.__version__} cannot be exported here: {str(error)[:60]}")
+    try:
+        ids = encode_phrase("red mug", TinyTokenizer(), None).input_ids[0].tolist()
+        export_model.export_grounding_dino(network, file, (WIDTH_PX, HEIGHT_PX), ids, TOKENS)
+    except torch.onnx.errors.UnsupportedOperatorError as error:
+        pytest.skip(f"transformers {transformers.__version__} cannot be exported here: {str(error)[:60]}")
     return file
 
 
@@ -93,7 +83,8 @@ def test_every_box_and_score_is_torchs(network, path, phrase):
         frame = Frame(0, 0, rgb(seed), np.ones((48, 96), np.float32), Camera(90, 90, 48, 24, 96, 48), np.eye(4))
         found = detector.boxes(frame, [phrase])
         with torch.no_grad():
-            logits, boxes = (each[0].numpy() for each in network(*network_inputs(seed, phrase)))
+            result = network(**dict(zip(INPUTS, network_inputs(seed, phrase), strict=True)))
+        logits, boxes = result.logits[0].numpy(), result.pred_boxes[0].numpy()
         likely = 1 / (1 + np.exp(-logits))
         sure = likely.max(axis=1) >= 0.001
         sure &= likely[:, : len(text.is_noun)][:, list(text.is_noun)].max(axis=1) >= 0.001
@@ -103,3 +94,29 @@ def test_every_box_and_score_is_torchs(network, path, phrase):
         assert len(found) == len(expected) > 6
         np.testing.assert_allclose([box.score for box in found], likely.max(axis=1)[sure][order], atol=1e-4)
         np.testing.assert_allclose([box.box_px for box in found], expected[order], atol=1e-4 * 96)
+
+
+def test_text_features_are_torchs(tmp_path):
+    pieces = ["<|startoftext|>", "<|endoftext|>", "m", "u", "g</w>", "ug</w>", "mug</w>", "r", "e", "d</w>", "ed</w>"]
+    words = {piece: index for index, piece in enumerate([*pieces, "red</w>"])}
+    merges = ["u g</w>", "m ug</w>", "e d</w>", "r ed</w>"]
+    (tmp_path / "vocab.json").write_text(json.dumps(words), encoding="utf-8")
+    (tmp_path / "merges.txt").write_text("\n".join(["#version: 0.2", *merges]), encoding="utf-8")
+    checkpoint, folder = tmp_path / "checkpoint", tmp_path / "models"
+    tokenizer = transformers.CLIPTokenizerFast(str(tmp_path / "vocab.json"), str(tmp_path / "merges.txt"))
+    config = transformers.CLIPTextConfig(
+        vocab_size=len(words), hidden_size=16, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2,
+        projection_dim=8, bos_token_id=0, eos_token_id=1,
+    )  # fmt: skip
+    torch.manual_seed(2)
+    model = transformers.CLIPTextModelWithProjection(config).eval()
+    tokenizer.save_pretrained(checkpoint)
+    model.save_pretrained(checkpoint)
+    assert export_model.main(["text-encoder", str(checkpoint), str(folder)]) == 0
+    vectors = open_phrase_vectors(folder, None, 1)
+    for phrase in ("mug", "red mug", "red red mug"):
+        with torch.no_grad():
+            expected = model(**tokenizer(phrase, return_tensors="pt")).text_embeds[0].numpy()
+        np.testing.assert_allclose(vectors.vector(phrase), expected / np.linalg.norm(expected), atol=1e-5)
+    assert vectors.dimensions == 8
+    assert export_model.main(["text-encoder", str(tmp_path / "missing"), str(folder)]) == 2

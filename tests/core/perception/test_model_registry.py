@@ -46,7 +46,7 @@ def test_a_family_is_identified_by_inputs_and_outputs(tmp_path):
     assert identify_family(open_model(boxes, 1)) is ModelFamily.YOLO_BOXES
     # rows of box, objectness and classes, as other detectors have them
     other = write_boxes_only(tmp_path / "other.onnx", ("cup", "chair"), [CUP], more_rows=1)
-    with pytest.raises(ModelFileError, match=r"expected Grounding DINO or .* or YOLO with text features, got images"):
+    with pytest.raises(ModelFileError, match=r"expected one of Grounding DINO, .*, text encoder; got images"):
         identify_family(open_model(other, 1))
 
 

@@ -126,6 +126,8 @@ def test_the_registry_finds_the_encoder_beside_the_detector(tmp_path):
     assert found[0].box_px == pytest.approx((32, 16, 64, 48), abs=1e-4)
     with pytest.raises(InvalidInputError, match="finds boxes only"):
         ModelRegistry(path, "yolo", None, 1)
+    with pytest.raises(ModelFileError, match="expected a detector, got a text encoder"):
+        ModelRegistry(tmp_path / "text_encoder.onnx", None, None, 1)
 
 
 def test_missing_and_wrong_text_files_are_named(tmp_path):

@@ -1,4 +1,4 @@
-"""Catalogue of the model files that GaussLite can use: purpose, licence, maximum size and optional SHA-256."""
+"""Catalogue of the model files that GaussLite can use: purpose, source, licence, maximum size and optional SHA-256."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 class ModelEntry:
     """One model file. path: its location below the address of --base-url; the last part is its name on disk.
 
-    Raises InvalidInputError for invalid fields.
+    project: the public project that makes it. export: the commands that make the file, one per line. Raises
+    InvalidInputError for invalid fields.
     """
 
     name: str
@@ -28,6 +29,8 @@ class ModelEntry:
     licence: str
     max_mib: int
     sha256: str | None = None
+    project: str = ""
+    export: str = ""
 
     def __post_init__(self) -> None:
         parts = self.path.split("/")
@@ -51,12 +54,76 @@ class ModelEntry:
         return self.max_mib * _MIB
 
 
+_ULTRALYTICS: Final = "pip install ultralytics\n"
+_TRANSFORMERS: Final = 'pip install "transformers<5" torch onnx\n'
+
 CATALOGUE: Final = (
-    ModelEntry("grounding-dino", "grounding-dino.onnx", "--detector: any noun phrase, boxes", "Apache-2.0", 1024),
-    ModelEntry("bert-vocabulary", "vocab.txt", "--vocabulary: the vocabulary of grounding-dino", "Apache-2.0", 1),
-    ModelEntry("yolo-seg", "yolo11n-seg.onnx", "--detector: 80 classes with masks", "AGPL-3.0", 256),
-    ModelEntry("fastsam", "FastSAM-s.onnx", "--segmenter: masks of everything", "AGPL-3.0", 512),
-)
+    ModelEntry(
+        "grounding-dino", "grounding-dino.onnx", "--detector: any noun phrase, boxes", "Apache-2.0", 1024,
+        project="Grounding DINO, IDEA-Research",
+        export=_TRANSFORMERS + "tools/export_model.py grounding-dino IDEA-Research/grounding-dino-tiny models",
+    ),
+    ModelEntry(
+        "bert-vocabulary", "vocab.txt", "--vocabulary: the vocabulary of grounding-dino", "Apache-2.0", 1,
+        project="BERT, Google Research",
+        export=_TRANSFORMERS + "tools/export_model.py grounding-dino IDEA-Research/grounding-dino-tiny models",
+    ),
+    ModelEntry(
+        "yolo-seg", "yolo11n-seg.onnx", "--detector: 80 classes with masks", "AGPL-3.0", 256,
+        project="YOLO11, Ultralytics",
+        export=_ULTRALYTICS + "yolo export model=yolo11n-seg.pt format=onnx",
+    ),
+    ModelEntry(
+        "yoloe", "yoloe-11s-seg.onnx", "--detector: classes of your choice, with masks", "AGPL-3.0", 512,
+        project="YOLOE, THU-MIG, in Ultralytics",
+        export=_ULTRALYTICS + """python -c "from ultralytics import YOLOE
+names = ['mug', 'kettle', 'counter']
+model = YOLOE('yoloe-11s-seg.pt')
+model.set_classes(names, model.get_text_pe(names))
+model.export(format='onnx')\"""",
+    ),
+    ModelEntry(
+        "yolo-world", "yolov8s-worldv2-classes.onnx", "--detector: classes of your choice, boxes",
+        "GPL-3.0, AGPL-3.0", 512,
+        project="YOLO-World, Tencent AI Lab, in Ultralytics",
+        export=_ULTRALYTICS + """python -c "from ultralytics import YOLOWorld
+model = YOLOWorld('yolov8s-worldv2.pt')
+model.set_classes(['mug', 'kettle', 'counter'])
+model.save('yolov8s-worldv2-classes.pt')"
+yolo export model=yolov8s-worldv2-classes.pt format=onnx""",
+    ),
+    ModelEntry(
+        "yolo-world-text", "yolo-world-text.onnx", "--detector: any noun, boxes; needs text-encoder or noun-vectors",
+        "GPL-3.0", 1024,
+        project="YOLO-World, Tencent AI Lab, with the export of the project yolo-world-onnx",
+        export="# in a copy of yolo-world-onnx; the file's name differs\nmake install\n./export_onnx.py",
+    ),
+    ModelEntry(
+        "text-encoder", "text_encoder.onnx", "text features of any phrase, beside yolo-world-text", "MIT", 512,
+        project="CLIP ViT-B/32, OpenAI",
+        export=_TRANSFORMERS + "tools/export_model.py text-encoder openai/clip-vit-base-patch32 models",
+    ),
+    ModelEntry(
+        "text-tokenizer", "tokenizer.json", "the vocabulary of text-encoder", "MIT", 16,
+        project="CLIP ViT-B/32, OpenAI",
+        export=_TRANSFORMERS + "tools/export_model.py text-encoder openai/clip-vit-base-patch32 models",
+    ),
+    ModelEntry(
+        "noun-vectors", "lvis_v1_clip_a+cname.npy", "text features of 1203 nouns, beside any YOLO", "Apache-2.0", 16,
+        project="Detic, Meta: folder datasets/metadata",
+        export="copy lvis_v1_clip_a+cname.npy and lvis_v1_train_cat_info.json from that folder",
+    ),
+    ModelEntry(
+        "noun-names", "lvis_v1_train_cat_info.json", "the nouns of noun-vectors", "Apache-2.0", 16,
+        project="Detic, Meta: folder datasets/metadata",
+        export="copy lvis_v1_clip_a+cname.npy and lvis_v1_train_cat_info.json from that folder",
+    ),
+    ModelEntry(
+        "fastsam", "FastSAM-s.onnx", "--segmenter: masks of everything", "AGPL-3.0", 512,
+        project="FastSAM, CASIA, in Ultralytics",
+        export=_ULTRALYTICS + "yolo export model=FastSAM-s.pt format=onnx",
+    ),
+)  # fmt: skip
 """No entry has a SHA-256, because exports of one network differ. Pin that of your file by --sha256 or a catalogue."""
 
 
@@ -82,8 +149,8 @@ def entry_named(entries: tuple[ModelEntry, ...], name: str) -> ModelEntry:
 
 
 def _entry(path: Path, name: str, table: Any) -> ModelEntry:
-    kinds = {"path": str, "purpose": str, "licence": str, "max_mib": int, "sha256": str}
-    required = set(kinds) - {"sha256"}
+    kinds = {"path": str, "purpose": str, "licence": str, "max_mib": int, "sha256": str, "project": str, "export": str}
+    required = set(kinds) - {"sha256", "project", "export"}
     fits = (
         isinstance(table, dict)
         and required <= set(table) <= set(kinds)
@@ -91,6 +158,7 @@ def _entry(path: Path, name: str, table: Any) -> ModelEntry:
     )
     if not fits:
         raise InvalidInputError(
-            f"catalogue {path}: {name}: expected texts path, purpose, licence, a whole max_mib and perhaps sha256"
+            f"catalogue {path}: {name}: expected texts path, purpose, licence, a whole max_mib and perhaps sha256, "
+            "project, export"
         )
     return ModelEntry(name, **table)

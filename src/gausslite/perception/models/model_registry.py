@@ -22,11 +22,13 @@ class ModelFamily(StrEnum):
     YOLO_SEG = "YOLO-seg or FastSAM"
     YOLO_BOXES = "YOLO with class names"
     PROMPTED_YOLO = "YOLO with text features"
+    TEXT_ENCODER = "text encoder"
 
 
 def identify_family(model: OpenModel) -> ModelFamily:
     """Return the family of an open model. Raises ModelFileError if it is not supported."""
     from gausslite.perception.grounding import is_grounding
+    from gausslite.perception.phrase_vectors import TOKEN_ID_TYPES
     from gausslite.perception.prompted_yolo import is_prompted
 
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
@@ -34,6 +36,8 @@ def identify_family(model: OpenModel) -> ModelFamily:
         return ModelFamily.GROUNDING_DINO
     if is_prompted(model.session):
         return ModelFamily.PROMPTED_YOLO
+    if all(len(each.shape) == 2 and each.type in TOKEN_ID_TYPES for each in inputs):
+        return ModelFamily.TEXT_ENCODER
     has_image_input = len(inputs) == 1 and len(inputs[0].shape) == 4
     # a dynamic size is known only after the network has run
     channels = [each.shape[1] for each in outputs if len(each.shape) == 4]
@@ -43,7 +47,7 @@ def identify_family(model: OpenModel) -> ModelFamily:
     if has_image_input and _has_named_boxes(model):
         return ModelFamily.YOLO_BOXES
     received = " → ".join(", ".join(f"{each.name} {each.shape}" for each in ports) for ports in (inputs, outputs))
-    raise ModelFileError(f"model {model.path}: expected {' or '.join(ModelFamily)}, got {received}")
+    raise ModelFileError(f"model {model.path}: expected one of {', '.join(ModelFamily)}; got {received}")
 
 
 def _has_named_boxes(model: OpenModel) -> bool:
@@ -64,13 +68,14 @@ class ModelRegistry:
         """Open the detector's file and build the segmenter.
 
         segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour), or the path of a FastSAM file. None
-        selects the detector's own masks if it has them, else "depth". vocabulary: the text encoder's tokenizer,
-        by default next to the detector. accept_similar: also detect classes that are only
-        similar to a noun. Raises ModelFileError, InvalidInputError,
-        KernelError.
+        selects the detector's own masks if it has them, else "depth". vocabulary: the text encoder's, by default next
+        to the detector. accept_similar: also detect classes that are only similar to a noun. Raises ModelFileError,
+        InvalidInputError, KernelError.
         """
         model = open_model(detector, threads)
         family = identify_family(model)
+        if family is ModelFamily.TEXT_ENCODER:
+            raise ModelFileError(f"model {detector}: expected a detector, got a {family}, which belongs beside one")
         if family is ModelFamily.YOLO_SEG:
             self._use_yolo_masks(model, segmenter, threads, accept_similar)
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from model_server import DIGEST, ServedModel, files_in, no_progress, serving
@@ -149,3 +150,19 @@ def test_catalogue_names_and_files_are_distinct_and_an_unknown_name_lists_them()
     assert len({each.name for each in CATALOGUE}) == len({each.file_name for each in CATALOGUE}) == len(CATALOGUE)
     with pytest.raises(InvalidInputError, match="grounding-dino"):
         entry_named(CATALOGUE, "dino")
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in CATALOGUE])
+def test_every_file_has_a_source_whose_commands_can_be_pasted(capsys, name):
+    found = entry_named(CATALOGUE, name)
+    assert main(["models", "source", name]) == 0
+    printed = capsys.readouterr().out
+    assert found.project
+    assert f"licence   {found.licence}\n" in printed
+    assert printed.endswith(f"export:\n{found.export}\n")
+    assert "://" not in printed
+    for command in found.export.split('python -c "')[1:]:
+        compile(command.split('"')[0], name, "exec")
+    for command in found.export.splitlines():
+        if command.startswith("tools/"):
+            assert (Path(__file__).resolve().parents[4] / command.split()[0]).is_file()
