@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from gausslite.domain.errors import StorageError
+from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.joint_refinement import rasterizer_of_backend
 from gausslite.fusion.memory_store import MemoryStore
@@ -46,7 +47,20 @@ def run(arguments: Sequence[str] | None = None) -> int:
 def _open_store(settings: ServerSettings) -> FusionStore:
     if settings.store is None:
         return MemoryStore()
+    if settings.shards is not None:
+        return _open_ray_store(settings.store, settings.shards, settings)
     return SqliteStore(settings.store, settings.store_max_bytes)
+
+
+def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> FusionStore:
+    try:
+        # Ray is large, and an extra
+        from gausslite.cluster.ray_store import RaySettings, RayStore
+    except ModuleNotFoundError as error:
+        raise InvalidInputError(
+            "--shards: expected the package 'ray'; install it with: pip install 'gausslite[ray]'"
+        ) from error
+    return RayStore(RaySettings(folder, shards, settings.ray_address, settings.store_max_bytes))
 
 
 async def _serve(settings: ServerSettings, store: FusionStore) -> None:

@@ -13,6 +13,7 @@ from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.config.view_option import add_view
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings
@@ -24,6 +25,8 @@ from gausslite.wire.tls import Tls
 
 PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"
+RAY_LOCAL = "local"
+MAX_SHARDS = 1024
 _CORRECT, _TRUST = "correct", "trust"
 _MAX_STORE_MB = 1 << 24
 
@@ -32,12 +35,15 @@ _MAX_STORE_MB = 1 << 24
 class ServerSettings:
     """Address, storage (None: in memory) and limits of the server, and the mission that it serves.
 
+    shards: the storage is a folder, for shards on Ray; None for a file.
     view: port of the page that shows the server, None for no page.
     """
 
     listen: str = FUSION_ADDRESS
     store: Path | None = None
     store_max_bytes: int | None = None
+    shards: int | None = None
+    ray_address: str = RAY_LOCAL
     fusion: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
@@ -62,6 +68,10 @@ class MaintenanceSettings:
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Return the settings of the options. Raises InvalidInputError for values that are out of range."""
     options = parse_options(_parser(), arguments, warn=print_message)
+    if options.shards is not None and options.store == MEMORY:
+        raise InvalidInputError("--shards: expected a folder as --store, got none")
+    if options.shards is None and options.ray_address != RAY_LOCAL:
+        raise InvalidInputError("--ray-address: expected --shards beside it")
     quotas = Quotas(
         options.quota_agents,
         options.quota_voxels,
@@ -73,6 +83,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         options.listen,
         None if options.store == MEMORY else Path(options.store),
         None if options.store_max_mb is None else options.store_max_mb << 20,
+        options.shards,
+        options.ray_address,
         FusionSettings(
             VoxelGrid(options.voxel_size),
             options.mission,
@@ -100,7 +112,16 @@ def _parser() -> argparse.ArgumentParser:
     defaults, quotas = ServerSettings(), Quotas()
     add = parser.add_argument
     add("--listen", default=defaults.listen, metavar="ADDRESS", help="HOST:PORT or unix:PATH (default: %(default)s)")
-    add("--store", default=MEMORY, metavar="memory|PATH.sqlite", help="storage of the voxel updates (default: memory)")
+    storage = "storage of the voxel updates; with --shards a folder that all machines share (default: memory)"
+    add("--store", default=MEMORY, metavar="memory|PATH.sqlite|FOLDER", help=storage)
+    shards = "divide the space among this many processes on Ray, each with a standby (default: one file)"
+    add("--shards", type=Number("shards", int, 1, MAX_SHARDS), metavar="N", help=shards)
+    add(
+        "--ray-address",
+        default=RAY_LOCAL,
+        metavar="local|auto|HOST:PORT",
+        help="Ray cluster of --shards; local starts one on this machine (default: %(default)s)",
+    )
     max_mb = Number("store-max-mb", int, 1, _MAX_STORE_MB)
     add("--store-max-mb", type=max_mb, metavar="MB", help="largest size of the SQLite file (default: no limit)")
     add_voxel_size(parser)

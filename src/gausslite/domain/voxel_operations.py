@@ -67,17 +67,18 @@ def tombstones(keys: Int64[ndarray, " k"]) -> VoxelBatch:
     return VoxelBatch(keys, np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint32), Gaussians.empty())
 
 
-def merge_batches(a: VoxelBatch, b: VoxelBatch) -> VoxelBatch:
-    """Return the voxels of both batches, which must be disjoint."""
-    keys = np.concatenate([a.keys, b.keys])
+def merge_batches(*batches: VoxelBatch) -> VoxelBatch:
+    """Return the voxels of all batches, which must be disjoint; empty without batches."""
+    if not batches:
+        return empty_batch()
+    keys = np.concatenate([batch.keys for batch in batches])
     order = np.argsort(keys, kind="stable")
-    counts = np.concatenate([a.counts, b.counts])
+    counts = np.concatenate([batch.counts for batch in batches])
     starts = np.cumsum(counts, dtype=np.int64) - counts
     rows = gather_rows(starts[order], counts[order])
-    sums = np.concatenate([a.kappa_sums, b.kappa_sums])
-    return VoxelBatch(
-        keys[order], sums[order], counts[order], Gaussians.concatenate([a.gaussians, b.gaussians]).take(rows)
-    )
+    sums = np.concatenate([batch.kappa_sums for batch in batches])
+    gaussians = Gaussians.concatenate([batch.gaussians for batch in batches]).take(rows)
+    return VoxelBatch(keys[order], sums[order], counts[order], gaussians)
 
 
 def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]:

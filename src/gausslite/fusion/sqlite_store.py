@@ -49,6 +49,8 @@ INSERT INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (agent_id, vo
 """
 SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, records FROM voxel_updates"
 """Rows as `is_intact` reads them."""
+_SELECT_POSITION = "SELECT value FROM properties WHERE name = 'log_position'"
+_SET_POSITION = "INSERT OR REPLACE INTO properties VALUES ('log_position', ?)"
 _SELECT_AGENT = f"{SELECT_UPDATES} WHERE agent_id = ? ORDER BY voxel"
 _SELECT_VOXELS = f"{SELECT_UPDATES} WHERE agent_id = ? AND voxel IN (SELECT value FROM json_each(?)) ORDER BY voxel"  # noqa: S608
 _UpdateRow = tuple[str, int, int, int, int, int, bytes]
@@ -78,12 +80,18 @@ class SqliteStore:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
             self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
+            self._log_position = sum(int(row[0]) for row in self._read(_SELECT_POSITION))
             self._opened = opened.pop_all()
 
     @property
     def incarnation_id(self) -> str:
         """The id made with the file, by a restore or by a repair."""
         return self._incarnation_id
+
+    @property
+    def log_position(self) -> int:
+        """The number of transactions since the file was made; a backup has that of its source."""
+        return self._log_position
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
@@ -287,7 +295,9 @@ class SqliteStore:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 yield self._writer
+                self._writer.execute(_SET_POSITION, (str(self._log_position + 1),))
                 self._writer.execute("COMMIT")
+                self._log_position += 1
             except BaseException:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")

@@ -13,7 +13,9 @@ from threading import Thread
 
 import numpy as np
 import pytest
+from support.local_replicas import LocalHosts
 
+from gausslite.cluster.sharded_store import ShardedStore
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
@@ -46,9 +48,22 @@ def make_subset(agent_id: str, update_seq: int, counts: dict[int, int], kappa: i
     return RoiSubset(agent_id, "session", update_seq, update_seq, batch)
 
 
-@pytest.fixture(params=["memory", "sqlite"])
+def open_store(kind: str, folder: Path) -> FusionStore:
+    match kind:
+        case "memory":
+            return MemoryStore()
+        case "sqlite":
+            return SqliteStore(folder / "store.sqlite")
+        case "sharded":
+            return ShardedStore([SqliteStore(folder / f"shard-{number}.sqlite") for number in range(3)])
+        case "replicated":
+            return LocalHosts(folder).open_store(2)
+    raise ValueError(kind)
+
+
+@pytest.fixture(params=["memory", "sqlite", "sharded", "replicated"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[FusionStore]:
-    store: FusionStore = MemoryStore() if request.param == "memory" else SqliteStore(tmp_path / "store.sqlite")
+    store = open_store(request.param, tmp_path)
     yield store
     store.close()
 
@@ -187,7 +202,7 @@ def test_a_reopened_sqlite_store_has_the_same_content(tmp_path: Path) -> None:
 CHILD = """
 import sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[2])
+sys.path[:0] = sys.argv[2:]
 from test_fusion_stores import make_subset
 from gausslite.fusion.sqlite_store import SqliteStore
 store = SqliteStore(Path(sys.argv[1]))
@@ -199,9 +214,8 @@ for revision in range(1, 1_000_000):
 
 def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
-    child = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(path), str(Path(__file__).parent)], stdout=subprocess.PIPE, text=True
-    )
+    folders = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+    child = subprocess.Popen([sys.executable, "-c", CHILD, str(path), *folders], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None
     acknowledged = 0
     for line in child.stdout:
