@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import sqlite3
 import subprocess
@@ -58,10 +59,22 @@ def open_store(kind: str, folder: Path) -> FusionStore:
             return ShardedStore([SqliteStore(folder / f"shard-{number}.sqlite") for number in range(3)])
         case "replicated":
             return LocalHosts(folder).open_store(2)
+        case "ray":
+            from gausslite.cluster.ray_store import RaySettings, RayStore
+
+            return RayStore(RaySettings(folder))
     raise ValueError(kind)
 
 
-@pytest.fixture(params=["memory", "sqlite", "sharded", "replicated"])
+RAY = pytest.param(
+    "ray",
+    marks=pytest.mark.skipif(
+        "GAUSSLITE_TEST_RAY" not in os.environ, reason="set GAUSSLITE_TEST_RAY=1: every test starts a Ray of its own"
+    ),
+)
+
+
+@pytest.fixture(params=["memory", "sqlite", "sharded", "replicated", RAY])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[FusionStore]:
     store = open_store(request.param, tmp_path)
     yield store
