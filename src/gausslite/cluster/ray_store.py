@@ -12,6 +12,7 @@ from gausslite.cluster.shard_directory import ShardState, read_states
 from gausslite.cluster.sharded_store import ShardedStore
 from gausslite.cluster.store_calls import LogPosition
 from gausslite.domain.errors import StorageError
+from gausslite.fusion.sqlite_file import StoreLock
 
 _LOCAL_OBJECT_BYTES = 512 << 20
 LOCAL = "local"
@@ -29,7 +30,10 @@ class RaySettings:
 
 
 class RayStore(ShardedStore):
-    """A sharded store whose shards are actors. A local Ray ends with it; actors in a cluster go on."""
+    """A sharded store whose shards are actors. A local Ray ends with it; actors in a cluster go on.
+
+    One process at a time can use a folder.
+    """
 
     def __init__(self, settings: RaySettings) -> None:
         """Connect, and start the actors that do not run.
@@ -42,12 +46,12 @@ class RayStore(ShardedStore):
         except OSError as error:
             raise StorageError(f"store {self._folder}: cannot be made ({error.strerror})") from error
         read_states(self._folder, settings.shards)
-        # the actors of two stores in one cluster have the same names
-        namespace = "gausslite-" + hashlib.sha256(str(self._folder).encode()).hexdigest()[:16]
-        connect(settings.address, namespace, _LOCAL_OBJECT_BYTES if self._is_local else None)
-        self._directory = open_directory(self._folder, settings.shards, settings.max_bytes)
-        self._clients = [RemoteStore(shard, self._directory, call_replica) for shard in range(settings.shards)]
-        super().__init__(self._clients)
+        self._lock_of_server = StoreLock(self._folder / "server")
+        try:
+            self._open(settings)
+        except BaseException:
+            self._lock_of_server.release()
+            raise
 
     def positions(self) -> tuple[LogPosition, ...]:
         """Return the position of each shard after its latest acknowledged call."""
@@ -63,3 +67,12 @@ class RayStore(ShardedStore):
         if self._is_local:
             self._directory.close()
         disconnect()
+        self._lock_of_server.release()
+
+    def _open(self, settings: RaySettings) -> None:
+        # the actors of two stores in one cluster have the same names
+        namespace = "gausslite-" + hashlib.sha256(str(self._folder).encode()).hexdigest()[:16]
+        connect(settings.address, namespace, _LOCAL_OBJECT_BYTES if self._is_local else None)
+        self._directory = open_directory(self._folder, settings.shards, settings.max_bytes)
+        self._clients = [RemoteStore(shard, self._directory, call_replica) for shard in range(settings.shards)]
+        super().__init__(self._clients)

@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 from test_sharded_store import assert_same_content, subset_from
 
-from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.domain.errors import InvalidInputError, StorageError, UnavailableError
 from gausslite.fusion.memory_store import MemoryStore
 
 ray = pytest.importorskip("ray", reason="the extra `ray` is not installed")
 from gausslite.cluster.ray_store import RaySettings, RayStore  # noqa: E402 - needs ray
 
 NODE_CPUS = 1
-PROBE = "import ray; ray.init(address='local', include_dashboard=False); ray.get(ray.remote(int).remote())"
+PROBE = "import ray; ray.init(address='local', include_dashboard=False); ray.get(ray.remote(lambda: 1).remote())"
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +76,8 @@ def test_a_killed_node_loses_no_acknowledged_update(cluster: Any, tmp_path: Path
             cluster.remove_node(victim, allow_graceful=False)
     assert_same_content(store, one)
     wait_for_standbys(store)
+    with pytest.raises(StorageError, match="in use by another server"):
+        RayStore(settings)
     store.close()
     # another process of the server finds the actors and their content
     again = RayStore(settings)
