@@ -12,7 +12,8 @@ from gausslite.export.packages import import_extra
 
 _PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _TIMEOUT_MS = 60_000
-_SOFTWARE_RENDERING = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_SOFTWARE_RENDERING = ("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader")
+"""As Chromium does it on a machine without a GPU: the page's text on the processor, WebGL through SwiftShader."""
 
 
 @contextmanager

@@ -10,6 +10,8 @@ from gausslite.domain.gaussians import Gaussians
 
 DEFAULT_LIMIT = 150_000
 _ACTIVE_SHARE = 0.5
+_GOLDEN_RATIO = 0.618033988749895
+_LEAST_OPACITY = 1e-3
 
 
 def choose_gaussians(gaussians: Gaussians, limit: int) -> Int64[ndarray, " m"]:
@@ -24,6 +26,22 @@ def choose_gaussians(gaussians: Gaussians, limit: int) -> Int64[ndarray, " m"]:
     active_count = min(len(active), max(int(limit * _ACTIVE_SHARE), limit - len(background)))
     parts = [_top(active, importance, active_count), _top(background, importance, limit - active_count)]
     return np.sort(np.concatenate(parts))
+
+
+def spread_order(gaussians: Gaussians) -> Int64[ndarray, " n"]:
+    """Return all indices so that each prefix is spread evenly over the map, opaque Gaussians first.
+
+    The task's region (active) and the background take turns until one of them is used up.
+    """
+    # multiples of the golden ratio, modulo 1, are evenly spread over the memory order, which follows space
+    priority = ((np.arange(1, len(gaussians) + 1) * _GOLDEN_RATIO) % 1.0) / np.maximum(
+        gaussians.opacities.astype(np.float64), _LEAST_OPACITY
+    )
+    turn = np.empty(len(gaussians), np.int64)
+    for part in (np.flatnonzero(gaussians.active), np.flatnonzero(~gaussians.active)):
+        turn[part[np.argsort(priority[part], kind="stable")]] = np.arange(len(part))
+    order: Int64[ndarray, " n"] = np.argsort(turn, kind="stable")
+    return order
 
 
 def covariances_m2(gaussians: Gaussians) -> Float32[ndarray, "n 3 3"]:

@@ -11,17 +11,14 @@ import numpy as np
 
 from gausslite.view.colours import ColourMode, colours_of, legend_of
 from gausslite.view.contents import ViewContents
-from gausslite.view.level_of_detail import DEFAULT_LIMIT, choose_gaussians, covariances_m2
+from gausslite.view.level_of_detail import DEFAULT_LIMIT, choose_gaussians, covariances_m2, spread_order
 from gausslite.view.local_server import LOOPBACK, LocalServer
-from gausslite.view.moving_cameras import MovingCameras
 from gausslite.view.scene_markers import SceneMarkers
+from gausslite.view.splat_layer import SplatLayer, Splats
 from gausslite.view.start_view import start_view
 
 _THOUSAND = 1000
 _MAX_SHOWN = 2_000_000
-_MOVING_LIMIT = 10_000
-"""Gaussians drawn while the camera of a slow browser moves: about 10 frames a second in software rendering."""
-_SPLATS = "/splats"
 _BACKGROUND_GREY = 40
 
 
@@ -35,20 +32,20 @@ class MapPage:
         self.server.scene.set_background_image(np.full((1, 1, 3), _BACKGROUND_GREY, np.uint8))
         self._lock = threading.RLock()
         self._contents: ViewContents | None = None
-        self._is_moving = False
-        self._cameras = MovingCameras(self._show_moving)
-        self.server.on_client_connect(self._cameras.watch)
         gui = self.server.gui
         highest = _MAX_SHOWN // _THOUSAND
         self._problem = gui.add_html("", order=-1)
-        with gui.add_folder("Map"):
+        with gui.add_folder("Map") as folder:
             self._figures = gui.add_html("")
             self._colour = gui.add_dropdown("Colour", [str(mode) for mode in ColourMode])
             self._limit = gui.add_slider("Shown (1000)", 10, highest, 10, min(max(limit // _THOUSAND, 10), highest))
+            self._adapts = gui.add_checkbox("Adapt to browser", True)
             self._legend = gui.add_html("")
+        self._layer = SplatLayer(self.server, folder)
         self._markers = SceneMarkers(self.server)
         self._colour.on_update(lambda _: self._draw_splats())
-        self._limit.on_update(lambda _: self._draw_with_new_limit())
+        self._limit.on_update(lambda _: self._draw_splats())
+        self._adapts.on_update(lambda _: self._layer.set_adaptive(self._adapts.value))
 
     @property
     def url(self) -> str:
@@ -72,6 +69,7 @@ class MapPage:
 
     def close(self) -> None:
         """Stop serving."""
+        self._layer.close()
         self.server.stop()
 
     def _set_start_view(self, contents: ViewContents) -> None:
@@ -83,40 +81,22 @@ class MapPage:
             camera.position = view.position_m
             camera.look_at = view.look_at_m
 
-    def _draw_with_new_limit(self) -> None:
-        self._cameras.forget()
-        self._draw_splats()
-
-    def _show_moving(self, is_moving: bool) -> None:
-        with self._lock:
-            self._is_moving = is_moving
-            if self._contents is not None and min(len(self._contents.gaussians), self._limit_count) > _MOVING_LIMIT:
-                self._draw_splats()
-
-    @property
-    def _limit_count(self) -> int:
-        return int(self._limit.value) * _THOUSAND
-
     def _draw_splats(self) -> None:
         with self._lock:
             contents = self._contents
             if contents is None:
                 return
             mode = ColourMode(self._colour.value)
-            limit = min(self._limit_count, _MOVING_LIMIT) if self._is_moving else self._limit_count
-            rows = choose_gaussians(contents.gaussians, limit)
+            rows = choose_gaussians(contents.gaussians, int(self._limit.value) * _THOUSAND)
             self._figures.content = _paragraph(_count_text(len(rows), len(contents.gaussians)))
             self._legend.content = legend_html(legend_of(contents, mode))
             if not len(rows):
                 return
+            rows = rows[spread_order(contents.gaussians.take(rows))]
             shown = contents.gaussians.take(rows)
-            arrays = (
-                shown.means_m,
-                covariances_m2(shown),
-                colours_of(contents, mode)[rows],
-                shown.opacities[:, None],
+            self._layer.show(
+                Splats(shown.means_m, covariances_m2(shown), colours_of(contents, mode)[rows], shown.opacities)
             )
-            self.server.scene.add_gaussian_splats(_SPLATS, *arrays)
 
 
 def legend_html(entries: Sequence[tuple[str, tuple[int, int, int]]]) -> str:

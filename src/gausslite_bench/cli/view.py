@@ -20,7 +20,7 @@ def configure_view(parser: argparse.ArgumentParser) -> None:
     add("--gaussians", metavar="N,...", type=read_counts, default=_GAUSSIANS, help=f"map sizes (default: {counts})")
     add("--max-shown", metavar="N", type=int, default=DEFAULT_LIMIT, help="Gaussians drawn (default: %(default)s)")
     add("--size", metavar="WxH", type=read_image_size, default=(1280, 720), help="window (default: 1280x720)")
-    add("--seconds", metavar="S", type=float, default=30.0, help="length of the drag (default: %(default)g)")
+    add("--seconds", metavar="S", type=float, default=10.0, help="length of the drag (default: %(default)g)")
     add_switch(parser, "--json", "print JSON")
     parser.set_defaults(run=run_view)
 
@@ -39,6 +39,7 @@ def run_view(options: argparse.Namespace) -> int:
 
 def _line(rate: ViewRate) -> str:
     return (
-        f"{rate.gaussians:,} Gaussians, {rate.shown:,} drawn at {rate.width_px}x{rate.height_px}: on the page after "
-        f"{rate.drawn_s:.1f} s, {rate.response_s:.2f} s to answer a move, then {rate.moving_fps:.1f} frames a second"
+        f"{rate.gaussians:,} Gaussians at {rate.width_px}x{rate.height_px}: drawn after {rate.drawn_s:.1f} s, a move "
+        f"answered after {rate.interactive_s:.1f} s, {rate.shown:,} drawn from {rate.settled_s:.1f} s on: "
+        f"{rate.response_s:.2f} s to answer a move, then {rate.moving_fps:.1f} frames a second"
     )

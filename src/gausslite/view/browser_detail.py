@@ -1,0 +1,157 @@
+"""Choose how many splats one browser draws: more, step by step, as long as its frames stay fast enough."""
+
+from __future__ import annotations
+
+import statistics
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gausslite.view.splat_layer import Splats
+
+PREVIEW_COUNT = 2_000
+"""Splats that a new browser gets first: in software rendering about 20 frames a second."""
+RESPONSE_LIMIT_S = 0.3
+"""A browser that takes longer to answer a message gets fewer splats. An answer takes about two frames."""
+_STEPS = (PREVIEW_COUNT, 5_000, 10_000, 20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
+_OPTIMISM = 2.0
+"""An answer takes less than in proportion to the splats: more are tried if the proportion gives twice the limit."""
+_REST_S = 0.7
+"""A camera that has not moved for this long is at rest; more splats are sent only then."""
+_ANSWERS = 5
+_ANSWER_LIMIT_S = 60.0
+_STORAGE_KEY = "gausslite-answer"
+
+
+def next_count(shown: int, total: int, response_s: float) -> int:
+    """Return how many of `total` splats to try after `shown` with a response of response_s, `shown` if slow."""
+    larger = min(total, next((step for step in _STEPS if step > shown), total))
+    return larger if response_s * larger <= _OPTIMISM * RESPONSE_LIMIT_S * shown else shown
+
+
+class BrowserDetail:
+    """Owns the splats of one browser and the thread that sends them.
+
+    The thread draws more splats when the camera rests, measures the answers, and goes back one step if they are slow.
+    """
+
+    def __init__(self, client: Any, folder: Any, is_adaptive: bool) -> None:
+        """client: the browser's handle in viser. folder: where its number of splats is shown if it is slow."""
+        self._client = client
+        with folder:
+            self._note = client.gui.add_html("")
+        self._changed = threading.Condition()
+        self._is_adaptive, self._is_restarted, self._is_closed = is_adaptive, False, False
+        self._splats: Splats | None = None
+        self._moved_s = -_REST_S
+        # only the thread uses what follows
+        self._drawn: Splats | None = None
+        self._handle: Any = None
+        self._count, self._usable, self._is_slow = PREVIEW_COUNT, 0, False
+        client.camera.on_update(lambda _: self._note_motion())
+        threading.Thread(target=self._run, name="browser-detail", daemon=True).start()
+
+    def show(self, splats: Splats) -> None:
+        """Replace the splats; a slow browser keeps its number of them."""
+        with self._changed:
+            self._splats = splats
+            self._changed.notify_all()
+
+    def restart(self, is_adaptive: bool) -> None:
+        """Find the number of splats again, or draw all of them."""
+        with self._changed:
+            self._is_adaptive, self._is_restarted = is_adaptive, True
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+    def _note_motion(self) -> None:
+        with self._changed:
+            self._moved_s = time.monotonic()
+
+    def _run(self) -> None:
+        try:
+            while (splats := self._wait_for_work()) is not None:
+                if splats is self._drawn:
+                    self._grow(splats)
+                else:
+                    self._draw(splats, self._count if self._is_adaptive else len(splats))
+        except (ConnectionError, TimeoutError):
+            return
+
+    def _wait_for_work(self) -> Splats | None:
+        """Return splats to draw, or those that are drawn if more of them can be tried; None at the end."""
+        with self._changed:
+            while not self._is_closed:
+                if self._is_restarted:
+                    self._is_restarted, self._drawn = False, None
+                    self._count, self._usable, self._is_slow = PREVIEW_COUNT, 0, False
+                if self._splats is not None and self._splats is not self._drawn:
+                    return self._splats
+                rest_s = None
+                if (
+                    self._splats is not None
+                    and self._is_adaptive
+                    and not self._is_slow
+                    and self._usable < len(self._splats)
+                ):
+                    rest_s = self._moved_s + _REST_S - time.monotonic()
+                    if rest_s <= 0:
+                        return self._splats
+                self._changed.wait(rest_s)
+        return None
+
+    def _grow(self, splats: Splats) -> None:
+        """Measure what is drawn; draw one step more, or the last usable number of splats."""
+        count, response_s = min(self._count, len(splats)), self._response_s()
+        if response_s > RESPONSE_LIMIT_S and self._usable:
+            self._is_slow = True
+            self._draw(splats, self._usable)
+        else:
+            self._usable = count
+            larger = next_count(count, len(splats), response_s)
+            self._is_slow = larger == count < len(splats)
+            if larger > count:
+                self._draw(splats, larger)
+        self._note.content = _note_html(self._usable) if self._is_slow else ""
+
+    def _draw(self, splats: Splats, count: int) -> None:
+        if count > PREVIEW_COUNT:
+            self._handle = splats.add_to(self._client.scene, count)
+        elif self._handle is not None:
+            self._handle.remove()
+            self._handle = None
+        self._drawn, self._count = splats, count
+
+    def _response_s(self) -> float:
+        """Return the median time of an answer: a browser answers a read of its storage between two frames.
+
+        Raises ConnectionError if the browser has left, TimeoutError if it does not answer.
+        """
+        self._wait_for_answer()  # until it has drawn what was sent
+        times_s = []
+        for _ in range(_ANSWERS):
+            started_s = time.perf_counter()
+            self._wait_for_answer()
+            times_s.append(time.perf_counter() - started_s)
+        return statistics.median(times_s)
+
+    def _wait_for_answer(self) -> None:
+        try:
+            self._client.local_storage.get_item(_STORAGE_KEY, _ANSWER_LIMIT_S)
+        except RuntimeError as error:
+            # a browser that refuses to read its storage has answered too
+            if "disconnected" in str(error):
+                raise ConnectionError("the browser has left") from error
+
+
+def _note_html(count: int) -> str:
+    return (
+        f'<div style="padding:0 0.75em;font-size:0.85em">This browser draws {count:,} of them: more would be slow. '
+        f"To draw all, clear the box below.</div>"
+    )
