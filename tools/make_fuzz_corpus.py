@@ -104,6 +104,7 @@ def fusion_messages() -> Iterator[tuple[str, str, Message]]:
     )
     yield "FusionService.RenderView", "small", view
     yield "FusionService.GetSessionStatus", "plain", fusion.GetSessionStatusRequest(mission_id="mission")
+    yield "FusionService.GetKeyframe", "first", fusion.GetKeyframeRequest(agent_id=AGENT_ID, index=0)
     yield "FusionService.KeepSession", "plain", fusion.KeepSessionRequest(session_id=SESSION)
     yield "FusionService.GetUpdateDigests", "plain", fusion.GetUpdateDigestsRequest(session_id=SESSION)
     yield "FusionService.LeaveSession", "forget", fusion.LeaveSessionRequest(session_id=SESSION, forget=True)

@@ -50,6 +50,7 @@ from gausslite_fusion_server.contributions import (
 )
 from gausslite_fusion_server.drain_gate import DrainGate
 from gausslite_fusion_server.exported_file import ExportedFile
+from gausslite_fusion_server.keyframe_reader import read_keyframe
 from gausslite_fusion_server.messages import (
     contribution_to_message,
     declared_frame_from_message,
@@ -185,6 +186,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                     raise
                 response.rejected.add(index=request.keyframe.index, reason=str(error))
         return response
+
+    async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
+        """Return a stored keyframe of an agent, for a person."""
+        self._engine.require_mission(request.mission_id)
+        return await self._work(read_keyframe, self._engine, request)
 
     async def WatchFusedMap(
         self, request: pb.WatchFusedMapRequest, context: Any

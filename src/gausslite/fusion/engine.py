@@ -118,6 +118,12 @@ class FusionEngine:
             return self._members.mission_config
 
     @property
+    def is_unused(self) -> bool:
+        """Whether no agent has a lease, and none has data."""
+        with self._lock:
+            return self._members.is_unused
+
+    @property
     def incarnation_id(self) -> str:
         """The id of the store's content, see FusionStore."""
         return self._store.incarnation_id
@@ -251,6 +257,11 @@ class FusionEngine:
         """
         with self._lock:
             self._keyframes.add(keyframe, selected)
+
+    def encoded_keyframe(self, agent_id: str, index: int | None = None) -> tuple[bytes, tuple[int, ...]]:
+        """Return a keyframe of the agent (see KeyframePool.find) and the indices of all. Raises InvalidInputError."""
+        with self._lock:
+            return self._keyframes.find(agent_id, index), self._keyframes.indices(agent_id)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""

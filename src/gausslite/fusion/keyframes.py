@@ -97,6 +97,18 @@ class KeyframePool:
         """Return the frame indices of this agent's keyframes, ascending."""
         return tuple(sorted(self._sizes_bytes.get(agent_id, ())))
 
+    def find(self, agent_id: str, index: int | None = None) -> bytes:
+        """Return the agent's encoded keyframe, the newest one without an index; empty if it has none.
+
+        Raises InvalidInputError if the agent has keyframes but none of this index.
+        """
+        indices = self.indices(agent_id)
+        if not indices:
+            return b""
+        if index is not None and index not in indices:
+            raise InvalidInputError(f"index: expected a keyframe of {agent_id}, such as {indices[-1]}, got {index}")
+        return self._store.keyframe(agent_id, indices[-1] if index is None else index)
+
     def remove_agent(self, agent_id: str) -> None:
         """Delete an agent's keyframes."""
         self._store.remove_keyframes(agent_id, sorted(self._sizes_bytes.pop(agent_id, ())))

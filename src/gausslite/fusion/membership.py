@@ -45,6 +45,11 @@ class Membership:
         """The agents with a session or with data, and the names of earlier maps."""
         return self.joined | frozenset(self._store.agents())
 
+    @property
+    def is_unused(self) -> bool:
+        """Whether no agent has a lease, and none has data."""
+        return not self._store.agents() and not self._sessions.live_agents
+
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id, see SessionRegistry.get."""
         return self._sessions.get(session_id)

@@ -520,6 +520,80 @@ class RejectedKeyframe(_message.Message):
 Global___RejectedKeyframe: _TypeAlias = RejectedKeyframe  # noqa: Y015
 
 @_typing.final
+class GetKeyframeRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MISSION_ID_FIELD_NUMBER: _builtins.int
+    AGENT_ID_FIELD_NUMBER: _builtins.int
+    INDEX_FIELD_NUMBER: _builtins.int
+    mission_id: _builtins.str
+    agent_id: _builtins.str
+    index: _builtins.int
+    """The frame index; absent: the newest one."""
+    def __init__(
+        self,
+        *,
+        mission_id: _builtins.str = ...,
+        agent_id: _builtins.str = ...,
+        index: _builtins.int | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_index", b"_index", "index", b"index"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_index", b"_index", "agent_id", b"agent_id", "index", b"index", "mission_id", b"mission_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__index: _TypeAlias = _typing.Literal["index"]  # noqa: Y015
+    _WhichOneofArgType__index: _TypeAlias = _typing.Literal["_index", b"_index"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__index) -> _WhichOneofReturnType__index | None: ...
+
+Global___GetKeyframeRequest: _TypeAlias = GetKeyframeRequest  # noqa: Y015
+
+@_typing.final
+class GetKeyframeResponse(_message.Message):
+    """Empty if the server has no keyframe of the agent."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INDEX_FIELD_NUMBER: _builtins.int
+    CAPTURE_TIME_NS_FIELD_NUMBER: _builtins.int
+    COLOUR_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
+    T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
+    INDICES_FIELD_NUMBER: _builtins.int
+    index: _builtins.int
+    capture_time_ns: _builtins.int
+    colour: _builtins.bytes
+    """JPEG or PNG, 8 bits a channel, as received."""
+    @_builtins.property
+    def camera(self) -> _geometry_pb2.Camera: ...
+    @_builtins.property
+    def t_world_camera(self) -> _geometry_pb2.RigidTransform:
+        """In the fused map's frame; absent while the agent's frame does not fit the map."""
+
+    @_builtins.property
+    def indices(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """The indices of all keyframes that the server has of the agent, ascending."""
+
+    def __init__(
+        self,
+        *,
+        index: _builtins.int = ...,
+        capture_time_ns: _builtins.int = ...,
+        colour: _builtins.bytes = ...,
+        camera: _geometry_pb2.Camera | None = ...,
+        t_world_camera: _geometry_pb2.RigidTransform | None = ...,
+        indices: _abc.Iterable[_builtins.int] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_t_world_camera", b"_t_world_camera", "camera", b"camera", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_t_world_camera", b"_t_world_camera", "camera", b"camera", "capture_time_ns", b"capture_time_ns", "colour", b"colour", "index", b"index", "indices", b"indices", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__t_world_camera: _TypeAlias = _typing.Literal["t_world_camera"]  # noqa: Y015
+    _WhichOneofArgType__t_world_camera: _TypeAlias = _typing.Literal["_t_world_camera", b"_t_world_camera"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__t_world_camera) -> _WhichOneofReturnType__t_world_camera | None: ...
+
+Global___GetKeyframeResponse: _TypeAlias = GetKeyframeResponse  # noqa: Y015
+
+@_typing.final
 class WatchFusedMapRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 

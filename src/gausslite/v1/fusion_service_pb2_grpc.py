@@ -49,6 +49,11 @@ class FusionServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesResponse.FromString,
                 _registered_method=True)
+        self.GetKeyframe = channel.unary_unary(
+                '/gausslite.v1.FusionService/GetKeyframe',
+                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeResponse.FromString,
+                _registered_method=True)
         self.WatchFusedMap = channel.unary_stream(
                 '/gausslite.v1.FusionService/WatchFusedMap',
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.WatchFusedMapRequest.SerializeToString,
@@ -141,6 +146,13 @@ class FusionServiceServicer(object):
     def ContributeKeyframes(self, request_iterator, context):
         """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
         selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetKeyframe(self, request, context):
+        """What an agent's camera saw, for a person: one of its stored keyframes. INVALID_ARGUMENT if there is none of this index.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -254,6 +266,11 @@ def add_FusionServiceServicer_to_server(servicer, server):
                     servicer.ContributeKeyframes,
                     request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesResponse.SerializeToString,
+            ),
+            'GetKeyframe': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetKeyframe,
+                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeResponse.SerializeToString,
             ),
             'WatchFusedMap': grpc.unary_stream_rpc_method_handler(
                     servicer.WatchFusedMap,
@@ -402,6 +419,33 @@ class FusionService(object):
             '/gausslite.v1.FusionService/ContributeKeyframes',
             gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesRequest.SerializeToString,
             gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetKeyframe(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/gausslite.v1.FusionService/GetKeyframe',
+            gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeRequest.SerializeToString,
+            gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -49,6 +49,8 @@ class FusionServiceStub:
     """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
     selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
     """
+    GetKeyframe: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetKeyframeRequest, _fusion_service_pb2.GetKeyframeResponse]
+    """What an agent's camera saw, for a person: one of its stored keyframes. INVALID_ARGUMENT if there is none of this index."""
     WatchFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.WatchFusedMapRequest, _fusion_service_pb2.WatchFusedMapResponse]
     """A snapshot of the fused map, then its changes. OUT_OF_RANGE if since_revision is too old: watch from 0."""
     RefineFusedMap: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.RefineFusedMapRequest, _fusion_service_pb2.RefineFusedMapResponse]
@@ -96,6 +98,8 @@ class FusionServiceAsyncStub(FusionServiceStub):
     """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
     selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
     """
+    GetKeyframe: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetKeyframeRequest, _fusion_service_pb2.GetKeyframeResponse]  # type: ignore[assignment]
+    """What an agent's camera saw, for a person: one of its stored keyframes. INVALID_ARGUMENT if there is none of this index."""
     WatchFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.WatchFusedMapRequest, _fusion_service_pb2.WatchFusedMapResponse]  # type: ignore[assignment]
     """A snapshot of the fused map, then its changes. OUT_OF_RANGE if since_revision is too old: watch from 0."""
     RefineFusedMap: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.RefineFusedMapRequest, _fusion_service_pb2.RefineFusedMapResponse]  # type: ignore[assignment]
@@ -158,6 +162,14 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         """Send keyframes for the joint refinement. They are as durable as the server's store. The server keeps the agent's
         selection, at most its quota: then the newest. Invalid ones are reported, others are kept.
         """
+
+    @_abc_1.abstractmethod
+    def GetKeyframe(
+        self,
+        request: _fusion_service_pb2.GetKeyframeRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_fusion_service_pb2.GetKeyframeResponse, _abc.Awaitable[_fusion_service_pb2.GetKeyframeResponse]]:
+        """What an agent's camera saw, for a person: one of its stored keyframes. INVALID_ARGUMENT if there is none of this index."""
 
     @_abc_1.abstractmethod
     def WatchFusedMap(

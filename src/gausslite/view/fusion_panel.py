@@ -12,6 +12,7 @@ from gausslite.view.contents import ViewContents
 from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.map_follower import MapFollower
 from gausslite.view.map_page import MapPage, text_html
+from gausslite.view.team_cameras import TeamCameras
 from gausslite.wire.clients import Export, FusionClient
 
 _FUSED, _REFINED = "fused map", "refined map"
@@ -26,13 +27,14 @@ class FusionPanel:
         self._follower = MapFollower(client.watch)
         self._started_s = self._polled_s = time.monotonic()
         self._bytes = 0
-        self._shown: tuple[str, int] | None = None
+        self._shown: tuple[object, ...] | None = None
         gui = page.server.gui
         with gui.add_folder("Fusion server", order=0):
             self._layer: Any = gui.add_dropdown("Shown map", [_FUSED])
             self._status = gui.add_html("")
             self._refine = gui.add_button("Start refinement")
             self._message = gui.add_html("")
+        self._cameras = TeamCameras(page.server, client)
         with gui.add_folder("History", expand_by_default=False):
             self._traffic = HistoryPlot(gui, "received (kB/s)", ["kB/s"])
             self._size = HistoryPlot(gui, "fused Gaussians (1000)", ["thousand"])
@@ -48,13 +50,17 @@ class FusionPanel:
             self._layer.options = layers
         followed = self._follower.newest()
         revision = status.fused_revision if followed is None else followed.revision
-        shown = (str(self._layer.value), revision)
+        layer = str(self._layer.value)
+        # an agent that replaces keyframes also sends updates, so that the revision changes
+        keyframes = tuple((each.agent_id, each.keyframes) for each in status.agents if each.keyframes)
+        shown = (layer, revision, keyframes, self._cameras.keyframes_back)
         if followed is None or shown == self._shown:
             return
         targets = {each.agent_id: tuple(each.targets) for each in status.agents}
-        contents = followed.contents(targets) if shown[0] == _FUSED else self._download(shown[0], targets)
+        contents = followed.contents(targets) if layer == _FUSED else self._download(layer, targets)
         objects = tuple(each.landmark for each in self._client.query_objects())
-        self._page.show(replace(contents, objects=objects))
+        self._cameras.read([agent_id for agent_id, _ in keyframes])
+        self._page.show(replace(contents, objects=objects, keyframes=self._cameras.draw(objects)))
         self._shown = shown
 
     def close(self) -> None:

@@ -40,6 +40,7 @@ from gausslite.wire.connection import MAX_MESSAGE_BYTES
 from gausslite.wire.convert_objects import report_to_message, team_object_from_message
 from gausslite.wire.digest_messages import digests_from_messages
 from gausslite.wire.images import decode_colour, decode_depth
+from gausslite.wire.stored_keyframe import StoredKeyframe, stored_keyframe_from_message
 from gausslite.wire.tls import Tls
 
 MAX_END_S = 90_000.0
@@ -348,6 +349,14 @@ class FusionClient(ServiceChannel):
         """Return the team's objects that a noun names, or all, the most confident first."""
         request = fusion_service_pb2.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
         return tuple(team_object_from_message(each) for each in self._call(self._stub.QueryObjects, request).objects)
+
+    def keyframe(self, agent_id: str, index: int | None = None) -> StoredKeyframe | None:
+        """Return the agent's keyframe of this frame index, or the newest one; None if the server has none of it.
+
+        Raises InvalidInputError if it has others only.
+        """
+        request = fusion_service_pb2.GetKeyframeRequest(mission_id=self.mission_id, agent_id=agent_id, index=index)
+        return stored_keyframe_from_message(self._call(self._stub.GetKeyframe, request))
 
     def status(self) -> fusion_service_pb2.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""

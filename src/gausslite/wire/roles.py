@@ -29,6 +29,7 @@ ROLES_OF_METHOD: Final = {
     _FUSION + "GetUpdateDigests": _ROBOT,
     _FUSION + "LeaveSession": _ROBOT,
     _FUSION + "WatchFusedMap": _ANY,
+    _FUSION + "GetKeyframe": _ANY,
     _FUSION + "ExportFusedMap": _ANY,
     _FUSION + "QueryObjects": _ANY,
     _FUSION + "RenderView": _ANY,

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from fusion_running import GRID, RunningServer, fusion_server
+from fusion_running import GRID, RunningServer, frame, fusion_server
 from sample_gaussians import plain_gaussians
 
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxel_operations import group_by_voxel
@@ -65,6 +68,55 @@ def test_the_page_shows_who_won_each_voxel_and_what_it_shows():
         finally:
             panel.close()
             page.close()
+
+
+def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one():
+    with fusion_server() as running:
+        contribute(running, "a", "Pick up the mug", [0.0], kappa=5)
+        session = running.client.join("a", GRID).session_id
+        assert running.client.contribute_keyframes(session, [coloured_frame(3, 40), coloured_frame(8, 200)]) == 2
+        contribute(running, "b", "Find the chair", [1.0], kappa=9)
+        page, client = open_page(0, "test"), FusionClient(running.client.address)
+        panel = FusionPanel(page, client)
+        try:
+            wait_for_map(panel._follower)
+            panel.poll()
+            images = panel._cameras._images
+            assert list(images) == ["a"]
+            assert images["a"].label.startswith("a: keyframe 8")
+            assert abs(int(images["a"].image.mean()) - 200) < 3
+            (view,) = page._contents.keyframes
+            np.testing.assert_allclose(view.T_world_camera[:3, 3], [0.8, 0.0, 0.0])
+            panel._cameras._age.value = 1
+            panel.poll()
+            assert images["a"].label.startswith("a: keyframe 3")
+        finally:
+            panel.close()
+            page.close()
+
+
+def test_a_stored_keyframe_is_read_by_its_index():
+    with fusion_server() as running:
+        session = running.client.join("a", GRID, T_fused_agent=moved_x(2.0)).session_id
+        running.client.contribute_keyframes(session, [coloured_frame(3, 40), coloured_frame(8, 200)])
+        keyframe = running.client.keyframe("a", 3)
+        assert (keyframe.index, keyframe.indices, keyframe.camera) == (3, (3, 8), coloured_frame(3, 40).camera)
+        np.testing.assert_allclose(keyframe.T_world_camera[:3, 3], [2.3, 0.0, 0.0])
+        assert running.client.keyframe("b") is None
+        with pytest.raises(InvalidInputError, match="a keyframe of a, such as 8, got 4"):
+            running.client.keyframe("a", 4)
+
+
+def moved_x(distance_m: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = distance_m
+    return pose
+
+
+def coloured_frame(index: int, grey: int) -> Frame:
+    plain = frame(index)
+    rgb = np.full_like(plain.rgb, grey)
+    return replace(plain, rgb=rgb, T_world_camera=moved_x(0.1 * index))
 
 
 def test_a_refused_refinement_is_reported_on_the_page():

@@ -1,0 +1,68 @@
+"""The images on the page of a fusion server: the newest stored keyframe of each agent, or a chosen one of one agent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.domain.objects import ObjectLandmark
+from gausslite.view.camera_image import with_objects
+from gausslite.view.local_server import LocalServer
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.stored_keyframe import StoredKeyframe
+
+MAX_IMAGES = 6
+"""Agents whose images are shown at the same time, the first by name."""
+
+
+class TeamCameras:
+    """Owns the agents' images. `read` and `draw` are called on one thread."""
+
+    def __init__(self, server: LocalServer, client: FusionClient) -> None:
+        self._server, self._client = server, client
+        with server.gui.add_folder("Cameras", order=0, visible=False) as self._folder:
+            self._age: Any = server.gui.add_slider("Keyframes back", 0, 1, 1, 0)
+        self._images: dict[str, Any] = {}
+        self._newest: dict[str, StoredKeyframe] = {}
+        self._chosen: dict[str, StoredKeyframe] = {}
+
+    @property
+    def keyframes_back(self) -> int:
+        """How many keyframes before the newest one the page shows."""
+        return int(self._age.value)
+
+    def read(self, agents: Sequence[str]) -> None:
+        """Read the chosen keyframe of each of these agents. Raises GaussLiteError."""
+        self._newest, self._chosen = {}, {}
+        for agent_id in sorted(agents)[:MAX_IMAGES]:
+            newest = self._client.keyframe(agent_id)
+            if newest is None:
+                continue
+            back = min(self.keyframes_back, len(newest.indices) - 1)
+            chosen = self._client.keyframe(agent_id, newest.indices[-1 - back]) if back else newest
+            self._newest[agent_id], self._chosen[agent_id] = newest, chosen or newest
+        most = max((len(each.indices) for each in self._newest.values()), default=0)
+        self._folder.visible = most > 0
+        self._age.max = max(1, most - 1)
+
+    def draw(self, objects: Sequence[ObjectLandmark]) -> tuple[KeyframeView, ...]:
+        """Draw the images with these objects; return the views for the scene's frusta."""
+        for agent_id in self._images.keys() - self._chosen.keys():
+            self._images.pop(agent_id).remove()
+        views = []
+        for number, (agent_id, keyframe) in enumerate(self._chosen.items()):
+            image = keyframe.rgb
+            if keyframe.T_world_camera is not None:
+                image = with_objects(image, objects, keyframe.camera, keyframe.T_world_camera)
+                time_ns = keyframe.capture_time_ns
+                views.append(KeyframeView(number, time_ns, keyframe.camera, keyframe.T_world_camera, 0))
+            self._show(agent_id, image, f"{agent_id}: keyframe {keyframe.index}, objects in green")
+        return tuple(views)
+
+    def _show(self, agent_id: str, image: Any, label: str) -> None:
+        if agent_id in self._images:
+            self._images[agent_id].image, self._images[agent_id].label = image, label
+        else:
+            with self._folder:
+                self._images[agent_id] = self._server.gui.add_image(image, label=label, format="jpeg")
