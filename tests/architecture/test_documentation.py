@@ -107,7 +107,7 @@ def known_flags() -> set[str]:
     """Return all flags in the --help of all programs."""
     commands = [["gausslite", name, "--help"] for name in SUB_COMMANDS]
     commands += [["gausslite", "bench", name, "--help"] for name in BENCHMARKS]
-    commands += [["gausslite", "models", name, "--help"] for name in ("fetch", "verify", "list", "inspect")]
+    commands += [["gausslite", "models", name, "--help"] for name in ("fetch", "verify", "list", "source", "inspect")]
     commands += [[program, "--help"] for program in PROGRAMS if program != "gausslite"]
     commands.append(["gausslite-fusion-server", "verify", "--help"])
     flags: set[str] = set()
@@ -121,7 +121,8 @@ def known_flags() -> set[str]:
 
 
 def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
-    others = {"--check", "--editable", "--no-index", "--build", "--python", "--masks"}  # of pip, docker and our tools
+    # of pip, docker and our tools
+    others = {"--check", "--editable", "--no-index", "--build", "--python", "--masks", "--homes", "--gains"}
     # of cibuildwheel, mkdocs, pytest-xdist and cmake
     others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel"}
     unknown = []

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.state import State, encode_text, get_array, get_counts, get_floats, get_text, int_array
+from gausslite.perception.colours import no_colours
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.surface_votes import VOXEL_SIZES_M, SurfaceVotes
 
@@ -28,6 +29,7 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "vote_keys": landmark.votes.keys,
         "votes": np.stack([landmark.votes.inside, landmark.votes.outside]),
         "vote_voxel_m": np.array([landmark.votes.voxel_m]),
+        "colours": landmark.colours,
         "score_sums": np.array([landmark.score_sum, *landmark.rival_scores.values()]),
     }
 
@@ -51,8 +53,12 @@ def decode_landmark(state: State) -> Landmark:
     if voxel_m not in VOXEL_SIZES_M:
         raise MapFileError(f"state landmark: expected voxels of {', '.join(map(str, VOXEL_SIZES_M))} m, got {voxel_m}")
     votes = SurfaceVotes(keys, inside, outside, voxel_m)
+    colours = get_array(state, "colours", no_colours().shape, np.float64).copy()
+    if not np.isfinite(colours).all() or (colours < 0).any():
+        raise MapFileError("state landmark: expected colours of zero or more, got others")
     names = get_text(state, "rival_names").splitlines()
     score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
     rivals = dict(zip(names, rival_sums, strict=True))
     landmark = Landmark(*extent, seen_count, missed_count, best_score, farthest_m, first_ns, last_ns, number)
-    return replace(landmark, score_sum=score_sum, rival_scores=rivals, votes=votes, missed_in_a_row=missed_in_a_row)
+    scored = replace(landmark, score_sum=score_sum, rival_scores=rivals)
+    return replace(scored, votes=votes, colours=colours, missed_in_a_row=missed_in_a_row)

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.relevance import Rival
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
+from gausslite.perception.colours import no_colours
 from gausslite.perception.surface_votes import SurfaceVotes
 
 _CELL_GRID: Final = VoxelGrid(0.05)
@@ -30,7 +31,7 @@ class Observation:
     The radius is twice the median distance of the points to the centroid: masks of chairs include background, which
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
     capture time. rival: a different thing detected in the same place. votes: which voxels the mask
-    shows inside and outside the object.
+    shows inside and outside the object. colours: `colour_counts` of the mask's pixels.
     """
 
     phrase: str
@@ -42,6 +43,7 @@ class Observation:
     time_ns: int = 0
     rival: Rival | None = None
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
+    colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
 
     @classmethod
     def from_points(
@@ -75,6 +77,7 @@ class Landmark:
     capture times of its observations. number: assigned by the object map, in the order of first observations.
     score_sum: sum of its scores; rival_scores: sums of the scores of different things in its place. votes: of its
     masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
+    colours: sums over its observations.
     """
 
     phrase: str
@@ -93,6 +96,7 @@ class Landmark:
     rival_scores: dict[str, float] = field(default_factory=dict)
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     missed_in_a_row: int = 0
+    colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -110,6 +114,7 @@ class Landmark:
             score_sum=observation.score,
             rival_scores={} if observation.rival is None else {observation.rival.name: observation.rival.score},
             votes=observation.votes,
+            colours=observation.colours,
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
@@ -119,7 +124,8 @@ class Landmark:
 
     def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
         """Return the whole object as an observation by a camera, to evaluate relations."""
-        return Observation(self.phrase, self.centroid_m, self.radius_m, self.cells, camera_m)
+        place = self.phrase, self.centroid_m, self.radius_m, self.cells, camera_m
+        return Observation(*place, colours=self.colours)
 
     def matches(self, other: Observation) -> bool:
         """Return True if an observation of the same phrase shows this object, in whole or in part."""
@@ -136,6 +142,7 @@ class Landmark:
         self.last_seen_ns = max(self.last_seen_ns, other.last_seen_ns)
         self.score_sum += other.score_sum
         self.votes = self.votes.add(other.votes)
+        self.colours = self.colours + other.colours
         self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
         for name, score in other.rival_scores.items():
             self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score

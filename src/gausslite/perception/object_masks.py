@@ -13,6 +13,7 @@ from numpy import ndarray
 from gausslite.domain.camera import back_project, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
+from gausslite.perception.colours import colour_counts
 from gausslite.perception.detect import bounding_box
 from gausslite.perception.mask_edges import snapped_to_edges
 from gausslite.perception.surface_votes import SurfaceVotes
@@ -22,6 +23,8 @@ _MIN_Z_M: Final = 0.05
 _MARGIN_SHARE: Final = 1.0
 _MIN_MARGIN_PX: Final = 8
 _MAX_VOTING_PIXELS: Final = 40_000
+_MIN_INNER_PIXELS: Final = 20
+_MAX_COLOUR_PIXELS: Final = 500
 _MAX_PROJECTED: Final = 4000
 _CLOSING: Final = np.ones((5, 5), np.uint8)
 
@@ -40,6 +43,13 @@ def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame) -> SurfaceVotes:
     pixels = frame.depth_m[window].size
     points_m, is_known = _points_m(frame, window, math.ceil(math.sqrt(pixels / _MAX_VOTING_PIXELS)))
     return SurfaceVotes.from_points(points_m, mask[window][is_known])
+
+
+def mask_colours(mask: Bool[ndarray, "h w"], frame: Frame) -> Float64[ndarray, "balances ranges"]:
+    """Return the `colour_counts` of a mask's pixels, without its outline, which mixes with what is behind."""
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    pixels = frame.rgb[inner if np.count_nonzero(inner) >= _MIN_INNER_PIXELS else mask]
+    return colour_counts(pixels[:: max(1, len(pixels) // _MAX_COLOUR_PIXELS)])
 
 
 def surface_mask(votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:

@@ -87,18 +87,13 @@ class RelevanceTracker:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Attributes of the task that are not evaluated, different things, and anchors that no frame has shown yet."""
-        attributes = (
-            f"{each.colour} {noun_of(each.name)!r}: colours are not evaluated, every {noun_of(each.name)!r} counts"
-            for each in self._graph.attributes
-            if each.colour is not None
-        )
+        """What colours decided, different things, and anchors that no frame has shown yet."""
         rivals = (
             f"what looks like {each.phrase!r} is rather {rival!r}: not activated; --accept-similar accepts it"
             for each, rival in self._filter.rivals
         )
         unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
-        return (*attributes, *dict.fromkeys(rivals), *unseen)
+        return (*self._filter.colour_notes, *dict.fromkeys(rivals), *unseen)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:

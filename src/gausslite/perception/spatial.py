@@ -1,4 +1,4 @@
-"""Filter detections by the task's spatial relations (Sec. III-B.3)."""
+"""Filter detections by the task's spatial relations (Sec. III-B.3) and colours."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
+from gausslite.perception.colour_filter import ColourFilter
+from gausslite.perception.colours import ColourMatch
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
-from gausslite.perception.object_masks import mask_votes
+from gausslite.perception.object_masks import mask_colours, mask_votes
 from gausslite.perception.relations import RelationGeometry, SpatialSettings, surface_distance_m
 from gausslite.perception.superlatives import select_extreme
 
@@ -51,11 +53,12 @@ def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], fra
     points_m = transform_points(T_world_camera, points)
     camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
     observation = Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
-    return replace(observation, rival=detection.rival, votes=mask_votes(detection.mask, frame))
+    votes, colours = mask_votes(detection.mask, frame), mask_colours(detection.mask, frame)
+    return replace(observation, rival=detection.rival, votes=votes, colours=colours)
 
 
 class SpatialFilter:
-    """Evaluate the graph's relations against all objects seen so far, whether in view or not."""
+    """Evaluate the graph's relations and colours against all objects seen so far, whether in view or not."""
 
     def __init__(
         self, graph: TaskGraph, up_axis: UpAxis, settings: SpatialSettings, evidence: EvidenceSettings | None = None
@@ -68,6 +71,7 @@ class SpatialFilter:
         self._names = {noun: tuple(each for each in graph.targets if noun_of(each) == noun) for noun in nouns}
         superlatives = {each.name: each.superlative for each in graph.attributes}
         self._superlatives = {target: superlatives.get(target) for target in graph.targets}
+        self._colours = ColourFilter(graph)
         self._up = np.array(unit_up_axis(up_axis))
         self._geometry = RelationGeometry(self._up, settings)
         self._evidence = evidence or EvidenceSettings()
@@ -91,9 +95,14 @@ class SpatialFilter:
 
     @property
     def unseen_anchors(self) -> tuple[str, ...]:
-        """Anchors of relations that no frame has shown yet."""
-        needed = dict.fromkeys(noun_of(each.anchor) for relations in self._relations.values() for each in relations)
-        return tuple(anchor for anchor in needed if not self._object_map.with_phrase(anchor))
+        """Anchors of relations that no frame has shown yet, with their colours."""
+        needed = dict.fromkeys(each.anchor for relations in self._relations.values() for each in relations)
+        return tuple(dict.fromkeys(self._colours.label(name) for name in needed if not self._landmarks_of(name)))
+
+    @property
+    def colour_notes(self) -> tuple[str, ...]:
+        """What the colours of the task decided about the confirmed objects, and where they could not."""
+        return self._colours.notes(self.confirmed_landmarks)
 
     def observe(self, observations: Sequence[Observation], visibility: VisibilityCheck | None = None) -> None:
         """Add one frame's observations to the object map; `visibility` also counts the landmarks that it missed."""
@@ -134,16 +143,26 @@ class SpatialFilter:
         self._object_map = ObjectMap(landmarks)
 
     def target_of(self, observation: Observation) -> str | None:
-        """Return the first target of the observation's noun whose relations it satisfies; None if there is none."""
-        names = self._names.get(observation.phrase, ())
-        return next((name for name in names if self._satisfies(self._relations[name], observation)), None)
+        """Return the target that an observation shows: its noun, colour and relations fit; None if there is none.
+
+        The first target whose colour is sure counts, else the first.
+        """
+        names = [
+            name
+            for name in self._names.get(observation.phrase, ())
+            if self._colours.allows(name, observation) and self._satisfies(self._relations[name], observation)
+        ]
+        if not names or self._colours.is_excluded(observation):
+            return None
+        return next((name for name in names if self._colours.match(name, observation) is ColourMatch.YES), names[0])
 
     def _satisfies(self, relations: Sequence[Relation], observation: Observation) -> bool:
         """Return True if no negated relation holds, and any other does (Sec. III-B.3) or none can be evaluated.
 
-        Relations to anchors that were never seen are not evaluated. All the anchors of `between` form one relation.
+        Relations to anchors that were never seen in their colour are not evaluated. All the anchors of `between` form
+        one relation.
         """
-        seen = [each for each in relations if self._object_map.with_phrase(noun_of(each.anchor))]
+        seen = [each for each in relations if self._landmarks_of(each.anchor)]
         simple = [each for each in seen if each.predicate is not Predicate.BETWEEN]
         if any(each.negated and self._holds(each, observation) for each in simple):
             return False
@@ -163,7 +182,7 @@ class SpatialFilter:
 
     def _anchors(self, relation: Relation, observation: Observation) -> list[Landmark]:
         """Return the relation's anchors without the target itself."""
-        landmarks = self._confirmed_landmarks(noun_of(relation.anchor))
+        landmarks = self._confirmed_landmarks(relation.anchor)
         return [each for each in landmarks if not each.is_colocated_with(observation)]
 
     def _holds(self, relation: Relation, observation: Observation) -> bool:
@@ -182,20 +201,24 @@ class SpatialFilter:
     def _is_extreme(self, relation: Relation, observation: Observation) -> bool:
         """Return True for the reliable candidate with the least (or largest) distance to its nearest anchor."""
         sign = 1.0 if relation.predicate is Predicate.CLOSEST_TO else -1.0
-        anchors = self._confirmed_landmarks(noun_of(relation.anchor))
+        anchors = self._confirmed_landmarks(relation.anchor)
         best, best_signed_m = None, np.inf
-        for candidate in self._reliable_landmarks(noun_of(relation.target)):
+        for candidate in self._reliable_landmarks(relation.target):
             distances_m = [surface_distance_m(candidate, each) for each in anchors if each is not candidate]
             if distances_m and sign * min(distances_m) < best_signed_m:
                 best, best_signed_m = candidate, sign * min(distances_m)
         return best is not None and best.matches(observation)
 
-    def _reliable_landmarks(self, phrase: str) -> list[Landmark]:
-        """Return the reliable landmarks of a phrase; if there are none, the confirmed ones."""
-        confirmed = self._confirmed_landmarks(phrase)
+    def _reliable_landmarks(self, name: str) -> list[Landmark]:
+        """Return the reliable landmarks of a name; if there are none, the confirmed ones."""
+        confirmed = self._confirmed_landmarks(name)
         return [each for each in confirmed if self._evidence.is_reliable(each)] or confirmed
 
-    def _confirmed_landmarks(self, phrase: str) -> list[Landmark]:
-        """Return the confirmed landmarks of a phrase; if there are none, all of them."""
-        landmarks = self._object_map.with_phrase(phrase)
+    def _confirmed_landmarks(self, name: str) -> list[Landmark]:
+        """Return the confirmed landmarks of a name; if there are none, all of them."""
+        landmarks = self._landmarks_of(name)
         return [each for each in landmarks if self._evidence.is_confirmed(each)] or landmarks
+
+    def _landmarks_of(self, name: str) -> list[Landmark]:
+        """Return the landmarks of a name's noun, without those of another colour."""
+        return [each for each in self._object_map.with_phrase(noun_of(name)) if self._colours.allows(name, each)]
