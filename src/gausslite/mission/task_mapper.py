@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+from jaxtyping import Float32
+from numpy import ndarray
+
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.noun_match import NounReport
@@ -109,6 +112,10 @@ class TaskMapper:
     def gaussians(self) -> Gaussians:
         """Return a copy of the map."""
         return self._mapper.gaussians()
+
+    def render(self, frame: Frame) -> Float32[ndarray, "h w 3"]:
+        """Return the colours of the map, not clipped to [0, 1], from a frame's pose and motion."""
+        return self._mapper.render(frame.camera, frame.T_world_camera, frame.motion).rgb
 
     @property
     def poses(self) -> PoseHistory:

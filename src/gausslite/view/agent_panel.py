@@ -15,6 +15,7 @@ from gausslite.view.contents import ViewContents
 from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.map_follower import MapFollower
 from gausslite.view.map_page import MapPage, text_html
+from gausslite.view.quality_plot import QualityPlot
 from gausslite.wire.camera_view import CameraView
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert_objects import object_from_message
@@ -45,6 +46,7 @@ class AgentPanel:
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
+            self._quality = QualityPlot(gui)
             self._traffic = HistoryPlot(gui, "sent (kB/s)", ["kB/s"])
         self._assign.on_click(lambda _: self._run(self._assign, self._assign_task))
         self._end.on_click(lambda _: self._run(self._end, self._end_mission))
@@ -65,6 +67,8 @@ class AgentPanel:
         view = self._client.camera_view()
         if view is not None:
             self._show_image(view, objects)
+            rendered, _ = self._client.render(view.camera, view.T_world_camera)
+            self._quality.add(time.monotonic() - self._started_s, rendered, view.rgb, view.roi)
             keyframes = [KeyframeView(i, 0, view.camera, T, 0) for i, T in enumerate(view.keyframes)]
             contents = replace(contents, times_ns=view.times_ns, T_world_camera=view.path, keyframes=keyframes)
         self._page.show(contents)

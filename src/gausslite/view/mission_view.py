@@ -19,6 +19,7 @@ from gausslite.view.camera_image import with_objects, with_region
 from gausslite.view.contents import ViewContents
 from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.open_page import open_page
+from gausslite.view.quality_plot import QualityPlot
 
 if TYPE_CHECKING:
     from gausslite.view.map_page import MapPage
@@ -41,6 +42,7 @@ class MissionView:
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
+            self._quality = QualityPlot(gui)
 
     def update(self, outcome: FrameOutcome) -> None:
         """Draw the map after a frame, if the last drawing is older than a second."""
@@ -51,6 +53,7 @@ class MissionView:
         keyframes = self._mapper.keyframes()
         if keyframes:
             self._show_image(keyframes[-1])
+            self._add_quality(now_s - self._started_s, keyframes[-1])
         if outcome.timing.seconds > 0:
             self._rate.add(now_s - self._started_s, [1 / outcome.timing.seconds])
         self._roi.add(now_s - self._started_s, [100 * outcome.roi_share])
@@ -66,6 +69,10 @@ class MissionView:
             T_world_camera=trajectory.T_world_camera,
             keyframes=[_view(each) for each in keyframes],
         )
+
+    def _add_quality(self, time_s: float, keyframe: Keyframe) -> None:
+        rendered = np.clip(self._mapper.render(keyframe.frame), 0.0, 1.0)
+        self._quality.add(time_s, rendered, keyframe.frame.rgb, keyframe.relevance.roi)
 
     def _show_image(self, keyframe: Keyframe) -> None:
         frame = keyframe.frame

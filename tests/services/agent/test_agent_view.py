@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import pytest
@@ -10,9 +11,13 @@ from browser import open_browser
 from fusion_running import frame
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.evaluation.metrics import psnr
 from gausslite.view.live_page import live_page, own_address
+from gausslite.wire.clients import AgentClient
 
 pytest.importorskip("viser")
+from gausslite.view.agent_panel import AgentPanel
+from gausslite.view.open_page import open_page
 
 
 def assign(tab: Any, task: str) -> None:
@@ -49,6 +54,34 @@ def test_a_wrong_task_is_reported_on_the_page():
         assign(tab, "<b>")
         tab.get_by_text("'<b>'").wait_for()
         assert not running.client.status().graph.text
+
+
+def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe():
+    with agent() as running:
+        page, client = open_page(0, "test"), AgentClient(running.client.address)
+        panel = AgentPanel(page, client)
+        try:
+            running.client.assign_task(TASK)
+            for index in range(3):
+                next(running.client.ingest([frame(index)]))
+            wait_for_map(panel)
+            panel.poll()
+            rendered, _ = client.render(frame(0).camera, frame(0).T_world_camera)
+            (_, full_db), *_ = panel._quality._full._rows
+            assert full_db == pytest.approx(psnr(rendered, client.camera_view().rgb), abs=1.0)
+        finally:
+            panel.close()
+            page.close()
+
+
+def wait_for_map(panel: AgentPanel) -> None:
+    waiting = threading.Event()
+    for _ in range(1200):
+        newest = panel._follower.newest()
+        if newest is not None and len(newest.batch):
+            return
+        waiting.wait(0.05)
+    raise AssertionError("no map arrived")
 
 
 @pytest.mark.parametrize(
