@@ -116,10 +116,11 @@ class _Chunker:
             buffer.words.append(word)
 
     def _state(self, word: str) -> None:
-        """Emit the colour of "the mug that is red"; other states ("is empty") describe no object."""
+        """Emit the colour of "the mug that is red" or "anything red"; other states describe no object ("is empty")."""
         buffer = self._buffer
-        is_relative = Tag.RELATIVE in (buffer.tag(-2), buffer.tag(-3)) and buffer.last_kind() is ChunkKind.NOUN
-        if is_relative and is_attribute(word):
+        before = (buffer.tag(-1), buffer.tag(-2))
+        follows_noun = Tag.INDEFINITE in before or Tag.RELATIVE in (buffer.tag(-2), buffer.tag(-3))
+        if follows_noun and buffer.last_kind() is ChunkKind.NOUN and is_attribute(word):
             buffer.chunks.append(Chunk(ChunkKind.ATTRIBUTE, word, negated=buffer.negates_next))
         buffer.negates_next = False
 

@@ -246,9 +246,11 @@ class GraphBuilder:
 
     def _resolve_one(self, one: NounPhrase) -> NounPhrase:
         """Return the phrase with the latest object's noun in place of "one": "the blue one"."""
-        named = (
-            self._clause.objects or self._clause.referents or self._draft.targets or self._draft.excluded or ["object"]
-        )
+        clause = self._clause
+        # "with the blue cloth, not with the yellow one"
+        replaced = clause.places if self._pending is not None and clause.terms.negated else []
+        named = replaced or clause.objects or clause.referents or self._draft.targets or self._draft.excluded
+        named = named or ["object"]
         *adjectives, head = named[-1].split()
         nouns = [*(word for word in adjectives if not adjectives_only((word,))), head]
         same = phrase_from_text(" ".join(nouns))

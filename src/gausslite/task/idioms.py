@@ -25,7 +25,9 @@ _PLAIN: Final = {
         "handle"
     ),
     r"(on|in|inside|under|near|behind|at|above) neither (.{2,40}?) nor(?: \1)?": r"not \1 \2 and not \1",
-    r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor \1": r"not \1 \2 and not \1",
+    r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor (on|in|inside|under|near|behind|at|above)": (
+        r"not \1 \2 and not \3"
+    ),
     r"face[ -](?:down|up)": "",
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)": "i see",
     r"back(?= where\b)": "",

@@ -11,7 +11,7 @@ from gausslite.task.chunk_buffer import ChunkBuffer
 from gausslite.task.clause_types import INABILITIES, WISHES
 from gausslite.task.part_of_speech import Tag
 from gausslite.task.singular import singular
-from gausslite.task.verb_chunks import OBJECT_START_TAGS
+from gausslite.task.verb_chunks import NOUN_PHRASE_TAGS, OBJECT_START_TAGS
 from gausslite.task.verb_forms import verb_base
 from gausslite.task.verbs import HOLDING_VERBS, POSTURE_VERBS, TOOL_VERBS
 from gausslite.task.word_set import word_set
@@ -39,7 +39,7 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
     elif _opens_question(buffer):
         buffer.close()  # "isn't there a mug on the table?"
     elif (word in _NOTS and _negates_place(buffer)) or (
-        word in _NOTS and before is Tag.AUXILIARY and is_attribute(buffer.word(1)) and buffer.tag(-2) is Tag.RELATIVE
+        word in _NOTS and is_attribute(buffer.word(1)) and _follows_noun_of_state(buffer)
     ):
         buffer.close()
         buffer.negates_next = True
@@ -53,6 +53,13 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
         buffer.emit(ChunkKind.NOT_UNDERSTOOD, f"{word} {buffer.word(1)}".strip())
     else:
         buffer.emit(ChunkKind.NEGATION, word)
+
+
+def _follows_noun_of_state(buffer: ChunkBuffer) -> bool:
+    """Return True for the "not" of "the mug that is not red" and "anything not red"."""
+    is_relative = buffer.tag(-1) is Tag.AUXILIARY and buffer.tag(-2) is Tag.RELATIVE
+    is_bare = buffer.tag(-1) is Tag.INDEFINITE and buffer.tag(2) not in NOUN_PHRASE_TAGS
+    return is_relative or is_bare
 
 
 def _is_state(buffer: ChunkBuffer) -> bool:

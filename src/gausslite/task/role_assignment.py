@@ -136,6 +136,8 @@ class RoleAssigner:
             self.target(noun, TargetRole.OBJECT)  # "lead me around the puddle"
         elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
             self.target(noun, TargetRole.OBJECT, conjoined=True)
+        elif pending == "with" and clause.terms.negated and clause.places:
+            self._draft.exclude(noun.text)  # "with the sponge, not with the towel"
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
             self._assign_loaded(noun)
         elif pending == "with":
