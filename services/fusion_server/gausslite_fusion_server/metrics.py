@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.traffic import AgentContribution
+from gausslite.fusion.traffic import AgentContribution, MissionStatus
 from gausslite.wire.address import host_and_port
 
 _log = logging.getLogger(__name__)
+Engines = Callable[[], Sequence[FusionEngine]]
+"""Returns the engines of the server's missions."""
 
 
 class _AgentMetric(NamedTuple):
@@ -42,36 +44,43 @@ _OF_AGENTS = (
 )
 
 
+_OF_MISSIONS: tuple[tuple[str, str, Callable[[MissionStatus, bool], float]], ...] = (
+    ("revision", "revision of the fused map", lambda status, _: status.revision),
+    ("fused_voxels", "voxels of the fused map", lambda status, _: status.fused_voxels),
+    ("fused_gaussians", "Gaussians of the fused map", lambda status, _: status.fused_gaussians),
+    ("stored_keyframes", "keyframes of all agents", lambda status, _: status.keyframes),
+    ("store_writable", "1 while the store can write", lambda _, is_writable: is_writable),
+    ("banned_agents", "names that operators have banned", lambda status, _: len(status.banned_agents)),
+)
+
+
 class MissionCollector:
     """Reads the figures when Prometheus asks for them; counters start at 0 with the server."""
 
-    def __init__(self, engine: FusionEngine) -> None:
-        self._engine = engine
+    def __init__(self, engines: Engines) -> None:
+        self._engines = engines
 
     def collect(self) -> Iterator[Any]:
-        """Yield the metrics of the mission and of each agent; the label `agent` is the agent's id."""
+        """Yield the metrics of each mission and of each agent, with the ids as the labels `mission` and `agent`."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        status = self._engine.status()
-        for name, help_text, value in (
-            ("revision", "revision of the fused map", status.revision),
-            ("fused_voxels", "voxels of the fused map", status.fused_voxels),
-            ("fused_gaussians", "Gaussians of the fused map", status.fused_gaussians),
-            ("stored_keyframes", "keyframes of all agents", status.keyframes),
-            ("store_writable", "1 while the store can write", int(self._engine.storage.is_writable)),
-            ("banned_agents", "names that operators have banned", len(status.banned_agents)),
-        ):
-            yield GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, value=value)
+        figures = [(engine.status(), engine.storage.is_writable) for engine in self._engines()]
+        for name, help_text, value in _OF_MISSIONS:
+            of_missions = GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, labels=["mission"])
+            for status, is_writable in figures:
+                of_missions.add_metric([status.mission_config.mission_id], value(status, is_writable))
+            yield of_missions
         for metric in _OF_AGENTS:
             kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
-            family = kind(f"gausslite_agent_{metric.name}", metric.help_text, labels=["agent"])
-            for agent in status.agents:
-                family.add_metric([agent.agent_id], metric.value(agent))
+            family = kind(f"gausslite_agent_{metric.name}", metric.help_text, labels=["mission", "agent"])
+            for status, _ in figures:
+                for agent in status.agents:
+                    family.add_metric([status.mission_config.mission_id, agent.agent_id], metric.value(agent))
             yield family
 
 
 @contextmanager
-def metrics_server(address: str | None, engine: FusionEngine) -> Iterator[int]:
+def metrics_server(address: str | None, engines: Engines) -> Iterator[int]:
     """Serve /metrics on HOST:PORT while the context is open, with the figures of the process; gives the actual port.
 
     None serves nothing and gives 0. Raises InvalidInputError without prometheus-client or for another address,
@@ -87,7 +96,7 @@ def metrics_server(address: str | None, engine: FusionEngine) -> Iterator[int]:
         raise InvalidInputError("--metrics: needs prometheus-client; pip install 'gausslite[metrics]'") from error
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
-    registry.register(MissionCollector(engine))
+    registry.register(MissionCollector(engines))
     try:
         server, thread = start_http_server(port, host.strip("[]"), registry)
     except OSError as error:

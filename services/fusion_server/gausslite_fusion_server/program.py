@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from gausslite.domain.errors import InvalidInputError, StorageError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.joint_refinement import rasterizer_of_backend
 from gausslite.fusion.memory_store import MemoryStore
@@ -20,6 +20,8 @@ from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite_fusion_server.maintenance import COMMANDS, run_command
 from gausslite_fusion_server.metrics import metrics_server
+from gausslite_fusion_server.mission_router import MissionRouter
+from gausslite_fusion_server.missions import Mission, Missions, mission_file, stored_missions
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import PROGRAM, ServerSettings, parse_arguments
@@ -38,18 +40,37 @@ def run(arguments: Sequence[str] | None = None) -> int:
         settings = parse_arguments(arguments)
         if settings.log_format is LogFormat.JSON:
             log_to_stderr(PROGRAM, LogFormat.JSON)
-        with contextlib.closing(_open_store(settings)) as store:
-            await _serve(settings, store)
+        await _serve(settings)
 
     return run_service(PROGRAM, serve)
 
 
-def _open_store(settings: ServerSettings) -> FusionStore:
+def _open_missions(settings: ServerSettings) -> Missions:
+    """Open the stored missions. Raises InvalidInputError, QuotaError, StorageError."""
+    refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
+
+    def open_mission(mission_id: str) -> Mission:
+        fusion = replace(settings.fusion, mission_id=mission_id) if mission_id else settings.fusion
+        store = _open_store(settings, mission_id)
+        try:
+            engine = FusionEngine(store, fusion, decode_keyframe=decode_frame)
+        except BaseException:
+            store.close()
+            raise
+        return Mission(store, engine, FusionServicer(engine, refinement))
+
+    has_folder = settings.max_missions > 1 and settings.store is not None
+    stored = stored_missions(settings.store) if has_folder and settings.store is not None else ()
+    return Missions(open_mission, settings.max_missions, stored)
+
+
+def _open_store(settings: ServerSettings, mission_id: str) -> FusionStore:
     if settings.store is None:
         return MemoryStore()
     if settings.shards is not None:
         return _open_ray_store(settings.store, settings.shards, settings)
-    return SqliteStore(settings.store, settings.store_max_bytes)
+    path = mission_file(settings.store, mission_id) if mission_id else settings.store
+    return SqliteStore(path, settings.store_max_bytes)
 
 
 def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> FusionStore:
@@ -63,25 +84,20 @@ def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> Fusi
     return RayStore(RaySettings(folder, shards, settings.ray_address, settings.store_max_bytes))
 
 
-async def _serve(settings: ServerSettings, store: FusionStore) -> None:
-    engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame)
-    servicer = FusionServicer(engine, RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer)))
+async def _serve(settings: ServerSettings) -> None:
+    missions = _open_missions(settings)
+    service = missions.only.servicer.service() if settings.max_missions == 1 else MissionRouter(missions).service()
 
     async def drain_when_stopping() -> None:
         try:
             await asyncio.Event().wait()
         finally:
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
-            servicer.drain()
+            missions.drain()
 
     try:
         page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
-        with metrics_server(settings.metrics, engine), page:
-            await serve_until_stopped(
-                settings.listen, [servicer.service()], drain_when_stopping, settings.tls, settings.limits
-            )
+        with metrics_server(settings.metrics, missions.engines), page:
+            await serve_until_stopped(settings.listen, [service], drain_when_stopping, settings.tls, settings.limits)
     finally:
-        servicer.close()
-        # a full disk is in the log already
-        with contextlib.suppress(StorageError):
-            engine.save_counters()
+        missions.close()

@@ -27,6 +27,7 @@ PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"
 RAY_LOCAL = "local"
 MAX_SHARDS = 1024
+MAX_MISSIONS = 256
 _CORRECT, _TRUST = "correct", "trust"
 _MAX_STORE_MB = 1 << 24
 
@@ -35,7 +36,8 @@ _MAX_STORE_MB = 1 << 24
 class ServerSettings:
     """Address, storage (None: in memory) and limits of the server, and the mission that it serves.
 
-    shards: the storage is a folder, for shards on Ray; None for a file.
+    shards: the storage is a folder, for shards on Ray; None for a file. max_missions: above one, the storage is a
+    folder with a file for each.
     view: port of the page that shows the server, None for no page.
     """
 
@@ -44,6 +46,7 @@ class ServerSettings:
     store_max_bytes: int | None = None
     shards: int | None = None
     ray_address: str = RAY_LOCAL
+    max_missions: int = 1
     fusion: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
@@ -70,6 +73,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     options = parse_options(_parser(), arguments, warn=print_message)
     if options.shards is not None and options.store == MEMORY:
         raise InvalidInputError("--shards: expected a folder as --store, got none")
+    _require_one_mission(options)
     if options.shards is None and options.ray_address != RAY_LOCAL:
         raise InvalidInputError("--ray-address: expected --shards beside it")
     quotas = Quotas(
@@ -85,6 +89,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         None if options.store_max_mb is None else options.store_max_mb << 20,
         options.shards,
         options.ray_address,
+        options.max_missions,
         FusionSettings(
             VoxelGrid(options.voxel_size),
             options.mission,
@@ -101,6 +106,19 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         options.metrics,
         options.view,
     )
+
+
+def _require_one_mission(options: argparse.Namespace) -> None:
+    """Raise InvalidInputError for options that several missions cannot share."""
+    for name, value, default in (
+        ("mission", options.mission, ""),
+        ("shards", options.shards, None),
+        ("view", options.view, None),
+    ):
+        if options.max_missions > 1 and value != default:
+            raise InvalidInputError(
+                f"--{name}: expected a server of one mission, got --max-missions {options.max_missions}"
+            )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -126,6 +144,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--store-max-mb", type=max_mb, metavar="MB", help="largest size of the SQLite file (default: no limit)")
     add_voxel_size(parser)
     add("--mission", default="", metavar="ID", help="the only mission to serve (default: the first agent's)")
+    add(
+        "--max-missions",
+        type=Number("max-missions", int, 1, MAX_MISSIONS),
+        default=defaults.max_missions,
+        metavar="N",
+        help="largest number of missions; above 1, agents name theirs, and --store is a folder (default: %(default)s)",
+    )
     add("--world-frame", default="", metavar="NAME", help="frame of all maps (default: the first agent's)")
     add(
         "--vote",

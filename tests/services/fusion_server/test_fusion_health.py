@@ -83,7 +83,7 @@ def metric(log: Path, name: str) -> float:
     port = re.search(r"metrics.*:(\d+)", log.read_text())
     assert port is not None
     with urllib.request.urlopen(f"http://127.0.0.1:{port[1]}/metrics", timeout=20) as response:
-        value = re.search(rf"^gausslite_fusion_{name} (\S+)$", response.read().decode(), re.MULTILINE)
+        value = re.search(rf"^gausslite_fusion_{name}(?:{{[^}}]*}})? (\S+)$", response.read().decode(), re.MULTILINE)
     assert value is not None
     return float(value[1])
 
