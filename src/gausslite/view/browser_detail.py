@@ -44,7 +44,7 @@ class BrowserDetail:
         self._changed = threading.Condition()
         self._is_adaptive, self._is_restarted, self._is_closed = is_adaptive, False, False
         self._splats: Splats | None = None
-        self._moved_s = -_REST_S
+        self._moved_s = time.monotonic()
         # only the thread uses what follows
         self._drawn: Splats | None = None
         self._handle: Any = None

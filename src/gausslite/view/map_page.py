@@ -20,6 +20,8 @@ from gausslite.view.start_view import start_view
 _THOUSAND = 1000
 _MAX_SHOWN = 2_000_000
 _BACKGROUND_GREY = 40
+_GROWTH = 1.5
+"""New browsers get a new start view when the map has grown by this factor."""
 
 
 class MapPage:
@@ -32,6 +34,7 @@ class MapPage:
         self.server.scene.set_background_image(np.full((1, 1, 3), _BACKGROUND_GREY, np.uint8))
         self._lock = threading.RLock()
         self._contents: ViewContents | None = None
+        self._viewed_count = 0
         gui = self.server.gui
         highest = _MAX_SHOWN // _THOUSAND
         self._problem = gui.add_html("", order=-1)
@@ -55,8 +58,8 @@ class MapPage:
     def show(self, contents: ViewContents) -> None:
         """Replace what the page shows."""
         with self._lock:
-            is_first, self._contents = self._contents is None or not len(self._contents.gaussians), contents
-            if is_first and len(contents.gaussians):
+            self._contents = contents
+            if len(contents.gaussians) > _GROWTH * self._viewed_count:
                 self._set_start_view(contents)
             self._draw_splats()
             self._markers.show(contents)
@@ -73,9 +76,12 @@ class MapPage:
         self.server.stop()
 
     def _set_start_view(self, contents: ViewContents) -> None:
-        view = start_view(contents)
+        """Set where the camera of a new browser starts; browsers that saw no map before start there too."""
+        view, is_first = start_view(contents), not self._viewed_count
+        self._viewed_count = len(contents.gaussians)
         self.server.scene.set_up_direction(view.up)
-        cameras: list[Any] = [self.server.initial_camera, *(each.camera for each in self.server.get_clients().values())]
+        clients = self.server.get_clients().values() if is_first else ()
+        cameras: list[Any] = [self.server.initial_camera, *(each.camera for each in clients)]
         for camera in cameras:
             camera.up = view.up
             camera.position = view.position_m

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
@@ -19,6 +20,7 @@ _MAX_TRAJECTORY_POINTS = 5000
 _TRAJECTORY_RGB, _KEYFRAME_RGB, _ROBOT_RGB = (40, 90, 220), (90, 140, 230), (220, 40, 40)
 _TARGET_RGB, _ANCHOR_RGB = (20, 150, 60), (200, 130, 20)
 _NS_PER_S = 1e9
+_MIN_BOX_M = 0.01
 _UNKNOWN_CAMERA = Camera(525.0, 525.0, 320.0, 240.0, 640, 480)
 
 
@@ -89,12 +91,11 @@ class SceneMarkers:
     def _object(self, index: int, landmark: ObjectLandmark) -> list[Any]:
         colour = _TARGET_RGB if landmark.role is ObjectRole.TARGET else _ANCHOR_RGB
         low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
+        high = np.maximum(high, low + _MIN_BOX_M)
         scene, name = self._server.scene, f"/objects/{index}"
         # a label is drawn as text, never as HTML
         return [
-            scene.add_box(
-                f"{name}/box", colour, tuple(np.maximum(high - low, 0.01)), wireframe=True, position=(low + high) / 2
-            ),
+            scene.add_line_segments(f"{name}/box", _box_edges_m(low, high), colour, thickness=0.004),
             scene.add_label(
                 f"{name}/label",
                 f"{landmark.noun} {landmark.confidence:.2f}",
@@ -130,6 +131,13 @@ class SceneMarkers:
             if handle.name not in kept:
                 handle.remove()
         self._drawn[kind] = handles
+
+
+def _box_edges_m(low: Float64[ndarray, "3"], high: Float64[ndarray, "3"]) -> Float32[ndarray, "12 2 3"]:
+    """Return the ends of a box's edges: the pairs of corners that differ along one axis."""
+    corners = list(product((0, 1), repeat=3))
+    pairs = [(a, b) for a, b in combinations(corners, 2) if sum(i != j for i, j in zip(a, b, strict=True)) == 1]
+    return np.where(np.array(pairs, bool), high, low).astype(np.float32)
 
 
 def _wxyz(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:

@@ -9,6 +9,7 @@ import pytest
 from browser import open_browser
 from sample_gaussians import plain_gaussians, random_gaussians
 
+from gausslite.view import browser_detail
 from gausslite.view.browser_detail import PREVIEW_COUNT, RESPONSE_LIMIT_S, next_count
 from gausslite.view.contents import ViewContents
 from gausslite.view.level_of_detail import spread_order
@@ -62,7 +63,8 @@ def test_opaque_gaussians_come_first():
     assert spread_order(gaussians)[:40].min() >= 50
 
 
-def test_a_browser_gets_the_small_set_first_and_all_when_asked():
+def test_a_slow_browser_keeps_the_small_set_until_all_is_asked_for_and_a_fast_one_gets_all(monkeypatch):
+    monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 0.0)
     page = open_page(0, "test")
     try:
         page.show(ViewContents.of_one_agent(points(3 * PREVIEW_COUNT)))
@@ -70,12 +72,16 @@ def test_a_browser_gets_the_small_set_first_and_all_when_asked():
             browser.add_init_script(COUNT_DRAWN)
             tab = browser.new_page()
             tab.goto(page.url)
+            tab.get_by_text(f"This browser draws {PREVIEW_COUNT:,} of them").wait_for()
             tab.wait_for_function("window.drawn.length > 0")
-            assert tab.evaluate("window.drawn[0]") == PREVIEW_COUNT
-            tab.get_by_text("Adapt to browser").wait_for()
+            assert set(tab.evaluate("window.drawn")) == {PREVIEW_COUNT}
             page._adapts.value = False
             tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
+            monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
+            tab.evaluate("window.drawn = []")
             page._adapts.value = True
+            tab.wait_for_function(f"window.drawn.some(count => count < {3 * PREVIEW_COUNT})")
+            tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
             page.show(ViewContents.of_one_agent(points(PREVIEW_COUNT // 2)))
             tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT // 2}")
     finally:

@@ -124,3 +124,13 @@ def test_only_the_own_page_on_a_loopback_name_is_served(host, origin, expected):
     from gausslite.view.local_server import is_own_page
 
     assert is_own_page(host, origin) is expected
+
+
+def test_a_box_has_twelve_edges_along_its_axes():
+    from gausslite.view.scene_markers import _box_edges_m
+
+    low, high = np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 5.0])
+    edges_m = _box_edges_m(low, high)
+    lengths_m = np.abs(edges_m[:, 1] - edges_m[:, 0])
+    assert (np.count_nonzero(lengths_m, axis=1) == 1).all()
+    assert sorted(lengths_m.max(axis=1).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4

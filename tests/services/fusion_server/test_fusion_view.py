@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from browser import open_browser
 from fusion_running import GRID, RunningServer, frame, fusion_server
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport
-from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.task.rules import RuleParser
 from gausslite.view.colours import ColourMode, legend_of
+from gausslite.view.live_page import live_page
 from gausslite.view.map_follower import FollowedMap, MapFollower
 
 pytest.importorskip("viser")
@@ -93,6 +96,39 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one():
         finally:
             panel.close()
             page.close()
+
+
+def test_a_refinement_is_started_in_a_browser_which_then_shows_its_map():
+    with (
+        fusion_server() as running,
+        open_browser() as browser,
+        live_page(0, running.client.address, is_agent=False) as url,
+    ):
+        session = running.client.join("a", GRID).session_id
+        running.contribute_subsets(session, RoiSubset("a", session, 1, 1, wall()))
+        running.client.contribute_keyframes(session, [coloured_frame(0, 90)])
+        tab = browser.new_page()
+        tab.goto(url)
+        tab.get_by_text("a: keyframe 0").wait_for()
+        tab.get_by_role("button", name="Start refinement").click()
+        tab.get_by_text("refinement complete").wait_for()
+        assert running.client.status().refined
+        choose(tab, "Shown map", "refined map")
+        choose(tab, "Colour", "agent")
+        # the Gaussians of a refined map belong to no agent
+        tab.get_by_text("none", exact=True).wait_for()
+
+
+def choose(tab: Any, control: str, option: str) -> None:
+    tab.get_by_label(control).first.click()
+    tab.get_by_role("option", name=option, exact=True).click()
+
+
+def wall() -> VoxelBatch:
+    """Return grey Gaussians on the wall that the test's frames see."""
+    x, y = np.meshgrid(np.arange(-0.4, 0.4, 0.05), np.arange(-0.3, 0.3, 0.05))
+    means_m = np.stack([x.ravel(), y.ravel(), np.full(x.size, 1.2)], axis=1)
+    return group_by_voxel(plain_gaussians(means_m, kappa=3, rgb=0.4), GRID)
 
 
 def test_a_stored_keyframe_is_read_by_its_index():
