@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.state import State, encode_text, get_array, get_counts, get_floats, get_text, int_array
 from gausslite.perception.colours import no_colours
-from gausslite.perception.object_map import Landmark
+from gausslite.perception.object_map import MAX_SUPPORTS, Landmark
+from gausslite.perception.supporting_surface import FloorLevel
 from gausslite.perception.surface_votes import VOXEL_SIZES_M, SurfaceVotes
 
 
@@ -30,6 +31,7 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "votes": np.stack([landmark.votes.inside, landmark.votes.outside]),
         "vote_voxel_m": np.array([landmark.votes.voxel_m]),
         "colours": landmark.colours,
+        "supports_m": landmark.supports_m,
         "score_sums": np.array([landmark.score_sum, *landmark.rival_scores.values()]),
     }
 
@@ -56,9 +58,23 @@ def decode_landmark(state: State) -> Landmark:
     colours = get_array(state, "colours", no_colours().shape, np.float64).copy()
     if not np.isfinite(colours).all() or (colours < 0).any():
         raise MapFileError("state landmark: expected colours of zero or more, got others")
+    supports_m = get_array(state, "supports_m", (None,), np.float64).copy()
+    if len(supports_m) > MAX_SUPPORTS or not np.isfinite(supports_m).all():
+        raise MapFileError(f"state landmark: expected at most {MAX_SUPPORTS} finite levels, got {len(supports_m)}")
     names = get_text(state, "rival_names").splitlines()
     score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
     rivals = dict(zip(names, rival_sums, strict=True))
     landmark = Landmark(*extent, seen_count, missed_count, best_score, farthest_m, first_ns, last_ns, number)
     scored = replace(landmark, score_sum=score_sum, rival_scores=rivals)
-    return replace(scored, votes=votes, colours=colours, missed_in_a_row=missed_in_a_row)
+    seen = replace(scored, votes=votes, colours=colours, supports_m=supports_m)
+    return replace(seen, missed_in_a_row=missed_in_a_row)
+
+
+def decode_floor(state: State) -> FloorLevel:
+    """Decode the observed heights. Raises MapFileError."""
+    empty = FloorLevel.before_frames()
+    counts = get_array(state, "floor_counts", empty.counts.shape, np.int64).copy()
+    first_camera_m = float(get_array(state, "first_camera_m", (1,), np.float64)[0])
+    if (counts < 0).any() or np.isinf(first_camera_m):
+        raise MapFileError("state floor: expected counts of zero or more and a finite height, got others")
+    return FloorLevel(first_camera_m, counts)

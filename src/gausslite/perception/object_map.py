@@ -22,6 +22,7 @@ _MIN_COUNT_SHARE: Final = 0.15
 _MIN_RELIABLE_SHARE: Final = 0.25
 _MAX_CELLS: Final = 4000
 _MAX_OBJECTS: Final = 500
+MAX_SUPPORTS: Final = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +33,7 @@ class Observation:
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
     capture time. rival: a different thing detected in the same place. votes: which voxels the mask
     shows inside and outside the object. colours: `colour_counts` of the mask's pixels.
+    supports_m: the levels of planes seen under it, along up in the world.
     """
 
     phrase: str
@@ -44,6 +46,7 @@ class Observation:
     rival: Rival | None = None
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
+    supports_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def from_points(
@@ -77,7 +80,7 @@ class Landmark:
     capture times of its observations. number: assigned by the object map, in the order of first observations.
     score_sum: sum of its scores; rival_scores: sums of the scores of different things in its place. votes: of its
     masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
-    colours: sums over its observations.
+    colours: sums over its observations. supports_m: the latest levels of planes seen under it.
     """
 
     phrase: str
@@ -97,6 +100,7 @@ class Landmark:
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     missed_in_a_row: int = 0
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
+    supports_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -115,6 +119,7 @@ class Landmark:
             rival_scores={} if observation.rival is None else {observation.rival.name: observation.rival.score},
             votes=observation.votes,
             colours=observation.colours,
+            supports_m=observation.supports_m,
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
@@ -125,7 +130,7 @@ class Landmark:
     def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
         """Return the whole object as an observation by a camera, to evaluate relations."""
         place = self.phrase, self.centroid_m, self.radius_m, self.cells, camera_m
-        return Observation(*place, colours=self.colours)
+        return Observation(*place, colours=self.colours, supports_m=self.supports_m)
 
     def matches(self, other: Observation) -> bool:
         """Return True if an observation of the same phrase shows this object, in whole or in part."""
@@ -143,6 +148,7 @@ class Landmark:
         self.score_sum += other.score_sum
         self.votes = self.votes.add(other.votes)
         self.colours = self.colours + other.colours
+        self.supports_m = np.concatenate([self.supports_m, other.supports_m])[-MAX_SUPPORTS:]
         self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
         for name, score in other.rival_scores.items():
             self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score

@@ -41,7 +41,7 @@ def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame) -> SurfaceVotes:
     low, high = np.array((top, left)) - margin_px, np.array((bottom, right)) + margin_px
     window = _clipped(low.astype(np.int64), high.astype(np.int64), frame)
     pixels = frame.depth_m[window].size
-    points_m, is_known = _points_m(frame, window, math.ceil(math.sqrt(pixels / _MAX_VOTING_PIXELS)))
+    points_m, is_known = window_points_m(frame, window, math.ceil(math.sqrt(pixels / _MAX_VOTING_PIXELS)))
     return SurfaceVotes.from_points(points_m, mask[window][is_known])
 
 
@@ -63,7 +63,7 @@ def surface_mask(votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
     if window is None:
         return mask
     votes = _resolved(votes, frame)
-    points_m, is_known = _points_m(frame, window)
+    points_m, is_known = window_points_m(frame, window)
     shown = np.zeros(is_known.shape, np.bool_)
     shown[is_known] = votes.is_on_surface(points_m)
     closed = cv2.morphologyEx(shown.astype(np.uint8), cv2.MORPH_CLOSE, _CLOSING) > 0
@@ -82,7 +82,7 @@ def refined_mask(detected: Bool[ndarray, "h w"], votes: SurfaceVotes, frame: Fra
     votes = _resolved(votes, frame)
     for window in windows:
         if window is not None:
-            points_m, is_known = _points_m(frame, window)
+            points_m, is_known = window_points_m(frame, window)
             part = mask[window]
             part[is_known] |= votes.is_surely_inside(points_m)
             part[is_known] &= ~votes.is_surely_outside(points_m)
@@ -106,7 +106,9 @@ def _box_window(box_px: tuple[float, float, float, float]) -> Window:
     return slice(top, bottom), slice(left, right)
 
 
-def _points_m(frame: Frame, window: Window, step: int = 1) -> tuple[Float64[ndarray, "n 3"], Bool[ndarray, "h w"]]:
+def window_points_m(
+    frame: Frame, window: Window, step: int = 1
+) -> tuple[Float64[ndarray, "n 3"], Bool[ndarray, "h w"]]:
     """Return the world points of the window's pixels with depth, and which pixels these are.
 
     step: use every step-th pixel of every step-th row.

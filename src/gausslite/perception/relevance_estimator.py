@@ -19,6 +19,7 @@ from gausslite.perception.detect import Detector, Segmenter
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.relevance_tracker import RelevanceTracker, RelevanceTrackerSettings
 from gausslite.perception.spatial import best_depth_m
+from gausslite.perception.supporting_surface import nouns_known_by_height
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +100,8 @@ class TaskRelevanceEstimator:
         """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._detector = detector
-        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter)
+        by_height = nouns_known_by_height(detector.matches(graph.queries))
+        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter, by_height)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -171,7 +173,8 @@ class AsyncRelevanceEstimator:
         self._graph = graph
         self._detector = detector
         self._executor = executor
-        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter)
+        by_height = nouns_known_by_height(detector.matches(graph.queries))
+        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter, by_height)
         self._frames = 0
         self._skipped_keyframes = 0
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None

@@ -24,7 +24,7 @@ from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, tra
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.perception.checkpoint import decode_landmark, encode_landmark
+from gausslite.perception.checkpoint import decode_floor, decode_landmark, encode_landmark
 from gausslite.perception.detect import Segmenter, bounding_box
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.foreground import foreground_mask
@@ -69,12 +69,21 @@ class RelevanceTracker:
     The caller runs the detector.
     """
 
-    def __init__(self, graph: TaskGraph, settings: RelevanceTrackerSettings, segmenter: Segmenter | None) -> None:
-        """Without a segmenter, the masks of frames without detection are the objects' surfaces alone."""
+    def __init__(
+        self,
+        graph: TaskGraph,
+        settings: RelevanceTrackerSettings,
+        segmenter: Segmenter | None,
+        nouns_by_height: frozenset[str] = frozenset(),
+    ) -> None:
+        """Without a segmenter, the masks of frames without detection are the objects' surfaces alone.
+
+        nouns_by_height: surfaces that the detector cannot find, whose height above the floor is known.
+        """
         self._graph = graph
         self._settings = settings
         self._segmenter = segmenter
-        self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial, settings.evidence)
+        self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial, settings.evidence, nouns_by_height)
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
         self._needs_observation = False
@@ -93,7 +102,7 @@ class RelevanceTracker:
             for each, rival in self._filter.rivals
         )
         unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
-        return (*self._filter.colour_notes, *dict.fromkeys(rivals), *unseen)
+        return (*self._filter.colour_notes, *self._filter.height_notes, *dict.fromkeys(rivals), *unseen)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
@@ -121,6 +130,8 @@ class RelevanceTracker:
             "keyframe_age": int_array(self._frames_since, self._needs_observation),
             "known_targets": int_array(*self._known_targets),
         }
+        floor = self._filter.floor
+        state |= {"floor_counts": floor.counts, "first_camera_m": np.array([floor.first_camera_m])}
         state["count"] = int_array(len(self.landmarks))
         for i, landmark in enumerate(self.landmarks):
             state |= add_prefix(f"landmark-{i}", encode_landmark(landmark))
@@ -135,7 +146,8 @@ class RelevanceTracker:
         for pose in poses:
             require_rigid("state T_world_keyframe", pose)
         saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
-        self._filter.restore_landmarks([decode_landmark(each) for each in saved_landmarks])
+        floor = decode_floor(state)
+        self._filter.restore([decode_landmark(each) for each in saved_landmarks], floor)
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
         self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
         self._needs_observation = needs_observation > 0
@@ -224,7 +236,12 @@ class RelevanceTracker:
         kept = self._drop_excluded(self._drop_generic_anchors(detections))
         masked = [replace(each, mask=foreground_mask(each.mask, depth_m)) for each in kept]
         lifted = [(each, lift_observation(each, depth_m, frame)) for each in masked]
-        localised = [(detection, observation) for detection, observation in lifted if observation is not None]
+        localised = [
+            (detection, self._filter.with_support(observation, detection, frame))
+            for detection, observation in lifted
+            if observation is not None
+        ]
+        self._filter.observe_floor(frame)
         self._filter.observe([observation for _, observation in localised], VisibilityCheck(frame, frame.depth_m))
         self._needs_observation = any(
             self._filter.needs_observation(observation) and self._filter.target_of(observation) is not None

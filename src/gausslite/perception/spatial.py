@@ -21,6 +21,7 @@ from gausslite.perception.object_map import Landmark, ObjectMap, Observation
 from gausslite.perception.object_masks import mask_colours, mask_votes
 from gausslite.perception.relations import RelationGeometry, SpatialSettings, surface_distance_m
 from gausslite.perception.superlatives import select_extreme
+from gausslite.perception.supporting_surface import FloorLevel, stands_on, support_level_m
 
 _MIN_PIXELS = 8
 _MAX_PIXELS = 4000
@@ -61,8 +62,14 @@ class SpatialFilter:
     """Evaluate the graph's relations and colours against all objects seen so far, whether in view or not."""
 
     def __init__(
-        self, graph: TaskGraph, up_axis: UpAxis, settings: SpatialSettings, evidence: EvidenceSettings | None = None
+        self,
+        graph: TaskGraph,
+        up_axis: UpAxis,
+        settings: SpatialSettings,
+        evidence: EvidenceSettings | None = None,
+        nouns_by_height: frozenset[str] = frozenset(),
     ) -> None:
+        """nouns_by_height: surfaces that no detection shows; heights decide what stands on them."""
         self._relations = {
             target: tuple(relation for relation in graph.relations if relation.target == target)
             for target in graph.targets
@@ -76,6 +83,10 @@ class SpatialFilter:
         self._geometry = RelationGeometry(self._up, settings)
         self._evidence = evidence or EvidenceSettings()
         self._object_map = ObjectMap()
+        self._nouns_by_height = frozenset(
+            noun_of(each.anchor) for each in graph.relations if each.predicate is Predicate.ON
+        ).intersection(nouns_by_height)
+        self._floor = FloorLevel.before_frames()
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
@@ -96,13 +107,49 @@ class SpatialFilter:
     @property
     def unseen_anchors(self) -> tuple[str, ...]:
         """Anchors of relations that no frame has shown yet, with their colours."""
-        needed = dict.fromkeys(each.anchor for relations in self._relations.values() for each in relations)
+        needed = dict.fromkeys(
+            each.anchor for relations in self._relations.values() for each in relations if not self._is_by_height(each)
+        )
         return tuple(dict.fromkeys(self._colours.label(name) for name in needed if not self._landmarks_of(name)))
 
     @property
     def colour_notes(self) -> tuple[str, ...]:
         """What the colours of the task decided about the confirmed objects, and where they could not."""
         return self._colours.notes(self.confirmed_landmarks)
+
+    @property
+    def height_notes(self) -> tuple[str, ...]:
+        """Which relations heights decide, for how many of the confirmed objects, and what happens to the others."""
+        relations = [each for relations in self._relations.values() for each in relations if self._is_by_height(each)]
+        notes = []
+        for relation in {(each.target, each.anchor): each for each in relations}.values():
+            noun, anchor = noun_of(relation.target), noun_of(relation.anchor)
+            seen = [each for each in self.confirmed_landmarks if each.phrase == noun]
+            sure = sum(self._stands_on(relation, each) is not None for each in seen)
+            others = "compared with the class detected instead" if self._landmarks_of(relation.anchor) else "kept"
+            others = "left out" if others == "kept" and relation.negated else others
+            notes.append(
+                f"no class of the detector is a {anchor!r}: the height of what an object stands on decides, so far "
+                f"for {sure} of {len(seen)} {noun!r} objects; the others are {others}"
+            )
+        return tuple(notes)
+
+    @property
+    def floor(self) -> FloorLevel:
+        """The points observed so far, by their height; none if no relation needs them."""
+        return self._floor
+
+    def with_support(self, observation: Observation, detection: Detection, frame: Frame) -> Observation:
+        """Return the observation with the level of the plane under it, if a relation needs it."""
+        if not self._nouns_by_height:
+            return observation
+        level_m = support_level_m(detection.mask, frame, self._up)
+        return replace(observation, supports_m=np.array([level_m])) if np.isfinite(level_m) else observation
+
+    def observe_floor(self, frame: Frame) -> None:
+        """Count a frame's points by their height, if a relation needs the floor."""
+        if self._nouns_by_height:
+            self._floor = self._floor.add(frame, self._up)
 
     def observe(self, observations: Sequence[Observation], visibility: VisibilityCheck | None = None) -> None:
         """Add one frame's observations to the object map; `visibility` also counts the landmarks that it missed."""
@@ -138,9 +185,9 @@ class SpatialFilter:
         landmark = self._object_map.match(observation)
         return landmark is not None and self._evidence.needs_observation(landmark)
 
-    def restore_landmarks(self, landmarks: Sequence[Landmark]) -> None:
-        """Replace the object map by these landmarks, oldest first."""
-        self._object_map = ObjectMap(landmarks)
+    def restore(self, landmarks: Sequence[Landmark], floor: FloorLevel) -> None:
+        """Replace the object map by these landmarks, oldest first, and the floor."""
+        self._object_map, self._floor = ObjectMap(landmarks), floor
 
     def target_of(self, observation: Observation) -> str | None:
         """Return the target that an observation shows: its noun, colour and relations fit; None if there is none.
@@ -159,10 +206,16 @@ class SpatialFilter:
     def _satisfies(self, relations: Sequence[Relation], observation: Observation) -> bool:
         """Return True if no negated relation holds, and any other does (Sec. III-B.3) or none can be evaluated.
 
-        Relations to anchors that were never seen in their colour are not evaluated. All the anchors of `between` form
-        one relation.
+        Relations to anchors that were never seen in their colour are not evaluated. Of negated relations that heights
+        decide, only the sure ones hold. All the anchors of `between` form one relation.
         """
-        seen = [each for each in relations if self._landmarks_of(each.anchor)]
+        seen = [
+            each
+            for each in relations
+            if self._stands_on(each, observation) is not None or self._landmarks_of(each.anchor)
+        ]
+        if any(each.negated and self._is_by_height(each) and each not in seen for each in relations):
+            return False
         simple = [each for each in seen if each.predicate is not Predicate.BETWEEN]
         if any(each.negated and self._holds(each, observation) for each in simple):
             return False
@@ -187,6 +240,9 @@ class SpatialFilter:
 
     def _holds(self, relation: Relation, observation: Observation) -> bool:
         """Return whether the relation holds, regardless of its negation."""
+        by_height = self._stands_on(relation, observation)
+        if by_height is not None:
+            return by_height
         if relation.predicate in (Predicate.CLOSEST_TO, Predicate.FARTHEST_FROM):
             return self._is_extreme(relation, observation)
         anchors = self._anchors(relation, observation)
@@ -197,6 +253,18 @@ class SpatialFilter:
             return True
         geometry = self._geometry.with_reach(relation.max_m) if has_bounds else self._geometry
         return any(geometry.holds(relation.predicate, observation, anchor) for anchor in anchors)
+
+    def _is_by_height(self, relation: Relation) -> bool:
+        """Return True if heights decide the relation: on a surface without a colour that no detection shows."""
+        noun = noun_of(relation.anchor)
+        is_plain = self._colours.label(relation.anchor) == noun
+        return relation.predicate is Predicate.ON and is_plain and noun in self._nouns_by_height
+
+    def _stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
+        """Return whether an object stands on the relation's anchor by its height; None if heights do not decide."""
+        if not self._is_by_height(relation):
+            return None
+        return stands_on(noun_of(relation.anchor), seen.supports_m, self._floor.level_m)
 
     def _is_extreme(self, relation: Relation, observation: Observation) -> bool:
         """Return True for the reliable candidate with the least (or largest) distance to its nearest anchor."""
