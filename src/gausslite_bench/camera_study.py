@@ -154,7 +154,9 @@ class _CachedSource(WrappedSource):
             self._frames[i] = self._source.frame(i)
         frame = self._frames[i]
         image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
-        return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
+        return replace(
+            frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera, recorded_rgb=image.recorded_rgb
+        )
 
 
 def camera_table(scores: Sequence[CameraScore]) -> str:

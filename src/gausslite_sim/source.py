@@ -131,6 +131,7 @@ class SimulatedHome:
             image.depth_m,
             image.camera,
             self._odometry_poses[i].copy(),
+            recorded_rgb=image.recorded_rgb,
         )
 
     def indices(self) -> Sequence[int]:

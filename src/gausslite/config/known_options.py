@@ -52,7 +52,17 @@ KNOWN_OPTIONS: Final = frozenset(
             "queue",
         ),
         *("queue-policy", "quota-agents", "quota-gaussians", "quota-keyframe-pixels", "quota-keyframes"),
-        *("quota-voxels", "rasterizer", "rate", "ray-address", "real", "refine-iterations", "register-depth", "reps"),
+        *(
+            "quota-voxels",
+            "rasterizer",
+            "rate",
+            "ray-address",
+            "real",
+            "recorded-size",
+            "refine-iterations",
+            "register-depth",
+            "reps",
+        ),
         *(
             "resegment",
             "resume",

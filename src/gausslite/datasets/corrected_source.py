@@ -63,7 +63,9 @@ class CorrectedSource(WrappedSource):
             # a blur along a wrong velocity does more harm than none
             frame = replace(frame, motion=replace(frame.motion, exposure_s=0.0))
         image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
-        return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
+        return replace(
+            frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera, recorded_rgb=image.recorded_rgb
+        )
 
     def trajectory(self) -> Trajectory:
         """The wrapped source's trajectory, as recorded."""

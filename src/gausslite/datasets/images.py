@@ -35,11 +35,15 @@ class DepthUnits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdImage:
-    """A colour and a depth image of the same size, with the camera for this size."""
+    """A colour and a depth image of the same size, with the camera for this size.
+
+    recorded_rgb: the colour image before it was made smaller, see Frame.
+    """
 
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
     camera: Camera
+    recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
 
 
 def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:
@@ -101,7 +105,8 @@ def resize_rgbd(image: RgbdImage, size: tuple[int, int] | None) -> RgbdImage:
     width, height = size
     camera = image.camera.resized(width, height)
     rgb = cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA)
-    return RgbdImage(rgb, resize_depth(image.depth_m, size), camera)
+    recorded_rgb = image.rgb if width < image.camera.width_px else image.recorded_rgb
+    return RgbdImage(rgb, resize_depth(image.depth_m, size), camera, recorded_rgb)
 
 
 def resize_depth(depth_m: Float32[ndarray, "h w"], size: tuple[int, int]) -> Float32[ndarray, "ho wo"]:

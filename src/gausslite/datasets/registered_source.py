@@ -64,7 +64,12 @@ class RegisteredSource(WrappedSource):
         image = resize_rgbd(RgbdImage(recorded.rgb, depth_m, self._camera), size)
         T_world_colour = recorded.T_world_camera @ inverse(self._T_colour_depth)
         return replace(
-            recorded, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera, T_world_camera=T_world_colour
+            recorded,
+            rgb=image.rgb,
+            depth_m=image.depth_m,
+            camera=image.camera,
+            T_world_camera=T_world_colour,
+            recorded_rgb=image.recorded_rgb,
         )
 
     def trajectory(self) -> Trajectory:

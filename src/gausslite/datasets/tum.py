@@ -94,7 +94,15 @@ class TumSource(FolderSource):
         match = self._matches[i]
         image = load_rgbd(match.colour, match.depth, self._camera, self._units, size)
         time_ns = round(match.time_s * 1e9)
-        return Frame(match.number, time_ns, image.rgb, image.depth_m, image.camera, match.T_world_camera)
+        return Frame(
+            match.number,
+            time_ns,
+            image.rgb,
+            image.depth_m,
+            image.camera,
+            match.T_world_camera,
+            recorded_rgb=image.recorded_rgb,
+        )
 
     def indices(self) -> Sequence[int]:
         """Return the rows of rgb.txt, from 0."""

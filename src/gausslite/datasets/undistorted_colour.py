@@ -30,4 +30,6 @@ class UndistortedColourSource(WrappedSource):
         recorded = self._source.frame(i)
         rgb = undistort_colour(recorded.rgb, recorded.camera, lens)
         image = resize_rgbd(RgbdImage(rgb, recorded.depth_m, recorded.camera), size)
-        return replace(recorded, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
+        return replace(
+            recorded, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera, recorded_rgb=image.recorded_rgb
+        )

@@ -25,7 +25,8 @@ class Frame:
     depth_m is the distance along the optical axis in metres, 0 where the sensor had no return.
     T_world_camera uses OpenCV axes (x right, y down, z forward); its position is within 10 km of the world's origin
     along each axis. motion: the camera's motion while the image was exposed, with T_world_camera the pose at the middle
-    row's time; None for an image of a camera at rest. Raises ShapeError, PoseError, InvalidInputError.
+    row's time; None for an image of a camera at rest. recorded_rgb: the same image before it was made smaller, for
+    detectors; None if it never was. Raises ShapeError, PoseError, InvalidInputError.
     """
 
     index: int
@@ -35,6 +36,7 @@ class Frame:
     camera: Camera
     T_world_camera: Float64[ndarray, "4 4"]
     motion: CameraMotion | None = None
+    recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height_px, self.camera.width_px)
@@ -49,6 +51,11 @@ class Frame:
             )
         if not np.isfinite(self.depth_m).all() or (self.depth_m < 0).any():
             raise InvalidInputError("frame depth_m: expected finite values of at least 0 (0 = no return)")
+
+    @property
+    def sharpest_rgb(self) -> UInt8[ndarray, "hs ws 3"]:
+        """The image with the most pixels: as recorded if it was made smaller."""
+        return self.rgb if self.recorded_rgb is None else self.recorded_rgb
 
     @property
     def has_depth(self) -> bool:

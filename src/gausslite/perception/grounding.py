@@ -75,7 +75,7 @@ class GroundingDino:
 
     def boxes(self, frame: Frame, queries: Sequence[str]) -> list[DetectedBox]:
         """Return all instances of each query, best first, without boxes too large for their noun."""
-        pixel_values, pixel_mask = self._preprocess(frame.rgb)
+        pixel_values, pixel_mask = self._preprocess(frame.sharpest_rgb)
         found: list[DetectedBox] = []
         for query in queries:
             logits, boxes_cxcywh = self._run(pixel_values, pixel_mask, self._encoded_phrase(query))

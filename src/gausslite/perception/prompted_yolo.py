@@ -93,7 +93,9 @@ class PromptedYolo:
         """Return all instances of each query, best first, without boxes too large for their noun."""
         searched = [(query, self._vectors.vector(query)) for query in queries]
         known = [(query, vector) for query, vector in searched if vector is not None]
-        tensor, letterboxing = letterbox(frame.rgb, self._inputs.height_px, self._inputs.width_px)
+        tensor, letterboxing = letterbox(
+            frame.sharpest_rgb, self._inputs.height_px, self._inputs.width_px, frame.rgb.shape[:2]
+        )
         found: list[DetectedBox] = []
         step = self._inputs.classes or _MAX_CLASSES
         for start in range(0, len(known), step):

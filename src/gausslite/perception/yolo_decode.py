@@ -38,16 +38,21 @@ class Candidates:
 
 
 def letterbox(
-    rgb: UInt8[ndarray, "h w 3"], height_px: int, width_px: int
+    rgb: UInt8[ndarray, "h w 3"], height_px: int, width_px: int, size_px: tuple[int, int] | None = None
 ) -> tuple[Float32[ndarray, "1 3 H W"], Letterbox]:
-    """Scale an image to fit, centre it on grey, and convert it to [0, 1] with channels first."""
-    h, w = rgb.shape[:2]
+    """Scale an image to fit, centre it on grey, and convert it to [0, 1] with channels first.
+
+    size_px: (height, width) in whose pixels the letterbox is stated, by default the image's own.
+    """
+    h, w = size_px or rgb.shape[:2]
     scale = min(height_px / h, width_px / w)
     inner_h, inner_w = max(1, round(h * scale)), max(1, round(w * scale))
     top, left = (height_px - inner_h) // 2, (width_px - inner_w) // 2
     canvas = np.full((height_px, width_px, 3), _PAD_VALUE, np.uint8)
     canvas[top : top + inner_h, left : left + inner_w] = (
-        rgb if (inner_h, inner_w) == (h, w) else cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_LINEAR)
+        rgb
+        if (inner_h, inner_w) == rgb.shape[:2]
+        else cv2.resize(rgb, (inner_w, inner_h), interpolation=cv2.INTER_LINEAR)
     )
     tensor = np.ascontiguousarray(canvas.transpose(2, 0, 1)[None]).astype(np.float32) / np.float32(255.0)
     return tensor, Letterbox(inner_w / w, inner_h / h, left, top)

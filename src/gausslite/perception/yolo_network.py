@@ -74,9 +74,9 @@ class YoloNetwork:
         return latest[1]
 
     def _infer(self, frame: Frame) -> NetworkOutput:
-        tensor, letterboxing = letterbox(frame.rgb, self._height_px, self._width_px)
-        outputs = self._session.run(None, {self._input: tensor})
         size_px = (frame.camera.height_px, frame.camera.width_px)
+        tensor, letterboxing = letterbox(frame.sharpest_rgb, self._height_px, self._width_px, size_px)
+        outputs = self._session.run(None, {self._input: tensor})
         network_size_px = (self._height_px, self._width_px)
         index = self._prototypes_index
         prototypes = np.zeros((0, 1, 1), np.float32) if index is None else outputs[index][0]

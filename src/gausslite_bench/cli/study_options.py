@@ -15,7 +15,7 @@ from gausslite.config.values import AUTO, NONE, read_names, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
 from gausslite.domain.errors import InvalidInputError
-from gausslite_bench.cli.argument_types import read_seeds
+from gausslite_bench.cli.argument_types import read_image_size, read_seeds
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HomeTask, choose_home_tasks
 from gausslite_bench.quality.real_scenes import REAL_CAMERA, RealScenePlan, choose_kinds, real_plans
@@ -39,6 +39,12 @@ def add_study_options(parser: argparse.ArgumentParser, default_seeds: tuple[int,
         help=f"training frames (default: {_HOME_FRAMES} per home, all of a real sequence)",
     )
     add("--views", metavar="N", type=int, default=24, help="held-out views per home (default: %(default)s)")
+    add(
+        "--recorded-size",
+        metavar="WxH",
+        type=read_image_size,
+        help="size of the images that simulated cameras record and detectors see (default: --size, that of the maps)",
+    )
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
     add(
         "--lpips-weights",
@@ -92,7 +98,10 @@ def scene_plans(
 def _home_plans(options: argparse.Namespace, tasks: Sequence[HomeTask]) -> list[HomeScenePlan]:
     frames = _HOME_FRAMES if options.frames is None else options.frames
     pose_policy = _pose_policy(options, PosePolicy())
-    return [HomeScenePlan(task, frames, options.views, pose_policy=pose_policy) for task in tasks]
+    return [
+        HomeScenePlan(task, frames, options.views, pose_policy=pose_policy, recorded_size=options.recorded_size)
+        for task in tasks
+    ]
 
 
 def real_sequence_plans(options: argparse.Namespace) -> tuple[list[RealScenePlan], tuple[int, int]] | None:

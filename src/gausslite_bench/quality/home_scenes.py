@@ -19,13 +19,18 @@ _FIRST_TRAJECTORY_SHARE = 2 / 3
 
 @dataclass(frozen=True, slots=True)
 class HomeScenePlan:
-    """A task in its simulated home: two training trajectories with sensor noise, held-out views without noise."""
+    """A task in its simulated home: two training trajectories with sensor noise, held-out views without noise.
+
+    recorded_size: (width_px, height_px) of the camera; images are made smaller, and a detector sees them as recorded.
+    None: the camera records at the size of the maps.
+    """
 
     pair: HomeTask
     frames: int = 60
     views: int = 24
     seed: int = 0
     pose_policy: PosePolicy = field(default_factory=PosePolicy)
+    recorded_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         require_count("frames", self.frames)
@@ -48,20 +53,23 @@ class HomeScenePlan:
             "task": self.task,
             "objects": list(self.pair.objects),
             "pose_policy": str(self.pose_policy),
+            **({} if self.recorded_size is None else {"recorded_size": list(self.recorded_size)}),
         }
 
     def training_settings(self) -> Mapping[str, object]:
         """Return the training trajectories."""
-        return {"specs": self._training_specs()}
+        recorded = {} if self.recorded_size is None else {"recorded_size": list(self.recorded_size)}
+        return {"specs": self._training_specs(), **recorded}
 
     def load(self, size: tuple[int, int]) -> Scene:
         """Return the scene; the training trajectories follow each other as one mission."""
-        size_option = f"&size={size[0]}x{size[1]}"
+        recorded = self.recorded_size or size
+        size_option = f"&size={recorded[0]}x{recorded[1]}"
         training_sources = [open_source(f"{spec}{size_option}") for spec in self._training_specs()]
-        training = [source.frame(i) for source in training_sources for i in range(len(source))]
+        training = [source.frame(i, size) for source in training_sources for i in range(len(source))]
         held_out_source = open_source(f"{self._held_out_spec()}{size_option}")
         regions = choose_regions(training_sources[0].regions(), self.pair.objects)
-        views = [HeldOutView.of(held_out_source.frame(i), regions) for i in range(len(held_out_source))]
+        views = [HeldOutView.of(held_out_source.frame(i, size), regions) for i in range(len(held_out_source))]
         return make_scene(self.task, training, views, regions, SceneInfo.of(training_sources[0]))
 
     def _training_specs(self) -> list[str]:

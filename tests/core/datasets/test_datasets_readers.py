@@ -197,3 +197,15 @@ def test_a_size_that_changes_the_aspect_ratio_is_rejected_with_the_nearest_sizes
 def test_a_size_within_a_pixel_of_the_aspect_ratio_is_accepted(text: str, tmp_path: Path) -> None:
     source = open_source(str(write_tum(tmp_path / "fr1")))
     assert "x".join(map(str, frame_size(text, source))) == text
+
+
+@pytest.mark.parametrize("write", [write_tum, write_seven_scenes, write_replica])
+def test_a_smaller_frame_keeps_its_recorded_image(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    source = open_source(str(write(tmp_path / "rgbd_dataset_freiburg2_x")))
+    full = source.frame(0)
+    small = source.frame(0, (full.camera.width_px // 2, full.camera.height_px // 2))
+    assert full.recorded_rgb is None
+    assert np.array_equal(full.sharpest_rgb, full.rgb)
+    assert small.recorded_rgb is not None
+    assert np.array_equal(small.sharpest_rgb, full.rgb)
+    assert small.rgb.shape == (full.rgb.shape[0] // 2, full.rgb.shape[1] // 2, 3)

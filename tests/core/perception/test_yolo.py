@@ -55,6 +55,26 @@ def test_boxes_and_masks_are_mapped_back_to_the_image(tmp_path):
     assert np.array_equal(inside, inside[:, ::-1])
 
 
+def test_a_frame_that_was_made_smaller_is_searched_as_recorded(tmp_path):
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP]))
+    recorded = frame_with_red_square()
+    camera = recorded.camera.resized(64, 32)
+    # what is seen in the recorded image only
+    small = replace(
+        recorded,
+        rgb=np.zeros((32, 64, 3), np.uint8),
+        depth_m=np.ones((32, 64), np.float32),
+        camera=camera,
+        recorded_rgb=recorded.rgb,
+    )
+    (found,) = detector.detect(small, ["mug"])
+    assert found.box_px == pytest.approx((16, 8, 32, 24))
+    expected = np.zeros((32, 64), np.bool_)
+    expected[8:24, 16:32] = True
+    assert (found.mask & expected).sum() / (found.mask | expected).sum() > 0.9
+    assert detector.detect(replace(small, recorded_rgb=None), ["mug"]) == []
+
+
 def test_a_mask_stays_in_its_box(tmp_path):
     narrow = (24.0, 32.0, 8.0, 16.0, 0, 0.9)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [narrow]))

@@ -64,7 +64,9 @@ class FrameConverter:
         image = resize_rgbd(self.cameras.join(place, rgb, depth_m), size)
         # to the precision of a float64 in seconds, as in folders: keyframes are chosen by their times
         time_ns = round(stamp_ns / 10**9 * 1e9)
-        return Frame(number, time_ns, image.rgb, image.depth_m, image.camera, T_world_camera)
+        return Frame(
+            number, time_ns, image.rgb, image.depth_m, image.camera, T_world_camera, recorded_rgb=image.recorded_rgb
+        )
 
 
 def _colour_image(place: str, message: Any) -> UInt8[ndarray, "h w 3"]:
