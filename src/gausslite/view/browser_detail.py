@@ -19,6 +19,8 @@ _OPTIMISM = 2.0
 """An answer takes less than in proportion to the splats: more are tried if the proportion gives twice the limit."""
 _REST_S = 0.7
 """A camera that has not moved for this long is at rest; more splats are sent only then."""
+_RETRY_S = 30.0
+"""A slow browser tries the next step again after this time, then after twice the time, and so on."""
 _ANSWERS = 5
 _ANSWER_LIMIT_S = 60.0
 _STORAGE_KEY = "gausslite-answer"
@@ -48,7 +50,7 @@ class BrowserDetail:
         # only the thread uses what follows
         self._drawn: Splats | None = None
         self._handle: Any = None
-        self._count, self._usable, self._is_slow = PREVIEW_COUNT, 0, False
+        self._start_again()
         client.camera.on_update(lambda _: self._note_motion())
         threading.Thread(target=self._run, name="browser-detail", daemon=True).start()
 
@@ -90,35 +92,39 @@ class BrowserDetail:
             while not self._is_closed:
                 if self._is_restarted:
                     self._is_restarted, self._drawn = False, None
-                    self._count, self._usable, self._is_slow = PREVIEW_COUNT, 0, False
+                    self._start_again()
                 if self._splats is not None and self._splats is not self._drawn:
                     return self._splats
-                rest_s = None
-                if (
-                    self._splats is not None
-                    and self._is_adaptive
-                    and not self._is_slow
-                    and self._usable < len(self._splats)
-                ):
-                    rest_s = self._moved_s + _REST_S - time.monotonic()
-                    if rest_s <= 0:
-                        return self._splats
-                self._changed.wait(rest_s)
+                pause_s = self._pause_s()
+                if pause_s is not None and pause_s <= 0:
+                    return self._splats
+                self._changed.wait(pause_s)
         return None
+
+    def _pause_s(self) -> float | None:
+        """Return the time until more splats can be tried; None if all are drawn."""
+        if self._splats is None or not self._is_adaptive or self._usable >= len(self._splats):
+            return None
+        return max(self._moved_s + _REST_S, self._retry_at_s) - time.monotonic()
+
+    def _start_again(self) -> None:
+        self._count, self._usable = PREVIEW_COUNT, 0
+        self._retry_at_s, self._retry_pause_s = 0.0, _RETRY_S
 
     def _grow(self, splats: Splats) -> None:
         """Measure what is drawn; draw one step more, or the last usable number of splats."""
         count, response_s = min(self._count, len(splats)), self._response_s()
-        if response_s > RESPONSE_LIMIT_S and self._usable:
-            self._is_slow = True
-            self._draw(splats, self._usable)
+        if response_s > RESPONSE_LIMIT_S and 0 < self._usable < count:
+            chosen, is_slow = self._usable, True
         else:
-            self._usable = count
-            larger = next_count(count, len(splats), response_s)
-            self._is_slow = larger == count < len(splats)
-            if larger > count:
-                self._draw(splats, larger)
-        self._note.content = _note_html(self._usable) if self._is_slow else ""
+            self._usable, chosen = count, next_count(count, len(splats), response_s)
+            is_slow = chosen == count < len(splats)
+        if chosen != count:
+            self._draw(splats, chosen)
+        if is_slow:
+            self._retry_at_s = time.monotonic() + self._retry_pause_s
+            self._retry_pause_s *= 2
+        self._note.content = _note_html(self._usable) if is_slow else ""
 
     def _draw(self, splats: Splats, count: int) -> None:
         if count > PREVIEW_COUNT:

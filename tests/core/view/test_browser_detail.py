@@ -63,8 +63,9 @@ def test_opaque_gaussians_come_first():
     assert spread_order(gaussians)[:40].min() >= 50
 
 
-def test_a_slow_browser_keeps_the_small_set_until_all_is_asked_for_and_a_fast_one_gets_all(monkeypatch):
+def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_more_when_it_is_fast(monkeypatch):
     monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 0.0)
+    monkeypatch.setattr(browser_detail, "_RETRY_S", 0.01)
     page = open_page(0, "test")
     try:
         page.show(ViewContents.of_one_agent(points(3 * PREVIEW_COUNT)))
@@ -77,10 +78,10 @@ def test_a_slow_browser_keeps_the_small_set_until_all_is_asked_for_and_a_fast_on
             assert set(tab.evaluate("window.drawn")) == {PREVIEW_COUNT}
             page._adapts.value = False
             tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
-            monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
-            tab.evaluate("window.drawn = []")
             page._adapts.value = True
-            tab.wait_for_function(f"window.drawn.some(count => count < {3 * PREVIEW_COUNT})")
+            tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT}")
+            # the next trial finds that the browser has become fast
+            monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
             tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
             page.show(ViewContents.of_one_agent(points(PREVIEW_COUNT // 2)))
             tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT // 2}")
