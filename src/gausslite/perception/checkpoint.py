@@ -74,7 +74,7 @@ def decode_floor(state: State) -> FloorLevel:
     """Decode the observed heights. Raises MapFileError."""
     empty = FloorLevel.before_frames()
     counts = get_array(state, "floor_counts", empty.counts.shape, np.int64).copy()
-    first_camera_m = float(get_array(state, "first_camera_m", (1,), np.float64)[0])
-    if (counts < 0).any() or np.isinf(first_camera_m):
-        raise MapFileError("state floor: expected counts of zero or more and a finite height, got others")
-    return FloorLevel(first_camera_m, counts)
+    levels_m = get_array(state, "first_camera_m", (None,), np.float64)
+    if (counts < 0).any() or len(levels_m) > 1 or not np.isfinite(levels_m).all():
+        raise MapFileError("state floor: expected counts of zero or more and at most one finite level, got others")
+    return FloorLevel(float(levels_m[0]) if len(levels_m) else None, counts)

@@ -131,7 +131,8 @@ class RelevanceTracker:
             "known_targets": int_array(*self._known_targets),
         }
         floor = self._filter.floor
-        state |= {"floor_counts": floor.counts, "first_camera_m": np.array([floor.first_camera_m])}
+        levels = [] if floor.first_camera_m is None else [floor.first_camera_m]
+        state |= {"floor_counts": floor.counts, "first_camera_m": np.array(levels, np.float64)}
         state["count"] = int_array(len(self.landmarks))
         for i, landmark in enumerate(self.landmarks):
             state |= add_prefix(f"landmark-{i}", encode_landmark(landmark))

@@ -84,20 +84,23 @@ def support_level_m(mask: Bool[ndarray, "h w"], frame: Frame, up: Float64[ndarra
 
 @dataclass(frozen=True, eq=False)
 class FloorLevel:
-    """Counts of points on horizontal surfaces by their level, from 4 m below the first camera to 4 m above it."""
+    """Counts of points on horizontal surfaces by their level, from 4 m below the first camera to 4 m above it.
 
-    first_camera_m: float
+    first_camera_m: the level of the first camera, None before any frame.
+    """
+
+    first_camera_m: float | None
     counts: Int64[ndarray, " bins"]
 
     @classmethod
     def before_frames(cls) -> FloorLevel:
         """Return no points."""
-        return cls(np.nan, np.zeros(_BINS, np.int64))
+        return cls(None, np.zeros(_BINS, np.int64))
 
     def add(self, frame: Frame, up: Float64[ndarray, "3"]) -> FloorLevel:
         """Return the counts with some points of another frame."""
         camera_m = float(frame.T_world_camera[:3, 3] @ up)
-        first_m = camera_m if np.isnan(self.first_camera_m) else self.first_camera_m
+        first_m = camera_m if self.first_camera_m is None else self.first_camera_m
         bins = np.floor((_horizontal_levels_m(frame, up) - first_m + _REACH_M) / _BIN_M).astype(np.int64)
         inside = bins[(bins >= 0) & (bins < _BINS)]
         return FloorLevel(first_m, self.counts + np.bincount(inside, minlength=_BINS))
@@ -109,7 +112,7 @@ class FloorLevel:
         below_m = _REACH_M - (np.arange(len(pairs)) + 1) * _BIN_M
         enough = max(_MIN_FLOOR_POINTS, _MIN_FLOOR_SHARE * float(self.counts.sum()))
         is_floor = (pairs >= enough) & (below_m >= _CAMERA_HEIGHTS_M[0]) & (below_m <= _CAMERA_HEIGHTS_M[1])
-        if not is_floor.any():
+        if self.first_camera_m is None or not is_floor.any():
             return np.nan
         low = int(np.flatnonzero(is_floor)[0])
         return self.first_camera_m - float(below_m[low + int(pairs[low : low + 4].argmax())])
