@@ -31,6 +31,7 @@ from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.timeline import Timeline
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.frame_queue import FrameQueue, QueuedFrame
 from gausslite_agent.idle_training import IdleTraining
@@ -73,6 +74,7 @@ class MappingWorker:
         self._sent_voxels = SentVoxelTracker(grid)
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
+        self._timeline = Timeline()
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
@@ -116,6 +118,10 @@ class MappingWorker:
         requested_task: the task of the command line. The future raises StorageError.
         """
         return self._submit(lambda: self._save(path, config, requested_task))
+
+    def write_timeline(self, folder: Path) -> Future[None]:
+        """Write frames.csv, with the frames since the program's start. The future raises StorageError."""
+        return self._submit(lambda: self._timeline.write(folder))
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame and return the future of its report.
@@ -253,6 +259,7 @@ class MappingWorker:
             self._keyframe_upload.offer_newest(self._mapper.keyframes())
         self._observe_free_space(frame)
         self._status.add_outcome(outcome)
+        self._timeline.add(outcome)
         self._status.update(correction=self._mapper.poses.latest(), corrected_at_s=time.monotonic())
         self._count(report)
         self._on_change()

@@ -26,6 +26,7 @@ from gausslite.config.mapping_options import (
     perception_options,
     perception_settings,
 )
+from gausslite.config.options_without_effect import require_effect
 from gausslite.config.source_options import add_camera_correction, add_register_depth
 from gausslite.config.switches import add_switch
 from gausslite.config.toml_text import OptionValue
@@ -132,6 +133,7 @@ def _require_valid(options: argparse.Namespace) -> None:
         raise InvalidInputError(
             f"--refine-iterations: expected 0 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
         )
+    require_effect(options)
     mission_settings(options)
     VoxelGrid(options.voxel_size)
     open_models(perception_settings(options))

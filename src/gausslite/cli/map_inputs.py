@@ -16,6 +16,7 @@ from gausslite.cli.source_options import (
 )
 from gausslite.codec.task_json import graph_as_json
 from gausslite.config.mapping_options import mission_settings, perception_settings
+from gausslite.config.options_without_effect import require_effect
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.selection import frame_step
 from gausslite.datasets.sequence_name import default_world_frame, sequence_name
@@ -68,6 +69,7 @@ class MapInputs:
     @classmethod
     def of(cls, options: argparse.Namespace) -> MapInputs:
         """Return the inputs of the command line. Raises InvalidInputError, DatasetError, TaskError."""
+        require_effect(options)
         task = TaskSettings(options.task, options.roi, tuple(options.objects), tuple(options.roi_ball))
         _report_uniform_map(options)
         mission = mission_settings(options, policy_of(options))

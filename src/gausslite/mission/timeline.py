@@ -17,12 +17,17 @@ from gausslite.mission.task_mapper import FrameOutcome
 
 _FILE = "frames.csv"
 COLUMNS = ("frame", "seconds", "iterations", "gaussians", "roi_share")
+_MAX_ROWS = 100_000
 
 
 @dataclass(slots=True)
 class Timeline:
-    """The rows of one run; frames that were skipped have none."""
+    """The rows of one run; frames that were skipped have none.
 
+    An agent may run for weeks: whenever there are max_rows rows, every second one is removed.
+    """
+
+    max_rows: int = _MAX_ROWS
     _rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def add(self, outcome: FrameOutcome) -> None:
@@ -30,6 +35,8 @@ class Timeline:
         if outcome.skipped is None:
             seconds = outcome.timing.seconds
             self._rows.append((outcome.index, seconds, outcome.iterations, outcome.gaussians, outcome.roi_share))
+        if len(self._rows) >= self.max_rows:
+            del self._rows[1::2]
 
     def write(self, folder: Path) -> None:
         """Write frames.csv. Raises StorageError."""

@@ -27,6 +27,7 @@ from gausslite.domain.trajectory import Trajectory
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.settings import SourceSettings
+from gausslite.mission.timeline import read_timeline
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
@@ -129,6 +130,9 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
     assert 0 < report["roi_share"] < 1
     assert report["bytes_sent"] == agent.roi_bytes > 0
     assert report["handover_bytes"] == agent.handover_bytes == agent.keyframes == 0
+    timeline = read_timeline(tmp_path)
+    assert len(timeline["frame"]) == report["frames"]
+    assert timeline["roi_share"].mean() == pytest.approx(report["roi_share"], rel=1e-4)
     assert report["map_shared_percent"] == pytest.approx(100 * written.active.mean())
     assert agent.gaussians == written.active.sum()
 

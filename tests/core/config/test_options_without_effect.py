@@ -1,0 +1,31 @@
+"""Options that do nothing without another option are refused before any work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tiny_sequences import write_tum
+
+from gausslite.cli.main import main
+
+
+@pytest.mark.parametrize(
+    ("given", "needed"),
+    [
+        (("--track-motion", "odometry"), "--poses track"),
+        (("--segmenter", "depth"), "--detector FILE.onnx"),
+        (("--vocabulary", "vocab.txt"), "--detector FILE.onnx"),
+        (("--resegment",), "--detector FILE.onnx"),
+    ],
+)
+@pytest.mark.parametrize("command", ["map", "demo"])
+def test_an_option_without_effect_is_refused(
+    command: str, given: tuple[str, ...], needed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = str(write_tum(tmp_path / "room"))
+    source = {"map": [sequence], "demo": ["--source", sequence, "--task-a", "Find the mug", "--task-b", "Find it"]}
+    assert main([command, *source[command], *given, "--out", str(tmp_path / "out")]) == 2
+    message = f"gausslite: {given[0]}: has an effect only with {needed}; give both, or omit {given[0]}"
+    assert capsys.readouterr().err.splitlines() == [message]
+    assert not (tmp_path / "out").exists()
