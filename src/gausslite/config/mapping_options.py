@@ -62,7 +62,7 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
         "--detector",
         metavar="FILE.onnx",
         type=Path,
-        help="a YOLO-seg or Grounding DINO model (default: the source's ground truth)",
+        help="a YOLO, YOLO-World or Grounding DINO model (default: the source's ground truth)",
     )
     add(
         "--segmenter",
@@ -73,7 +73,7 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
         "--vocabulary",
         metavar="FILE.txt",
         type=Path,
-        help="Grounding DINO's vocabulary (default: vocab.txt in the model's folder)",
+        help="the text encoder's vocabulary (default: vocab.txt or tokenizer.json in the model's folder)",
     )
     add_switch(group, "--resegment", "run the segmenter on every frame (slower)")
     add_switch(group, "--accept-similar", "also map objects of a class that is only similar to the task's noun")

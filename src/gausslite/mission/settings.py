@@ -115,9 +115,9 @@ class TaskSettings:
 class PerceptionSettings:
     """The models that find the task's nouns. Without a model file, the ground truth of the sequence is used.
 
-    model: a YOLO-seg or Grounding DINO file. segmenter: how detected boxes become masks, "yolo" (the detector's masks),
-    "depth" or a FastSAM file; None for the model's own masks, or depth if it has none. vocabulary: the vocabulary file
-    of Grounding DINO; None for vocab.txt next to the model.
+    model: a YOLO, YOLO-World or Grounding DINO file. segmenter: how detected boxes become masks, "yolo" (the
+    detector's masks), "depth" or a FastSAM file; None for the model's own masks, or depth if it has none. vocabulary:
+    the text encoder's file; None for vocab.txt (Grounding DINO) or tokenizer.json (YOLO-World) next to the model.
 
     resegment: also run the segmenter on frames between detections. Otherwise masks are cut by depth inside the
     re-projected boxes, which on a real kitchen is as accurate at a third of the time. asynchronous: mapping does not
