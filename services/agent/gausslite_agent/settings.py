@@ -111,7 +111,7 @@ class AgentSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     """Return the settings of the command line. Raises InvalidInputError."""
-    options = parse_options(_parser(), arguments, warn=print_message)
+    options = parse_options(build_parser(), arguments, warn=print_message)
     if options.source is not None and options.task is None:
         raise InvalidInputError("--task: expected a task for the source, got none")
     _require_valid(options)
@@ -198,7 +198,8 @@ def _require_valid(options: argparse.Namespace) -> None:
         require_task_text(options.task)
 
 
-def _parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of `gausslite-agent`, without the options of configuration files."""
     parser = argparse.ArgumentParser(
         prog="gausslite-agent",
         description="Map the region of interest (ROI) of a task online, and send it to a fusion server. With --source "

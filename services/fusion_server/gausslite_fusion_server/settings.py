@@ -70,7 +70,7 @@ class MaintenanceSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Return the settings of the options. Raises InvalidInputError for values that are out of range."""
-    options = parse_options(_parser(), arguments, warn=print_message)
+    options = parse_options(build_parser(), arguments, warn=print_message)
     if options.shards is not None and options.store == MEMORY:
         raise InvalidInputError("--shards: expected a folder as --store, got none")
     _require_one_mission(options)
@@ -121,7 +121,8 @@ def _require_one_mission(options: argparse.Namespace) -> None:
             )
 
 
-def _parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of `gausslite-fusion-server`, without the options of configuration files."""
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "

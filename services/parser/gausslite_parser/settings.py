@@ -27,11 +27,12 @@ class ParserSettings:
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     """Return the settings of the options. Ends the process with code 2 for wrong flags. Raises InvalidInputError."""
-    options = parse_options(_parser(), arguments, warn=print_message)
+    options = parse_options(build_parser(), arguments, warn=print_message)
     return ParserSettings(options.listen, backend_settings(options, os.environ), read_server_tls(options))
 
 
-def _parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of `gausslite-parser`, without the options of configuration files."""
     parser = argparse.ArgumentParser(
         prog="gausslite-parser", description="Serve gausslite.v1.ParserService: parse task texts into task graphs."
     )

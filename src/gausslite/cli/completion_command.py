@@ -1,8 +1,9 @@
-"""`gausslite completion`: print the script with which a shell completes commands, options and file names."""
+"""`gausslite completion`: print the script with which a shell completes a program's commands, options and files."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -12,24 +13,45 @@ from gausslite.config.paths import read_path
 from gausslite.domain.errors import InvalidInputError
 
 _SHELLS = ("bash", "zsh", "fish")
+_GAUSSLITE = "gausslite"
+_SERVICES = {
+    "gausslite-agent": "gausslite_agent.settings",
+    "gausslite-fusion-server": "gausslite_fusion_server.settings",
+    "gausslite-parser": "gausslite_parser.settings",
+}
+"""Modules of the service programs; imported by name, because the services are siblings of the command line."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the shell."""
+    """Add the shell and the program."""
     parser.add_argument("shell", choices=_SHELLS, help="the shell that reads the script")
+    parser.add_argument(
+        "program",
+        nargs="?",
+        choices=(_GAUSSLITE, *_SERVICES),
+        default=_GAUSSLITE,
+        help="the program whose words are completed (default: %(default)s)",
+    )
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the script. Returns the exit code. Raises InvalidInputError if shtab is not installed."""
     shtab = _import_shtab()
-    parser = build_parser()
+    parser = _parser_of(options.program)
     for action in _actions(parser):
         if action.type in (Path, read_path):
             # shtab reads this attribute of an action
             vars(action)["complete"] = shtab.DIRECTORY if action.metavar == "DIR" else shtab.FILE
     print(shtab.complete(parser, options.shell))
     return 0
+
+
+def _parser_of(program: str) -> argparse.ArgumentParser:
+    if program == _GAUSSLITE:
+        return build_parser()
+    parser: argparse.ArgumentParser = importlib.import_module(_SERVICES[program]).build_parser()
+    return parser
 
 
 def _import_shtab() -> ModuleType:

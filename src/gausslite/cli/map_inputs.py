@@ -71,7 +71,6 @@ class MapInputs:
         """Return the inputs of the command line. Raises InvalidInputError, DatasetError, TaskError."""
         require_effect(options)
         task = TaskSettings(options.task, options.roi, tuple(options.objects), tuple(options.roi_ball))
-        _report_uniform_map(options)
         mission = mission_settings(options, policy_of(options))
         schedule = _schedule(parse_task(options), [TaskSwitch.parse(text) for text in options.task_at])
         require_poses = mission.poses is not PoseMode.TRACK
@@ -86,6 +85,7 @@ class MapInputs:
         )
         stream = FrameStream.select(recorded, source)
         source = replace(source, size=f"{stream.size[0]}x{stream.size[1]}")
+        _report_uniform_map(options)
         return cls(mission, perception_settings(options), source, task, stream, schedule)
 
     def calibrated(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gausslite.config.tls_options import add_tls, read_tls
+from gausslite.wire.address import require_callable
 from gausslite.wire.clients import AgentClient, FusionClient
 
 
@@ -26,9 +27,11 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 def fusion_client(options: argparse.Namespace) -> FusionClient:
     """Return a client of the fusion server at the address. Raises InvalidInputError."""
+    require_callable("address of the fusion server", options.address)
     return FusionClient(options.address, mission_id=options.mission, tls=read_tls(options))
 
 
 def agent_client(options: argparse.Namespace) -> AgentClient:
     """Return a client of the agent at the address. Raises InvalidInputError."""
+    require_callable("address of the agent", options.address)
     return AgentClient(options.address, tls=read_tls(options))

@@ -159,7 +159,8 @@ def _read_poses(path: Path) -> PoseTrack:
     table = np.array([parse_numbers(place, fields, 8, meaning) for place, fields in rows])
     known = np.array([not is_lost(row[1:]) for row in table], np.bool_)
     if np.count_nonzero(known) < 2:
-        raise DatasetError(f"{path}: expected at least 2 poses, got {np.count_nonzero(known)}")
+        lost = f" and {len(rows) - np.count_nonzero(known)} rows of NaN, infinity or zeros" if rows else ""
+        raise DatasetError(f"{path}: expected at least 2 poses, got {np.count_nonzero(known)}{lost}")
     for i in np.flatnonzero(known):
         pose_from_quaternion(rows[i][0], table[i, 1:4], table[i, 4:8])
     if not (np.isfinite(table[:, 0]).all() and (np.diff(table[:, 0]) >= 0).all()):

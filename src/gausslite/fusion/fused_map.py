@@ -159,7 +159,7 @@ class FusedMapLayers:
         with self._lock:
             refined = self._refined
             if refined is None:
-                raise MismatchError("refined map: expected a refinement first, got none yet; call RefineFusedMap")
+                raise MismatchError("refined map: expected a refinement first, got none yet; see `gausslite refine`")
             changed = self._change_log.changed_since(refined.revision)
             batches = self._votes.batches(changed)
         return refined.replace_changed(fuse(batches), changed)

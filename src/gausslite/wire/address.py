@@ -6,10 +6,14 @@ from gausslite.domain.errors import InvalidInputError
 
 UNIX = "unix:"
 _LAST_PORT = 65535
+_WEB_SCHEMES = ("http://", "https://")
 
 
 def host_and_port(name: str, address: str) -> tuple[str, int]:
     """Split HOST:PORT. Raises InvalidInputError; its message begins with the name."""
+    for scheme in _WEB_SCHEMES:
+        if address.startswith(scheme):
+            raise InvalidInputError(f"{name}: expected HOST:PORT without {scheme}, got {address!r}")
     host, _, port = address.rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > _LAST_PORT:
         raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH, got {address!r}")

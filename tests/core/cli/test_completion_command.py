@@ -20,28 +20,28 @@ def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def script(shell: str) -> str:
+def script(shell: str, *program: str) -> str:
     import contextlib
     import io
 
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        assert main(["completion", shell]) == 0
+        assert main(["completion", shell, *program]) == 0
     return printed.getvalue()
 
 
-def completions(bash_script: Path, folder: Path, *words: str) -> set[str]:
+def completions(bash_script: Path, folder: Path, *words: str, program: str = "gausslite") -> set[str]:
     """Return what bash offers for the last word, by the function that it would call at a press of Tab."""
-    program = """
-        source "$1"; shift
+    commands = """
+        source "$1"; name="$2"; shift 2
         COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMP_LINE="$*"; COMP_POINT=${#COMP_LINE}
         compopt() { :; }
-        specification=$(complete -p gausslite) || exit 9
+        specification=$(complete -p "$name") || exit 9
         function=$(sed -E 's/.*-F ([^ ]+).*/\\1/' <<< "$specification")
-        "$function" gausslite "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
+        "$function" "$name" "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
         printf '%s\\n' "${COMPREPLY[@]}"
     """
-    command = ["bash", "--norc", "-c", program, "bash", str(bash_script), "gausslite", *words]
+    command = ["bash", "--norc", "-c", commands, "bash", str(bash_script), program, program, *words]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stderr) == (0, "")
     return {line.strip() for line in done.stdout.splitlines() if line.strip()}
@@ -57,6 +57,23 @@ def test_bash_completes_commands_options_choices_and_files(bash_script: Path, tm
     assert completions(bash_script, tmp_path, "bench", "ras") == {"raster"}
     assert completions(bash_script, tmp_path, "completion", "") >= {"bash", "zsh", "fish"}
     assert "kitchen.ply" in completions(bash_script, tmp_path, "eval", "kit")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("program", "typed", "option"),
+    [
+        ("gausslite-agent", "--hand", "--handover"),
+        ("gausslite-fusion-server", "--max-miss", "--max-missions"),
+        ("gausslite-parser", "--llm-u", "--llm-url"),
+    ],
+)
+def test_bash_completes_the_options_of_the_service_programs(
+    program: str, typed: str, option: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "program.bash"
+    path.write_text(script("bash", program))
+    assert completions(path, tmp_path, typed, program=program) == {option}
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])

@@ -31,7 +31,7 @@ def command(name: str) -> argparse.ArgumentParser:
 
 def parsers() -> Iterator[argparse.ArgumentParser]:
     """Yield the parser of every configurable program and benchmark."""
-    yield from (service._parser() for service in SERVICES)
+    yield from (service.build_parser() for service in SERVICES)
     yield from (command(name) for name in ("map", "demo", "eval"))
     for action in command("bench")._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -58,13 +58,13 @@ def test_the_list_of_known_options_is_complete() -> None:
 
 def test_options_of_another_program_give_no_warning(capsys: pytest.CaptureFixture[str]) -> None:
     parse_options(
-        parser_service._parser(),
+        parser_service.build_parser(),
         [],
         {"GAUSSLITE_MAX_GAUSSIANS": "5", "GAUSSLITE_LISTEN": "[::1]:1"},
         warn=print_message,
     )
     assert capsys.readouterr().err == ""
-    parse_options(parser_service._parser(), [], {"GAUSSLITE_ZZZ\x1b": "5"}, warn=print_message)
+    parse_options(parser_service.build_parser(), [], {"GAUSSLITE_ZZZ\x1b": "5"}, warn=print_message)
     assert capsys.readouterr().err == "gausslite-parser: GAUSSLITE_ZZZ\\x1b is not an option\n"
 
 
@@ -72,9 +72,9 @@ def test_every_boolean_option_can_be_switched_off(tmp_path: Path) -> None:
     file = tmp_path / "agent.toml"
     file.write_text("\ufeffstrict = true\nhandover = true\n", encoding="utf-8")
     config = ["--config", str(file)]
-    assert parse_options(agent._parser(), config, {}, warn=print_message).strict
-    assert not parse_options(agent._parser(), [*config, "--no-strict"], {}, warn=print_message).strict
-    assert not parse_options(agent._parser(), config, {"GAUSSLITE_STRICT": "false"}, warn=print_message).strict
+    assert parse_options(agent.build_parser(), config, {}, warn=print_message).strict
+    assert not parse_options(agent.build_parser(), [*config, "--no-strict"], {}, warn=print_message).strict
+    assert not parse_options(agent.build_parser(), config, {"GAUSSLITE_STRICT": "false"}, warn=print_message).strict
     for parser in parsers():
         plain = [each.dest for each in parser._actions if isinstance(each, argparse._StoreTrueAction)]
         assert set(plain) <= {"print_config"}, parser.prog
@@ -100,17 +100,17 @@ def test_the_printed_configuration_of_map_states_defaults_that_depend_on_other_o
 def test_the_printed_configuration_of_the_agent_is_read_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = printed(agent._parser(), capsys)
+    text = printed(agent.build_parser(), capsys)
     assert 'pose-prior = "none"\n' in text
     file = tmp_path / "agent.toml"
     file.write_text(text)
-    assert printed(agent._parser(), capsys, "--config", str(file)) == text
+    assert printed(agent.build_parser(), capsys, "--config", str(file)) == text
     file.write_text(text.replace("# ", "").split("\n", 1)[1].replace("defaults that", "#"))
     assert agent.parse_arguments(["--config", str(file)]).mission.iterations == 8
 
 
 def test_a_printed_configuration_hides_the_password_of_a_url(capsys: pytest.CaptureFixture[str]) -> None:
-    text = printed(parser_service._parser(), capsys, "--llm-url", "http://user:secret@host:8000/v1")
+    text = printed(parser_service.build_parser(), capsys, "--llm-url", "http://user:secret@host:8000/v1")
     assert 'llm-url = "http://user:***@host:8000/v1"' in text
 
 
@@ -120,4 +120,4 @@ def test_a_printed_configuration_hides_the_password_of_a_url(capsys: pytest.Capt
 )
 def test_a_flag_outside_its_bounds_is_named(flags: list[str], named: str) -> None:
     with pytest.raises(InvalidInputError, match=named):
-        parse_options(agent._parser(), flags, {}, warn=print_message)
+        parse_options(agent.build_parser(), flags, {}, warn=print_message)

@@ -54,6 +54,8 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
             (["status", "nowhere.invalid:1"], "nowhere.invalid:1: "),
             (["status", "nowhere"], "address: expected HOST:PORT or unix:PATH, got 'nowhere'"),
             (["status", ""], "address: expected HOST:PORT or unix:PATH, got ''"),
+            (["end", "nowhere"], "gausslite: address of the agent: expected HOST:PORT or unix:PATH, got 'nowhere'"),
+            (["fetch", "http://host:1", "--out", str(tmp_path / "x.ply")], "expected HOST:PORT without http://, got"),
             (["objects", str(tmp_path / "none")], "output folder of a run: expected HOST:PORT"),
             (["end", fusion.client.address], "another service listens there"),
             (["fetch", a.client.address, "--out", str(tmp_path / "x.ply")], "another service listens there"),
