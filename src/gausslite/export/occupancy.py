@@ -16,7 +16,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from gausslite.codec.files import write_atomic, write_atomic_with
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.export.packages import import_extra
 
@@ -72,7 +72,13 @@ def write_octomap(path: Path, gaussians: Gaussians, settings: OccupancySettings)
     for centre_m in (occupied_voxels(gaussians, settings) + 0.5) * settings.voxel_m:
         tree.updateNode(centre_m, True, True)
     tree.updateInnerOccupancy()
-    write_atomic_with(path, lambda partial: tree.writeBinary(str(partial)))
+
+    def write(partial: Path) -> None:
+        # OctoMap reports a full disk by its result only
+        if not tree.writeBinary(str(partial)):
+            raise StorageError(f"{path}: expected a complete file, got an error; check the disk's free space")
+
+    write_atomic_with(path, write)
 
 
 def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) -> None:

@@ -55,9 +55,23 @@ def write_video(
             rgb = np.rint(np.clip(render(camera, view.T_world_camera).rgb, 0.0, 1.0) * 255).astype(np.uint8)
             writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
         writer.release()
-        if not unfinished.is_file() or not unfinished.stat().st_size:
-            raise StorageError(f"{path}: expected a finished video, got nothing; check the disk's free space")
+        written = _count_frames(unfinished)
+        if written < len(poses):
+            raise StorageError(
+                f"{path}: expected a video of {len(poses)} frames, got {written}; check the disk's free space"
+            )
         unfinished.replace(path)
+
+
+def _count_frames(video: Path) -> int:
+    """Return the frames that a reader finds. OpenCV's writer reports no errors; a file cut short has no index."""
+    if not video.is_file() or not video.stat().st_size:
+        return 0
+    reader = cv2.VideoCapture(str(video))
+    try:
+        return int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+    finally:
+        reader.release()
 
 
 def smooth_path(T_world_camera: Float64[ndarray, "k 4 4"], count: int) -> Float64[ndarray, "n 4 4"]:
