@@ -14,14 +14,19 @@ from gausslite.wire.tls import Tls
 
 @contextmanager
 def serving(
-    services: list[Service], listen: str = "127.0.0.1:0", tls: Tls | None = None, limits: CallLimits | None = None
+    services: list[Service],
+    listen: str = "127.0.0.1:0",
+    tls: Tls | None = None,
+    limits: CallLimits | None = None,
+    health_listen: str | None = None,
 ) -> Iterator[RunningServer]:
     """Start a server; it is drained at the end."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)
     thread.start()
     try:
-        running = asyncio.run_coroutine_threadsafe(start_server(listen, services, tls, limits), loop).result(10)
+        starting = start_server(listen, services, tls, limits, health_listen)
+        running = asyncio.run_coroutine_threadsafe(starting, loop).result(10)
         try:
             yield running
         finally:

@@ -98,6 +98,8 @@ async def _serve(settings: ServerSettings) -> None:
     try:
         page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
         with metrics_server(settings.metrics, missions.engines), page:
-            await serve_until_stopped(settings.listen, [service], drain_when_stopping, settings.tls, settings.limits)
+            await serve_until_stopped(
+                settings.listen, [service], drain_when_stopping, settings.tls, settings.limits, settings.health
+            )
     finally:
         missions.close()

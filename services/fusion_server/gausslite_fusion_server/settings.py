@@ -38,7 +38,8 @@ class ServerSettings:
 
     shards: the storage is a folder, for shards on Ray; None for a file. max_missions: above one, the storage is a
     folder with a file for each.
-    view: port of the page that shows the server, None for no page.
+    view: port of the page that shows the server, None for no page. health: own address for health checks, None for
+    none.
     """
 
     listen: str = FUSION_ADDRESS
@@ -55,6 +56,7 @@ class ServerSettings:
     log_format: LogFormat = LogFormat.TEXT
     metrics: str | None = None
     view: int | None = None
+    health: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +107,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         LogFormat(options.log_format),
         options.metrics,
         options.view,
+        options.health,
     )
 
 
@@ -203,6 +206,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="lines of the log (default: %(default)s)",
     )
     add("--metrics", metavar="HOST:PORT", help="serve figures for Prometheus there over HTTP (default: no)")
+    add("--health", metavar="HOST:PORT", help="answer health checks also there, without encryption (default: no)")
     add_view(parser, "the fused map")
     add_tls(parser)
     return parser

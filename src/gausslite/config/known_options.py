@@ -16,6 +16,7 @@ KNOWN_OPTIONS: Final = frozenset(
         *(
             "grace-period",
             "handover",
+            "health",
             "idle-iterations",
             "iterations",
             "json",

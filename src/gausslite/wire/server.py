@@ -36,6 +36,7 @@ from gausslite.wire.token_bucket import TokenBucket
 
 _log = logging.getLogger(__name__)
 _LAST_CALLS_S = 1.0
+_HEALTH_LIMITS = CallLimits(connections=64, idle_s=10)
 # the longest path of a unix socket that Linux accepts
 _MAX_SOCKET_PATH_BYTES = 107
 _OPTIONS = (
@@ -57,15 +58,15 @@ class Service:
 
 
 class RunningServer:
-    """A running server. `address` holds the actual port."""
+    """A running server. The addresses hold the actual ports; health_address is empty without an own address."""
 
     def __init__(
-        self, server: grpc.aio.Server, address: str, health_servicer: Any, watches: Sequence[asyncio.Task[None]]
+        self, servers: dict[str, grpc.aio.Server], health_servicer: Any, watches: Sequence[asyncio.Task[None]]
     ) -> None:
-        self._server = server
+        self._servers = tuple(servers.values())
         self._health = health_servicer
         self._watches = watches
-        self.address = address
+        self.address, self.health_address = (*servers, "")[:2]
 
     async def stop(self, grace_s: float = 5.0) -> None:
         """Report NOT_SERVING, refuse new calls, and cancel the open ones after `grace_s`."""
@@ -73,7 +74,7 @@ class RunningServer:
             watch.cancel()
         await asyncio.gather(*self._watches, return_exceptions=True)
         await self._health.enter_graceful_shutdown()
-        await self._server.stop(grace_s)
+        await asyncio.gather(*(server.stop(grace_s) for server in self._servers))
         # gRPC prints a traceback for each call that the event loop cancels when it closes
         calls = asyncio.all_tasks() - {asyncio.current_task()}
         if calls:
@@ -81,14 +82,18 @@ class RunningServer:
 
 
 async def start_server(
-    listen: str, services: Sequence[Service], tls: Tls | None = None, limits: CallLimits | None = None
+    listen: str,
+    services: Sequence[Service],
+    tls: Tls | None = None,
+    limits: CallLimits | None = None,
+    health_listen: str | None = None,
 ) -> RunningServer:
     """Serve on HOST:PORT (port 0 = any free port) or unix:PATH, with health and reflection; encrypted with `tls`.
 
-    limits: of each caller, None for the default ones.
+    limits: of each caller, None for the default ones. health_listen: an address that serves only the health, without
+    encryption, so that connections to the other one cannot keep health checks out; None for no such address.
     Raises UnavailableError if the address is in use, InvalidInputError if it is not an address.
     """
-    _require_free_address(listen)
     limits = limits or CallLimits()
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     watches = [
@@ -105,19 +110,14 @@ async def start_server(
     await health_servicer.set(LIVENESS, health_pb2.HealthCheckResponse.SERVING)
     names = [service.name for service in services]
     reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
-    try:
-        port = (
-            server.add_insecure_port(listen)
-            if tls is None
-            else server.add_secure_port(listen, tls.server_credentials())
-        )
-    except RuntimeError:
-        port = 0
-    if port == 0:
-        raise UnavailableError(f"listen {listen}: the address is in use or cannot be bound; choose another")
-    await server.start()
-    address = listen if listen.startswith("unix:") else f"{listen.rpartition(':')[0]}:{port}"
-    return RunningServer(server, address, health_servicer, [asyncio.create_task(watch.run()) for watch in watches])
+    servers = {_bind(server, listen, tls): server}
+    if health_listen is not None:
+        health_server = grpc.aio.server(options=(*_OPTIONS, *_HEALTH_LIMITS.connection_options))
+        health_pb2_grpc.add_HealthServicer_to_server(health_servicer, health_server)
+        servers[_bind(health_server, health_listen, None)] = health_server
+    for each in servers.values():
+        await each.start()
+    return RunningServer(servers, health_servicer, [asyncio.create_task(watch.run()) for watch in watches])
 
 
 async def serve_until_stopped(
@@ -126,9 +126,9 @@ async def serve_until_stopped(
     background_task: Callable[[], Awaitable[None]] | None = None,
     tls: Tls | None = None,
     limits: CallLimits | None = None,
-    grace_s: float = 5.0,
+    health_listen: str | None = None,
 ) -> None:
-    """Serve until SIGTERM or SIGINT, or until the background task ends; then drain the server. Logs the address.
+    """Serve until SIGTERM or SIGINT, or until the background task ends; then drain the server. Logs the addresses.
 
     Raises the errors of the background task, also those raised during its cancellation.
     """
@@ -136,9 +136,11 @@ async def serve_until_stopped(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stopping.set)
-    running = await start_server(listen, services, tls, limits)
+    running = await start_server(listen, services, tls, limits, health_listen)
     service_names = ", ".join(service.name for service in services)
     _log.info("%s listening on %s%s", service_names, running.address, "" if tls is None else ", encrypted")
+    if running.health_address:
+        _log.info("health checks on %s", running.health_address)
     waits: list[asyncio.Future[Any]] = [asyncio.ensure_future(stopping.wait())]
     if background_task is not None:
         waits.append(asyncio.ensure_future(background_task()))
@@ -150,7 +152,7 @@ async def serve_until_stopped(
         for task in waits:
             task.cancel()
         results = await asyncio.gather(*waits, return_exceptions=True)
-        await running.stop(grace_s)
+        await running.stop()
         _log.info("ended")
     for result in results:
         # an error during the cancellation of the background task must reach the caller
@@ -279,6 +281,22 @@ async def _set_health(health_servicer: Any, service: str, is_serving: bool) -> N
     states = health_pb2.HealthCheckResponse
     for name in ("", service):
         await health_servicer.set(name, states.SERVING if is_serving else states.NOT_SERVING)
+
+
+def _bind(server: grpc.aio.Server, listen: str, tls: Tls | None) -> str:
+    """Let the server listen; returns the address with the actual port. Raises UnavailableError, InvalidInputError."""
+    _require_free_address(listen)
+    try:
+        port = (
+            server.add_insecure_port(listen)
+            if tls is None
+            else server.add_secure_port(listen, tls.server_credentials())
+        )
+    except RuntimeError:
+        port = 0
+    if port == 0:
+        raise UnavailableError(f"listen {listen}: the address is in use or cannot be bound; choose another")
+    return listen if listen.startswith(UNIX) else f"{listen.rpartition(':')[0]}:{port}"
 
 
 def _require_free_address(listen: str) -> None:

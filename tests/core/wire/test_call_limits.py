@@ -139,6 +139,27 @@ def test_idle_connections_do_not_lock_out_who_is_connected_already() -> None:
             assert check(health_pb2.HealthCheckRequest(), timeout=20, wait_for_ready=True).status == SERVING
 
 
+def test_an_own_address_for_health_answers_while_idle_connections_take_the_other() -> None:
+    limits = CallLimits(connections=200)
+    with serving([parser_service(RuleParser())], limits=limits, health_listen="127.0.0.1:0") as server:
+        opened = list(connections(server.address, 300))
+        # until the server refuses the newest one
+        opened[-1].settimeout(20)
+        with contextlib.suppress(ConnectionError):
+            while opened[-1].recv(4096):
+                pass
+        with grpc.insecure_channel(server.health_address) as channel:
+            check = health_pb2_grpc.HealthStub(channel).Check
+            for name in ("", "liveness", "gausslite.v1.ParserService"):
+                assert check(health_pb2.HealthCheckRequest(service=name), timeout=20).status == SERVING
+            parse = channel.unary_unary("/gausslite.v1.ParserService/ParseTask")
+            with pytest.raises(grpc.RpcError) as refused:
+                parse(b"", timeout=20)
+            assert refused.value.code() is grpc.StatusCode.UNIMPLEMENTED
+        for connection in opened:
+            connection.close()
+
+
 def test_a_connection_without_a_call_is_closed() -> None:
     with serving([parser_service(RuleParser())], limits=CallLimits(idle_s=1)) as server:
         (connection,) = connections(server.address, 1)
