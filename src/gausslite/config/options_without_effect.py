@@ -6,18 +6,22 @@ import argparse
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.motion_model import MotionModel
+from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.mission.settings import PoseMode
 
-_DETECTOR = "--detector FILE.onnx"
+_DETECTOR, _RATE = "--detector FILE.onnx", "--rate HZ"
 
 
 def require_effect(options: argparse.Namespace) -> None:
     """Raise InvalidInputError for an option that differs from its default and has no effect without another one.
 
-    options: those of `add_policy` and `add_detector`. The default itself is accepted: `--print-config` prints it.
+    options: those of `add_policy`, `add_budget` and `add_detector`. The default itself is accepted, because
+    `--print-config` prints it.
     """
     if options.poses != str(PoseMode.TRACK) and options.track_motion != str(MotionModel.VELOCITY):
         _refuse("--track-motion", f"--poses {PoseMode.TRACK}")
+    if options.rate is None:
+        _require_default_schedule(options)
     if options.detector is not None:
         return
     if options.segmenter is not None:
@@ -26,6 +30,16 @@ def require_effect(options: argparse.Namespace) -> None:
         _refuse("--vocabulary", _DETECTOR)
     if options.resegment:
         _refuse("--resegment", _DETECTOR)
+
+
+def _require_default_schedule(options: argparse.Namespace) -> None:
+    defaults = SchedulerSettings()
+    if options.min_iterations != defaults.min_iterations:
+        _refuse("--min-iterations", _RATE)
+    if options.skip_stages != defaults.skip_stages:
+        _refuse("--skip-stages", _RATE)
+    if options.deadline_slack != defaults.deadline_slack:
+        _refuse("--deadline-slack", _RATE)
 
 
 def _refuse(flag: str, needed: str) -> None:

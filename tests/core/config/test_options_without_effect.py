@@ -14,6 +14,9 @@ from gausslite.cli.main import main
     ("given", "needed"),
     [
         (("--track-motion", "odometry"), "--poses track"),
+        (("--min-iterations", "3"), "--rate HZ"),
+        (("--skip-stages", "seeding"), "--rate HZ"),
+        (("--deadline-slack", "0.5"), "--rate HZ"),
         (("--segmenter", "depth"), "--detector FILE.onnx"),
         (("--vocabulary", "vocab.txt"), "--detector FILE.onnx"),
         (("--resegment",), "--detector FILE.onnx"),
