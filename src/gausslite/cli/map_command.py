@@ -26,6 +26,7 @@ from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
+from gausslite.mission.folder_lock import locked_folder
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.keyframe_results import write_keyframes
 from gausslite.mission.results import (
@@ -34,7 +35,6 @@ from gausslite.mission.results import (
     prepare_folder,
     require_additional_file,
     require_no_map,
-    require_writable,
     write_poses,
     write_results,
 )
@@ -94,11 +94,15 @@ def run(options: argparse.Namespace) -> int:
     require_name("--world-frame", options.world_frame or "")
     if options.resume is None and not options.overwrite:
         require_no_map(options.out)
+    with locked_folder(options.out):
+        return _map(options)
+
+
+def _map(options: argparse.Namespace) -> int:
     inputs = MapInputs.of(options)
     saved = None if options.resume is None else SavedRun.read(options.resume)
     if saved is not None:
         inputs = inputs.resumed(options, saved)
-    require_writable(options.out)
     if options.save_state is not None:
         require_additional_file(options.save_state, options.out)
     resumed_after = _NOT_RESUMED if saved is None else saved.last_index

@@ -13,6 +13,7 @@ from gausslite.cli.main import main
 from gausslite.codec.ply import read_world_frame
 from gausslite.datasets.open import open_source
 from gausslite.datasets.sequence_name import default_world_frame
+from gausslite.mission.folder_lock import locked_folder
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 FRAMES = tuple(range(0, 24, 4))
@@ -34,6 +35,15 @@ def test_an_invalid_world_frame_is_refused(tmp_path: Path, capsys: pytest.Captur
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
     assert map_command(sequence, tmp_path / "out", "--world-frame", "a\nb") == 2
     assert "--world-frame: expected no line breaks" in capsys.readouterr().err
+
+
+def test_two_runs_cannot_write_into_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    with locked_folder(tmp_path / "out"):
+        assert map_command(sequence, tmp_path / "out") == 2
+        assert "another run writes its results there; choose another --out" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert map_command(sequence, tmp_path / "out") == 0
 
 
 def test_trajectories_through_one_home_share_a_world_frame(tmp_path: Path) -> None:
