@@ -13,6 +13,7 @@ from types import MappingProxyType
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, StorageError
 from gausslite.domain.names import quote_name, require_identifier
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.sqlite_file import remove_store
 from gausslite.fusion.store import FusionStore
 from gausslite_fusion_server.servicer import FusionServicer
 
@@ -22,11 +23,12 @@ _SUFFIX = ".sqlite"
 
 @dataclass(frozen=True, slots=True)
 class Mission:
-    """One fused map and what serves it."""
+    """One fused map and what serves it. file: its own file, which ends with it if it is unused."""
 
     store: FusionStore
     engine: FusionEngine
     servicer: FusionServicer
+    file: Path | None = None
 
     def close(self) -> None:
         """End the work in threads, save the counters, and close the store."""
@@ -35,6 +37,12 @@ class Mission:
         with contextlib.suppress(StorageError):
             self.engine.save_counters()
         self.store.close()
+
+    def discard(self) -> None:
+        """Close an unused mission and delete its file."""
+        self.close()
+        if self.file is not None:
+            remove_store(self.file)
 
 
 OpenMission = Callable[[str], Mission]
@@ -85,14 +93,9 @@ class Missions:
         QuotaError, StorageError.
         """
         require_identifier("mission_id", mission_id)
-        async with self._beginning:
-            if mission_id not in self._missions:
-                await self._make_room(mission_id)
-                mission = await asyncio.to_thread(self._open_mission, mission_id)
-                self._missions[mission_id] = mission
-                _log.info("mission %s begins", mission_id)
-                if self._is_draining:
-                    mission.servicer.drain()
+        if mission_id not in self._missions:
+            # a caller that gives up must not leave a mission open that nobody owns
+            await asyncio.shield(asyncio.ensure_future(self._begin(mission_id)))
         return self._missions[mission_id]
 
     def check(self) -> None:
@@ -108,9 +111,21 @@ class Missions:
 
     def close(self) -> None:
         """Close all missions."""
-        for mission in self._missions.values():
-            mission.close()
-        self._missions.clear()
+        with contextlib.ExitStack() as closing:
+            for mission in self._missions.values():
+                closing.callback(mission.close)
+        self._missions = {}
+
+    async def _begin(self, mission_id: str) -> None:
+        async with self._beginning:
+            if mission_id in self._missions:
+                return
+            await self._make_room(mission_id)
+            mission = await asyncio.to_thread(self._open_mission, mission_id)
+            self._missions[mission_id] = mission
+            _log.info("mission %s begins", mission_id)
+            if self._is_draining:
+                mission.servicer.drain()
 
     async def _make_room(self, mission_id: str) -> None:
         if len(self._missions) < self._limit:
@@ -122,7 +137,7 @@ class Missions:
             )
         mission = self._missions.pop(unused)
         mission.servicer.drain()
-        await asyncio.to_thread(mission.close)
+        await asyncio.to_thread(mission.discard)
 
 
 def stored_missions(folder: Path) -> tuple[str, ...]:

@@ -47,7 +47,6 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 def _open_missions(settings: ServerSettings) -> Missions:
     """Open the stored missions. Raises InvalidInputError, QuotaError, StorageError."""
-    refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
 
     def open_mission(mission_id: str) -> Mission:
         fusion = replace(settings.fusion, mission_id=mission_id) if mission_id else settings.fusion
@@ -57,7 +56,8 @@ def _open_missions(settings: ServerSettings) -> Missions:
         except BaseException:
             store.close()
             raise
-        return Mission(store, engine, FusionServicer(engine, refinement))
+        refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
+        return Mission(store, engine, FusionServicer(engine, refinement), _file_of(settings, mission_id))
 
     has_folder = settings.max_missions > 1 and settings.store is not None
     stored = stored_missions(settings.store) if has_folder and settings.store is not None else ()
@@ -69,8 +69,12 @@ def _open_store(settings: ServerSettings, mission_id: str) -> FusionStore:
         return MemoryStore()
     if settings.shards is not None:
         return _open_ray_store(settings.store, settings.shards, settings)
-    path = mission_file(settings.store, mission_id) if mission_id else settings.store
-    return SqliteStore(path, settings.store_max_bytes)
+    return SqliteStore(_file_of(settings, mission_id) or settings.store, settings.store_max_bytes)
+
+
+def _file_of(settings: ServerSettings, mission_id: str) -> Path | None:
+    """Return the file of one of several missions; None in memory and for the only mission."""
+    return mission_file(settings.store, mission_id) if mission_id and settings.store is not None else None
 
 
 def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> FusionStore:

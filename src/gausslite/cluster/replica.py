@@ -9,7 +9,7 @@ from threading import RLock
 from typing import Any, Protocol, runtime_checkable
 
 from gausslite.cluster.store_calls import READS, WRITES, LogEntry, LogPosition, StoreCall, StoreReply
-from gausslite.domain.errors import GaussLiteError, InvalidInputError, UnavailableError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_maintenance import back_up
 
@@ -112,7 +112,7 @@ class ShardReplica:
     def attach(self, epoch: int, standby: Standby) -> LogPosition:
         """Ship what was written since the copy and keep the standby up to date from now on.
 
-        Raises EpochError, UnavailableError if the standby cannot be reached.
+        Raises EpochError, UnavailableError if the standby cannot be reached, StorageError if its file is not the copy.
         """
         with self._lock:
             self._require_primary(epoch)
@@ -122,6 +122,12 @@ class ShardReplica:
             for entry in self._unshipped:
                 if entry.position.transactions >= copied.transactions:
                     standby.append(entry)
+            reached = standby.follow(epoch)
+            if reached != self._position():
+                raise StorageError(
+                    f"shard {self._path.name}: expected a standby with everything up to {self._position()}, got "
+                    f"{reached}; do all machines see the same folder?"
+                )
             self._standby, self._unshipped = standby, None
             return self._position()
 

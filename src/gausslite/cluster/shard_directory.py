@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from gausslite.cluster.store_calls import LogPosition
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
+from gausslite.fusion.sqlite_file import remove_store
 
 _log = logging.getLogger(__name__)
 _FILE = "directory.json"
@@ -90,17 +91,24 @@ class ShardDirectory:
     def __init__(self, folder: Path, shards: int, hosts: ReplicaHosts) -> None:
         """Read or begin the state. Raises InvalidInputError for another number of shards, StorageError."""
         self._folder, self._hosts = folder, hosts
-        self._shards = read_states(folder, shards)
+        # a standby that was being attached has not every write, and nobody attaches it any more
+        self._shards = [replace(state, joining="") for state in read_states(folder, shards)]
         self._lock = Lock()
         self._shard_locks = [Lock() for _ in range(shards)]
         self._repairs = ThreadPoolExecutor(max_workers=2, thread_name_prefix="standby")
 
     def check(self) -> None:
         """Replace the primaries that do not lead, and start missing standbys. Raises StorageError."""
+        failure: StorageError | None = None
         for shard, state in enumerate(self._shards):
-            self.report_failure(shard, state.epoch)
+            try:
+                self.report_failure(shard, state.epoch)
+            except StorageError as error:
+                failure = error
             if not self._shards[shard].standby:
                 self._repairs.submit(self._add_standby, shard)
+        if failure is not None:
+            raise failure
 
     def primary(self, shard: int) -> Primary:
         """Return the current primary."""
@@ -199,7 +207,8 @@ class ShardDirectory:
             primary.copy_to(self._path(name))
             self._start(shard, name, apart_from=state.primary)
             primary.attach(state.epoch, name)
-        except GaussLiteError as error:
+        except Exception as error:
+            # it must not stay marked as joining, whatever happened
             _log.warning("shard %d: no standby: %s", shard, error)
             with self._lock:
                 if self._shards[shard] == joining:
@@ -215,14 +224,17 @@ class ShardDirectory:
 
     def _discard(self, name: str) -> None:
         self._hosts.stop(name)
-        _delete(self._path(name))
+        remove_store(self._path(name))
 
     def _delete_unused(self, shard: int) -> None:
         """Delete the files of replicas that take no part any more."""
-        state = self._shards[shard]
-        for path in self._folder.glob(f"{_replica_prefix(shard)}*.sqlite"):
-            if path.stem not in (state.primary, state.standby, state.joining):
-                self._discard(path.stem)
+        with self._lock:
+            # the names first: a standby that begins to join later is not among them
+            names = [path.stem for path in self._folder.glob(f"{_replica_prefix(shard)}*.sqlite")]
+            state = self._shards[shard]
+        for name in names:
+            if name not in (state.primary, state.standby, state.joining):
+                self._discard(name)
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.sqlite"
@@ -275,8 +287,3 @@ def _write_durably(path: Path, text: str) -> None:
             os.close(folder)
     except OSError as error:
         raise StorageError(f"store {path}: cannot be written ({error.strerror})") from error
-
-
-def _delete(path: Path) -> None:
-    for suffix in ("", "-wal", "-shm", "-lock"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.cluster.regions import shard_of_keyframe, shard_of_voxels
+from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
@@ -88,7 +90,12 @@ class ShardedStore:
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
         with self._lock:
-            self._each(lambda shard: shard.remove_agent(agent_id))
+            try:
+                self._each(lambda shard: shard.remove_agent(agent_id))
+            except GaussLiteError:
+                # some shards have deleted their part, which the index must not claim any more
+                self._read_agent(agent_id)
+                raise
             with self._index_lock:
                 return self._index.remove_agent(agent_id)
 
@@ -191,6 +198,17 @@ class ShardedStore:
         for shard in self._shards:
             shard.close()
 
+    def _read_agent(self, agent_id: str) -> None:
+        """Replace the agent's totals by those of the shards, as far as these answer."""
+        tables = []
+        for shard in self._shards:
+            with contextlib.suppress(GaussLiteError):
+                tables.append(shard.scores())
+        with self._index_lock:
+            self._index.remove_agent(agent_id)
+            for table in tables:
+                _add_all(self._index, table, agent_id)
+
     def _put_newer(self, subsets: Sequence[RoiSubset]) -> None:
         of_shards: list[list[RoiSubset]] = [[] for _ in self._shards]
         for subset in subsets:
@@ -239,8 +257,10 @@ class ShardedStore:
         return [future.result() for future in futures]
 
 
-def _add_all(index: ScoreIndex, table: VoxelScoreTable) -> None:
+def _add_all(index: ScoreIndex, table: VoxelScoreTable, only: str = "") -> None:
     for number, agent_id in enumerate(table.agents):
+        if only not in ("", agent_id):
+            continue
         own = table.agent_index == number
         index.put(
             agent_id,

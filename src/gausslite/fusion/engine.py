@@ -119,7 +119,7 @@ class FusionEngine:
 
     @property
     def is_unused(self) -> bool:
-        """Whether no agent has a lease, and none has data."""
+        """Whether no agent has a lease, none has data, and none is banned."""
         with self._lock:
             return self._members.is_unused
 

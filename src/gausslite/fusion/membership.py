@@ -47,8 +47,8 @@ class Membership:
 
     @property
     def is_unused(self) -> bool:
-        """Whether no agent has a lease, and none has data."""
-        return not self._store.agents() and not self._sessions.live_agents
+        """Whether no agent has a lease, none has data, and none is banned."""
+        return not (self._store.agents() or self._sessions.live_agents or self._bans.agents)
 
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id, see SessionRegistry.get."""

@@ -113,6 +113,12 @@ def renew_incarnation(db: sqlite3.Connection) -> None:
     db.execute("INSERT OR REPLACE INTO properties VALUES ('incarnation_id', ?)", (secrets.token_hex(16),))
 
 
+def remove_store(path: Path) -> None:
+    """Delete a store that no process uses, with its log and its lock."""
+    for suffix in ("", "-wal", "-shm", "-lock"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
 def update_checksum(agent_id: str, voxel: int, scores: tuple[int, int, int], records: bytes) -> int:
     """Return the CRC32C of an update; scores: its update_seq, Σkappa and count."""
     head = agent_id.encode() + _UPDATE_HEADER.pack(voxel, *scores)

@@ -143,6 +143,28 @@ def test_writes_during_the_copy_for_a_standby_reach_it(tmp_path: Path) -> None:
     standby.close()
 
 
+def test_a_file_that_is_not_the_copy_cannot_become_the_standby(tmp_path: Path) -> None:
+    primary, empty = ShardReplica(tmp_path / "a.sqlite"), ShardReplica(tmp_path / "c.sqlite")
+    primary.lead(1, lambda _: True)
+    primary.call(1, message(1))
+    primary.copy_to(tmp_path / "b.sqlite")
+    with pytest.raises(StorageError, match="do all machines see the same folder"):
+        primary.attach(1, empty)
+    primary.close()
+    empty.close()
+
+
+def test_a_directory_that_crashed_while_a_standby_joined_starts_another(hosts: LocalHosts) -> None:
+    store = hosts.open_store(1)
+    settle(hosts)
+    path = hosts.folder / "directory.json"
+    path.write_text(path.read_text().replace('"joining": ""', '"joining": "shard-0-replica-9"'))
+    again = ShardDirectory(hosts.folder, 1, hosts)
+    assert again.states()[0].joining == ""
+    again.close()
+    store.close()
+
+
 def test_the_state_survives_a_restart_of_the_directory(hosts: LocalHosts) -> None:
     store = hosts.open_store(2)
     store.put(subset_from(("ant", 1, dict.fromkeys(range(12), 1), 0)))

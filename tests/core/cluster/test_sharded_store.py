@@ -133,6 +133,11 @@ class FailingStore(MemoryStore):
             raise StorageError("no space left")
         return super().put_all(subsets)
 
+    def remove_agent(self, agent_id: str) -> np.ndarray:  # type: ignore[override]
+        if self.is_full:
+            raise StorageError("refused")
+        return super().remove_agent(agent_id)
+
 
 def test_a_message_that_one_shard_refuses_counts_as_a_whole_when_it_is_sent_again() -> None:
     shards = [FailingStore() for _ in range(3)]
@@ -147,6 +152,20 @@ def test_a_message_that_one_shard_refuses_counts_as_a_whole_when_it_is_sent_agai
     one = MemoryStore()
     one.put(message)
     assert_same_content(store, one)
+    store.close()
+
+
+def test_an_agent_that_one_shard_does_not_delete_is_known_only_there() -> None:
+    shards = [FailingStore() for _ in range(3)]
+    store, message = ShardedStore(shards), subset_from(("ant", 1, dict.fromkeys(range(12), 2), 0))
+    store.put(message)
+    shards[1].is_full = True
+    with pytest.raises(StorageError):
+        store.remove_agent("ant")
+    assert store.scores().keys.tolist() == shards[1].scores().keys.tolist()
+    shards[1].is_full = False
+    assert store.put(message).stale.tolist() == shards[1].scores().keys.tolist()
+    assert store.remove_agent("ant").tolist() == KEYS.tolist()
     store.close()
 
 

@@ -67,6 +67,18 @@ def test_the_number_of_missions_is_limited_and_an_unused_one_makes_room() -> Non
             contribute(client, "../etc", "dog", {0: [1]})
 
 
+def test_missions_that_made_room_leave_no_file_and_no_limit_at_the_next_start(tmp_path: Path) -> None:
+    arguments = ("--max-missions", "2", "--store", str(tmp_path))
+    with server_process(*arguments) as (_, client):
+        contribute(client, "attic", "ant", {0: [1]})
+        for name in ("one", "two", "three"):
+            with FusionClient(client.address, mission_id=name, deadline_s=20.0) as own:
+                own.leave(own.join("bee", GRID).session_id)
+    assert sorted(path.stem for path in tmp_path.glob("*.sqlite")) == ["attic", "three"]
+    with server_process(*arguments) as (_, client):
+        assert gaussians_of(client, "attic") == 1
+
+
 def test_every_method_names_a_mission_or_a_session() -> None:
     for method in pb.DESCRIPTOR.services_by_name["FusionService"].methods:
         fields = method.input_type.fields_by_name
