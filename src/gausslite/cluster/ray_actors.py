@@ -7,7 +7,6 @@ import logging
 import os
 import socket
 import threading
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,10 +175,12 @@ class _RayHosts:
 
     def start(self, shard: int, name: str, path: Path, apart_from: str) -> _Replica:
         options: dict[str, Any] = {"name": name, "lifetime": "detached", "max_concurrency": _THREADS, "num_cpus": 0}
-        node_id = _other_node(apart_from)
-        options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(node_id, soft=False) if node_id else "SPREAD"
+        options["scheduling_strategy"] = _placement(shard, apart_from)
         with ray_errors():
-            actor: Any = ray.remote(_ReplicaActor).options(**options).remote(shard, path, self.max_bytes)
+            try:
+                actor: Any = ray.remote(_ReplicaActor).options(**options).remote(shard, path, self.max_bytes)
+            except ValueError as error:
+                raise UnavailableError(f"ray: the actor {name!r} that was stopped has not ended yet") from error
         _result(actor.node_id.remote(), _START_LIMIT_S)
         return _Replica(actor)
 
@@ -253,15 +254,18 @@ def _find_actor(name: str) -> Any:
             raise UnavailableError(f"ray: no actor {name!r}") from error
 
 
-def _other_node(apart_from: str) -> str:
-    """Return a living node without this replica, "" if there is none."""
-    if not apart_from:
-        return ""
-    with contextlib.suppress(GaussLiteError):
-        used = _result(_find_actor(apart_from).node_id.remote(), _PING_LIMIT_S)
-        nodes = sorted(node["NodeID"] for node in _nodes() if node["Alive"] and node["NodeID"] != used)
-        return nodes[zlib.crc32(apart_from.encode()) % len(nodes)] if nodes else ""
-    return ""
+def _placement(shard: int, apart_from: str) -> NodeAffinitySchedulingStrategy:
+    """Return the node of a new replica: the primaries take turns over the nodes, a standby gets another node.
+
+    Ray's own strategy SPREAD does not keep actors without CPU demand apart.
+    """
+    nodes = sorted(node["NodeID"] for node in _nodes() if node["Alive"])
+    if apart_from:
+        used = _result(_find_actor(apart_from).node_id.remote(), _CALL_LIMIT_S)
+        nodes = [node for node in nodes if node != used] or nodes
+    # Ray does not keep to a soft affinity if the actor has no CPU demand. If the node has just died, the start fails
+    # and the next check of the directory tries again
+    return NodeAffinitySchedulingStrategy(nodes[shard % len(nodes)], soft=False)
 
 
 def _nodes() -> list[dict[str, Any]]:
