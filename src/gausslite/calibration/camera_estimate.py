@@ -1,9 +1,8 @@
 """Estimate how a camera's images differ from an ideal camera's: lens, readout time, time offset and exposure time.
 
-Lens, readout and offset are those under which pairs of frames on moving stretches agree best (`MovingPairs`). The
-radial lens minimises the photometric residual. The readout time minimises the residual and the rotation that the pose
-fit needs, and the offset the rotation. The exposure time comes from blur (`estimate_exposure_time`). Each part is used
-only if it explains a clear share of the disagreement.
+Lens, readout and offset are those under which pairs of frames on moving stretches agree best (`MovingPairs`). A coarse
+search over one radial coefficient and the readout time is the start of a joint fit (`fit_camera`). The exposure time
+comes from blur (`estimate_exposure_time`). Each part is used only if it explains a clear share of the disagreement.
 """
 
 from __future__ import annotations
@@ -11,32 +10,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy import ndarray
 
 from gausslite.calibration.exposure_time import estimate_exposure_time
+from gausslite.calibration.joint_camera_fit import fit_camera
 from gausslite.calibration.moving_pairs import MovingPairs, PairError
+from gausslite.datasets.camera_correction import ideal_camera
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.lens import Lens, LensModel
 
 _MIN_PAIRS = 4
 _MIN_LENS_PIXELS = 160 * 120
 _READOUTS_S = (0.0, 0.015, 0.03, 0.045)
-_OFFSETS_S = (-0.02, 0.0, 0.02)
-_FINE_STEP_S = 0.0075
 _RADIAL = (-0.3, -0.15, 0.0, 0.15, 0.3)
-_FINE_RADIAL_STEP = 0.05
-_SECOND_RADIAL = (-0.15, 0.0, 0.15)
 _MIN_ROTATION_DEG = 0.01
-_EXCHANGE = 0.4
-"""Squared slope at which the two radial terms exchange: half way to the corner of an image 60 degrees wide."""
 _MIN_TIMING_RESIDUAL_GAIN, _MIN_MOTION_GAIN = 0.005, 0.3
 _CLEAR_MOTION_GAIN, _CLEAR_ROTATION_DEG, _MAX_RESIDUAL_LOSS = 0.6, 0.1, 0.02
-_MIN_COARSE_LENS_GAIN, _MIN_LENS_RESIDUAL_GAIN, _MIN_SECOND_RADIAL_GAIN = 0.01, 0.03, 0.01
+_MIN_COARSE_LENS_GAIN, _MIN_LENS_RESIDUAL_GAIN = 0.01, 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,69 +72,65 @@ def estimate_camera(source: Source, known: CameraCorrection) -> CameraEstimate:
 
 
 def _with_lens(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrection) -> tuple[CameraCorrection, str]:
-    """Return `known` with a radial lens of one or two coefficients, if it lowers the residual clearly."""
+    """Return `known` with a radial lens of two coefficients, if it lowers the residual clearly."""
 
-    def residual(pairs: MovingPairs, k1: float, k2: float, readout_s: float) -> float:
-        return pairs.error(replace(known, lens=_radial(k1, k2), readout_s=readout_s)).residual
+    def with_lens(k1: float) -> CameraCorrection:
+        return replace(known, lens=Lens(LensModel.RADTAN, (k1, 0.0, 0.0, 0.0)))
 
-    k1 = minimum(_RADIAL, lambda value: residual(coarse, value, 0.0, known.readout_s))
-    before, after = (residual(coarse, value, 0.0, known.readout_s) for value in (0.0, k1))
+    k1 = minimum(_RADIAL, lambda value: coarse.error(with_lens(value)).residual)
+    before, after = (coarse.error(with_lens(value)).residual for value in (0.0, k1))
     if after > (1.0 - _MIN_COARSE_LENS_GAIN) * before:
         gain = f"residual {before:.2f} becomes {after:.2f} of 255 with k1 = {k1:.2f}"
         return known, f"{gain}; no clear gain, not used"
     # a readout time left in the images would bias the lens
-    readout_s = minimum(_READOUTS_S, lambda value: residual(coarse, k1, 0.0, value))
-    k1 = minimum(_around(k1, _FINE_RADIAL_STEP), lambda value: residual(moving, value, 0.0, readout_s))
-    two = _second_coefficient(k1, lambda first, second: residual(coarse, first, second, readout_s))
-    pinhole, lens, wider = (
-        moving.error(replace(known, lens=_radial(*slopes), readout_s=readout_s))
-        for slopes in ((0.0, 0.0), (k1, 0.0), two)
+    fit = fit_camera(moving, _with_coarse_readout(coarse, with_lens(k1)), fits_lens=True)
+    if fit is None or fit.correction.lens is None:
+        return known, "too few pairs of frames can be compared, not used"
+    found = replace(
+        fit.correction.lens, coefficients=tuple(round(value, 3) for value in fit.correction.lens.coefficients)
     )
-    slopes, best = (k1, 0.0), lens
-    if wider.residual <= (1.0 - _MIN_SECOND_RADIAL_GAIN) * lens.residual:
-        slopes, best = two, wider
-    found = _radial(*slopes)
-    gain = f"residual {pinhole.residual:.2f} becomes {best.residual:.2f} of 255 on {best.pairs} pairs"
-    if best.residual <= (1.0 - _MIN_LENS_RESIDUAL_GAIN) * pinhole.residual:
-        return replace(known, lens=found), f"{found}, {gain}"
-    return known, f"{gain}; no clear gain, not used"
-
-
-def _second_coefficient(k1: float, residual: Callable[[float, float], float]) -> tuple[float, float]:
-    """Return both coefficients at the minimum over k2, with k1 at its own minimum for each k2."""
-    best_k1 = {
-        k2: minimum(_around(k1 - _EXCHANGE * k2, _FINE_RADIAL_STEP), partial(_swapped, residual, k2))
-        for k2 in _SECOND_RADIAL
-    }
-    k2 = minimum(_SECOND_RADIAL, lambda value: residual(best_k1[value], value))
-    return float(np.interp(k2, _SECOND_RADIAL, [best_k1[value] for value in _SECOND_RADIAL])), k2
-
-
-def _swapped(residual: Callable[[float, float], float], k2: float, k1: float) -> float:
-    return residual(k1, k2)
+    pinhole, lens = (moving.error(replace(fit.correction, lens=value)) for value in (None, found))
+    gain = f"residual {pinhole.residual:.2f} becomes {lens.residual:.2f} of 255 on {lens.pairs} pairs"
+    if lens.residual > (1.0 - _MIN_LENS_RESIDUAL_GAIN) * pinhole.residual:
+        return known, f"{gain}; no clear gain, not used"
+    correction = replace(known, lens=found)
+    try:
+        ideal_camera(next(iter(moving.frames.values())).camera, correction, 0.0)
+    except InvalidInputError as error:
+        return known, f"{error}; not used"
+    return correction, f"{found}, {gain}"
 
 
 def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrection) -> tuple[CameraCorrection, str]:
     """Return `known` with readout time and time offset, if they lower residual and rotation clearly."""
-    before, coarse_before = moving.error(known), coarse.error(known)
-    readout_s = minimum(
-        _READOUTS_S, lambda value: _relative(coarse.error(replace(known, readout_s=value)), coarse_before)
+    fit = fit_camera(moving, _with_coarse_readout(coarse, known), fits_lens=False)
+    if fit is None:
+        return known, "too few pairs of frames can be compared, not used"
+    found = replace(
+        known,
+        readout_s=round(fit.correction.readout_s, 4) + 0.0,
+        time_offset_s=round(fit.correction.time_offset_s, 4) + 0.0,
     )
-    found = replace(known, readout_s=readout_s)
-    offset_s = minimum(_OFFSETS_S, lambda value: moving.error(replace(found, time_offset_s=value)).rotation_deg ** 2)
-    found = replace(found, time_offset_s=round(offset_s, 3) + 0.0)
-    around_s = _around(readout_s, _FINE_STEP_S)
-    readout_s = minimum(around_s, lambda value: _relative(moving.error(replace(found, readout_s=value)), before))
-    found = replace(found, readout_s=round(readout_s, 3) + 0.0)
-    after = moving.error(found)
+    before, after = moving.error(known), moving.error(found)
     evidence = (
-        f"{1e3 * found.readout_s:.0f} ms and {1e3 * found.time_offset_s:.0f} ms, {after.pairs} pairs of moving "
+        f"{_milliseconds(found.readout_s, fit.readout_std_s)} and "
+        f"{_milliseconds(found.time_offset_s, fit.offset_std_s)}, {after.pairs} pairs of moving "
         f"frames: residual {before.residual:.2f} becomes {after.residual:.2f} of 255, "
         f"rotation error {before.rotation_deg:.2f} becomes {after.rotation_deg:.2f} deg"
     )
     if _explain_motion(before, after):
         return found, evidence
     return known, f"{evidence}; no clear gain, not used"
+
+
+def _with_coarse_readout(coarse: MovingPairs, known: CameraCorrection) -> CameraCorrection:
+    before = coarse.error(known)
+    readout_s = minimum(_READOUTS_S, lambda value: _relative(coarse.error(replace(known, readout_s=value)), before))
+    return replace(known, readout_s=readout_s)
+
+
+def _milliseconds(seconds: float, std_s: float) -> str:
+    return f"{1e3 * seconds:.1f} ± {1e3 * std_s:.1f} ms"
 
 
 def _explain_motion(before: PairError, after: PairError) -> bool:
@@ -158,14 +149,6 @@ def _explain_motion(before: PairError, after: PairError) -> bool:
 def _relative(error: PairError, before: PairError) -> float:
     """Return residual and squared rotation relative to those before, added: on few pairs, either alone is flat."""
     return error.residual / before.residual + (error.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)) ** 2
-
-
-def _radial(k1: float, k2: float) -> Lens:
-    return Lens(LensModel.RADTAN, (round(k1, 3), round(k2, 3), 0.0, 0.0))
-
-
-def _around(value: float, step: float) -> tuple[float, float, float]:
-    return value - step, value, value + step
 
 
 def minimum(values: Sequence[float], cost: Callable[[float], float]) -> float:

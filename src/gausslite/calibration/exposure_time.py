@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
+from gausslite.calibration.frame_warp import warp_into
 from gausslite.calibration.moving_pairs import read_frames
-from gausslite.calibration.pose_exposure_error import warp_into
 from gausslite.datasets.camera_correction import correct_frame
 from gausslite.datasets.selection import capped_size
 from gausslite.datasets.source import Source

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gausslite.calibration.pose_exposure_error import warp_into
+from gausslite.calibration.frame_warp import warp_into
 from gausslite.calibration.pose_fit import fit_pose, luminance_residual
 from gausslite.calibration.view_residuals import MAX_PIXELS, comparable_pixels
 from gausslite.datasets.camera_correction import correct_frame
@@ -28,7 +28,7 @@ from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR
 from gausslite.domain.trajectory import Trajectory
 
 _MAX_PAIRS = 16
-_MIN_COMPARABLE_SHARE = 0.08
+MIN_COMPARABLE_SHARE = 0.08
 """Share of the pixels of the grid of `comparable_pixels`; less overlap makes the pose fit unreliable."""
 _MIN_SPEED_RAD_S = math.radians(8.0)
 """Slower cameras move rows by less than a pixel in a readout of 30 ms."""
@@ -93,7 +93,7 @@ class MovingPairs:
             if first is None or second is None:
                 continue
             warped = warp_into(first, second)
-            if len(comparable_pixels(warped, second)) < _MIN_COMPARABLE_SHARE * min(warped.alpha.size, MAX_PIXELS):
+            if len(comparable_pixels(warped, second)) < MIN_COMPARABLE_SHARE * min(warped.alpha.size, MAX_PIXELS):
                 continue
             T_world_fitted = fit_pose(warped, inverse(second.T_world_camera), second, HANDHELD_PRIOR)
             residuals.append(255.0 * luminance_residual(warped, second, T_world_fitted))

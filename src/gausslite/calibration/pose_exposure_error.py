@@ -10,23 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-import cv2
 import numpy as np
 from numpy import ndarray
 
 from gausslite.calibration.exposure import fit_exposure
+from gausslite.calibration.frame_warp import warp_into
 from gausslite.calibration.pose_fit import fit_pose
-from gausslite.calibration.view_residuals import MAX_RELATIVE_DEPTH_ERROR, comparable_pixels
+from gausslite.calibration.view_residuals import comparable_pixels
 from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.registered_source import register_depth
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import back_project
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse, transform_points, twist_of
+from gausslite.domain.pose import inverse, twist_of
 from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior
-from gausslite.render.rasterizer import NEAR_M, Rendering
+from gausslite.render.rasterizer import Rendering
 
 _MAX_PAIRS = 24
 _MIN_PAIRS = 4
@@ -88,19 +86,3 @@ def _pairs(source: Source) -> Iterator[tuple[Rendering, Frame]]:
                 last_gap = gap
                 break
             gap //= 2
-
-
-def warp_into(frame: Frame, other: Frame) -> Rendering:
-    """Return the frame as the other's camera would see it, by the recorded depth and poses."""
-    T_other_frame = inverse(other.T_world_camera) @ frame.T_world_camera
-    depth_m = register_depth(frame.depth_m, frame.camera, other.camera, T_other_frame)
-    points = transform_points(inverse(T_other_frame), back_project(depth_m, other.camera).reshape(-1, 3))
-    z_m = np.maximum(points[:, 2], NEAR_M)
-    # cv2.remap places pixel centres at integers
-    columns = (points[:, 0] / z_m * frame.camera.fx_px + frame.camera.cx_px - 0.5).astype(np.float32)
-    rows = (points[:, 1] / z_m * frame.camera.fy_px + frame.camera.cy_px - 0.5).astype(np.float32)
-    pixels = columns.reshape(depth_m.shape), rows.reshape(depth_m.shape)
-    rgb = cv2.remap(frame.rgb, *pixels, cv2.INTER_LINEAR).astype(np.float32) / np.float32(255.0)
-    depth_error_m = np.abs(cv2.remap(frame.depth_m, *pixels, cv2.INTER_NEAREST) - z_m.reshape(depth_m.shape))
-    alpha = ((depth_m > 0) & (depth_error_m < MAX_RELATIVE_DEPTH_ERROR * depth_m)).astype(np.float32)
-    return Rendering(rgb, depth_m * alpha, alpha, None)

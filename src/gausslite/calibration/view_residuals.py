@@ -49,15 +49,21 @@ def solve_with_prior(
     deviation: how far the parameters are from the prior's mean before the update. Residuals are weighted by
     Geman-McClure, scaled by their median absolute deviation.
     """
-    residual_std = max(1.4826 * float(np.median(np.abs(residual))), _MIN_RESIDUAL_STD)
-    scaled = np.abs(residual) / residual_std
-    weight = np.square(1.0 / (1.0 + np.square(scaled / _OUTLIER_STDS))) * (pixel_weight / residual_std**2)
+    weight = pixel_weight * robust_weights(residual)
     # a standard deviation of 0 fixes its parameter up to floating-point precision
     precision = 1.0 / np.square(np.maximum(prior_std, 1e-9))
     weighted = jacobian * weight[:, None]
     information = weighted.T @ jacobian + np.diag(precision)
     update: Float64[ndarray, " p"] = np.linalg.solve(information, weighted.T @ residual - precision * deviation)
     return update
+
+
+def robust_weights(residual: Float64[ndarray, " n"]) -> Float64[ndarray, " n"]:
+    """Return the weights of Geman-McClure, scaled by the median absolute deviation, divided by the variance."""
+    residual_std = max(1.4826 * float(np.median(np.abs(residual))), _MIN_RESIDUAL_STD)
+    scaled = np.abs(residual) / residual_std
+    weights: Float64[ndarray, " n"] = np.square(1.0 / (1.0 + np.square(scaled / _OUTLIER_STDS))) / residual_std**2
+    return weights
 
 
 def shrinkage(prior_std: float, fit_std: float) -> float:

@@ -59,11 +59,11 @@ def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twi
     at the frame's stamp. Motion blur stays; the frame's motion states it.
     """
     depth_m = np.zeros_like(frame.depth_m)
-    columns, rows = _lookup(frame.camera, correction, ideal, twist, depth_m)
+    columns, rows = recorded_pixels(frame.camera, correction, ideal, twist, depth_m)
     if correction.readout_s != 0.0 and np.any(twist.linear_m_s):
         # depth decides how far the translation moves a pixel; rotation alone is close enough to look it up
         depth_m = cv2.remap(frame.depth_m, columns, rows, cv2.INTER_NEAREST)
-        columns, rows = _lookup(frame.camera, correction, ideal, twist, depth_m)
+        columns, rows = recorded_pixels(frame.camera, correction, ideal, twist, depth_m)
     return replace(
         frame,
         rgb=cv2.remap(frame.rgb, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE),
@@ -125,7 +125,7 @@ def undistort_depth(depth_m: Float32[ndarray, "h w"], camera: Camera, lens: Lens
 def _pinhole_lookup(camera: Camera, lens: Lens) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
     still = Twist(np.zeros(3), np.zeros(3))
     no_depth = np.zeros((camera.height_px, camera.width_px), np.float32)
-    return _lookup(camera, CameraCorrection(lens), camera, still, no_depth)
+    return recorded_pixels(camera, CameraCorrection(lens), camera, still, no_depth)
 
 
 def _undistorted(camera: Camera, lens: Lens) -> Camera:
@@ -157,11 +157,12 @@ def _require_invertible(lens: Lens, camera: Camera) -> None:
         raise InvalidInputError(f"lens {lens}: expected one that does not fold the image")
 
 
-def _lookup(
+def recorded_pixels(
     recorded: Camera, correction: CameraCorrection, ideal: Camera, twist: Twist, depth_m: Float32[ndarray, "h w"]
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
     """Return column and row of the recorded image for every ideal pixel, counted from pixel centres at integers.
 
+    depth_m: of the ideal image, 0 where it is unknown and the camera's translation is ignored.
     A point p of the camera at the middle row's time has moved to p - dt (w × p + v) after dt. The lookup is solved on
     a grid of every _GRID_PX-th pixel and interpolated in between: it is smooth, and this takes a fraction of the time.
     """
