@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
     conditions = _Conditions.of(options)
     recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)
     registered, _ = register_with_warnings(options.source, recorded, conditions.depth_registration, AUTO)
-    source, _ = correct_with_warnings(options.source, registered, conditions.camera_correction, AUTO)
+    source, _ = correct_with_warnings(options.source, registered, conditions.camera_correction)
     positions = _selected_positions(options, source)
     regions = selected_regions(options, source)
     if options.pictures is not None:

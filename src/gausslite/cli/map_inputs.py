@@ -103,7 +103,7 @@ class MapInputs:
         if self.mission.poses is PoseMode.TRACK and not isinstance(correction, CameraCorrection):
             # readout time and offset are estimated from given poses
             correction = CameraCorrection(registered.lens if registered.depth_registered else None)
-        frames, corrected_by = correct_with_warnings(self.source.spec, registered, correction, AUTO)
+        frames, corrected_by = correct_with_warnings(self.source.spec, registered, correction)
         if self.mission.poses is not PoseMode.REFINE and pose_prior == AUTO:
             pose_prior = PoseExposurePrior()
         mission = replace(self.mission, pose_prior=resolve_pose_prior(self.source.spec, frames, pose_prior))

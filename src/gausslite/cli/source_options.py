@@ -81,15 +81,15 @@ def register_with_warnings(
 
 
 def correct_with_warnings(
-    spec: str, source: Source, correction: CameraCorrection | str | None, default: str
+    spec: str, source: Source, correction: CameraCorrection | str | None
 ) -> tuple[Source, CameraCorrection | None]:
     """Correct a registered source's lens, rolling shutter, time offset and blur; None if images are used as recorded.
 
-    correction: a correction, AUTO, or None if the user did not set it; then default applies, AUTO or NONE. An estimate
-    (AUTO) takes seconds; a simulated home is exact unless the user asks for one. Raises DatasetError, PoseError.
+    correction: a correction, AUTO, or None if the user did not set it: AUTO then, except for a simulated home, which is
+    exact. An estimate (AUTO) takes seconds. Raises DatasetError, PoseError.
     """
     if correction is None:
-        correction = CameraCorrection() if default == NONE or is_simulated(spec) else AUTO
+        correction = CameraCorrection() if is_simulated(spec) else AUTO
     if isinstance(correction, str) and not source.depth_registered:
         correction, reason = CameraCorrection(), "depth is not registered to colour"
         print_message(f"--camera-correction {NONE}: {reason}")

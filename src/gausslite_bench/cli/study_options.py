@@ -11,7 +11,7 @@ from gausslite.cli.source_options import correct_with_warnings, open_with_warnin
 from gausslite.config.mapping_options import add_pose_prior
 from gausslite.config.source_options import add_camera_correction, add_register_depth
 from gausslite.config.switches import add_switch
-from gausslite.config.values import AUTO, NONE, read_names, read_up_axis
+from gausslite.config.values import AUTO, read_names, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
 from gausslite.domain.errors import InvalidInputError
@@ -77,7 +77,7 @@ def add_real_sequence(parser: argparse.ArgumentParser) -> None:
     add("--kinds", metavar="A,B", type=read_names, default=(), help="kinds of objects such as mug,chair (default: all)")
     add("--up", metavar="X,Y,Z", type=read_up_axis, help="the world's upward direction (default: the source's)")
     add_register_depth(group, allow_auto=True, default_text=AUTO)
-    add_camera_correction(group, allow_auto=True, default_text=NONE)
+    add_camera_correction(group, allow_auto=True, default_text=AUTO)
 
 
 def scene_plans(
@@ -124,7 +124,7 @@ def real_sequence_plans(options: argparse.Namespace) -> tuple[list[RealScenePlan
     chosen = choose_kinds(plans, options.kinds)
     spec = str(options.real)
     registered, registration = open_with_warnings(spec, options.up, options.register_depth, AUTO)
-    source, correction = correct_with_warnings(spec, registered, options.camera_correction, NONE)
+    source, correction = correct_with_warnings(spec, registered, options.camera_correction)
     plans = [replace(plan, depth_registration=registration, camera_correction=correction) for plan in chosen]
     return plans, downscaled_size(source.camera)
 

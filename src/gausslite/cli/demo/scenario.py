@@ -108,7 +108,7 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(training)))
         held_out_positions.append(held_out)
     registered, registration = register_with_warnings(options.source, recorded, options.register_depth, AUTO)
-    source, correction = correct_with_warnings(options.source, registered, options.camera_correction, AUTO)
+    source, correction = correct_with_warnings(options.source, registered, options.camera_correction)
     pose_prior = resolve_pose_prior(options.source, source, options.pose_prior)
     views = tuple(FrameStream(source, positions, size) for positions in held_out_positions)
     return Scenario(tuple(agents), size, _TEST_EVERY, views, regions, registration, correction, pose_prior)
