@@ -15,7 +15,7 @@ import numpy as np
 from numpy import ndarray
 
 from gausslite.calibration.exposure_time import estimate_exposure_time
-from gausslite.calibration.joint_camera_fit import fit_camera
+from gausslite.calibration.joint_camera_fit import CameraFit, fit_camera
 from gausslite.calibration.moving_pairs import MovingPairs, PairError
 from gausslite.datasets.camera_correction import ideal_camera
 from gausslite.datasets.selection import downscaled_size
@@ -30,8 +30,9 @@ _READOUTS_S = (0.0, 0.015, 0.03, 0.045)
 _RADIAL = (-0.3, -0.15, 0.0, 0.15, 0.3)
 _MIN_ROTATION_DEG = 0.01
 _MIN_TIMING_RESIDUAL_GAIN, _MIN_MOTION_GAIN = 0.005, 0.3
-_CLEAR_MOTION_GAIN, _CLEAR_ROTATION_DEG, _MAX_RESIDUAL_LOSS = 0.6, 0.1, 0.02
+_CLEAR_STDS, _CLEAR_TIME_S, _CLEAR_ROTATION_DEG, _MAX_RESIDUAL_LOSS = 5.0, 0.004, 0.1, 0.03
 _MIN_COARSE_LENS_GAIN, _MIN_LENS_RESIDUAL_GAIN = 0.01, 0.03
+_CLEAR_RADIAL_STDS, _CLEAR_RADIAL, _CLEAR_LENS_RESIDUAL_GAIN = 10.0, 0.02, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,9 @@ def _with_lens(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrection
     )
     pinhole, lens = (moving.error(replace(fit.correction, lens=value)) for value in (None, found))
     gain = f"residual {pinhole.residual:.2f} becomes {lens.residual:.2f} of 255 on {lens.pairs} pairs"
-    if lens.residual > (1.0 - _MIN_LENS_RESIDUAL_GAIN) * pinhole.residual:
+    is_clear = abs(fit.radial) >= max(_CLEAR_RADIAL_STDS * fit.radial_std, _CLEAR_RADIAL)
+    least_gain = _CLEAR_LENS_RESIDUAL_GAIN if is_clear else _MIN_LENS_RESIDUAL_GAIN
+    if lens.residual > (1.0 - least_gain) * pinhole.residual:
         return known, f"{gain}; no clear gain, not used"
     correction = replace(known, lens=found)
     try:
@@ -118,7 +121,7 @@ def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrectio
         f"frames: residual {before.residual:.2f} becomes {after.residual:.2f} of 255, "
         f"rotation error {before.rotation_deg:.2f} becomes {after.rotation_deg:.2f} deg"
     )
-    if _explain_motion(before, after):
+    if _explain_motion(before, after, _has_clear_time(fit)):
         return found, evidence
     return known, f"{evidence}; no clear gain, not used"
 
@@ -133,17 +136,27 @@ def _milliseconds(seconds: float, std_s: float) -> str:
     return f"{1e3 * seconds:.1f} ± {1e3 * std_s:.1f} ms"
 
 
-def _explain_motion(before: PairError, after: PairError) -> bool:
-    """Return True if new times lower both errors, or the rotation so far that the residual need not fall.
+def _has_clear_time(fit: CameraFit) -> bool:
+    """Return True if readout time or offset differ from 0 by far more than their standard errors."""
+    times = (
+        (fit.correction.readout_s, fit.readout_std_s),
+        (fit.correction.time_offset_s, fit.offset_std_s),
+    )
+    return any(abs(value_s) >= max(_CLEAR_STDS * std_s, _CLEAR_TIME_S) for value_s, std_s in times)
+
+
+def _explain_motion(before: PairError, after: PairError, is_clear: bool) -> bool:
+    """Return True if new times lower both errors, or, if they are clear, the rotation alone.
 
     The pose fit hides a slow camera's readout from the residual: most of it looks like a rotation of the whole image.
     """
     rotation_gain = 1.0 - after.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)
     residual_gain = 1.0 - after.residual / before.residual
-    if rotation_gain >= _MIN_MOTION_GAIN and residual_gain >= _MIN_TIMING_RESIDUAL_GAIN:
-        return True
-    is_far = rotation_gain >= _CLEAR_MOTION_GAIN and before.rotation_deg >= _CLEAR_ROTATION_DEG
-    return is_far and residual_gain >= -_MAX_RESIDUAL_LOSS
+    if rotation_gain < _MIN_MOTION_GAIN:
+        return False
+    if is_clear and before.rotation_deg >= _CLEAR_ROTATION_DEG:
+        return residual_gain >= -_MAX_RESIDUAL_LOSS
+    return residual_gain >= _MIN_TIMING_RESIDUAL_GAIN
 
 
 def _relative(error: PairError, before: PairError) -> float:

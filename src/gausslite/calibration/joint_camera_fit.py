@@ -43,6 +43,8 @@ from gausslite.domain.trajectory import Twist
 _READOUT, _OFFSET = 0, 1
 _STEPS = np.array([0.001, 0.001, 0.01, 0.02])
 """Differences of readout time, offset, k1 and k2 for numerical derivatives of the lookup."""
+_RADIAL_SLOPES = np.array([1.0, 0.4])
+"""Change of the relative distortion half way to the corner of an image 60 degrees wide, by k1 and k2."""
 _PRIOR_STD = np.array([0.05, 0.05, 0.4, 0.1])
 _LIMITS = np.array([0.06, 0.1, 0.8, 0.5])
 _START_TRANSLATION_M, _START_ROTATION_RAD = 0.01, np.radians(0.5)
@@ -56,11 +58,16 @@ _MIN_PAIRS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFit:
-    """The fitted correction, and the standard errors of readout time and offset by leaving out one pair at a time."""
+    """The fitted correction, and standard errors by leaving out one pair at a time.
+
+    radial, radial_std: the relative distortion half way to the image's corner, where the two coefficients exchange.
+    """
 
     correction: CameraCorrection
     readout_std_s: float
     offset_std_s: float
+    radial: float = 0.0
+    radial_std: float = 0.0
 
 
 def fit_camera(moving: MovingPairs, start: CameraCorrection, fits_lens: bool) -> CameraFit | None:
@@ -70,7 +77,7 @@ def fit_camera(moving: MovingPairs, start: CameraCorrection, fits_lens: bool) ->
     """
     parameters = _Parameters.of(start, fits_lens)
     poses = _PairPoses.initial(moving.pairs)
-    std = np.zeros(len(parameters.values))
+    covariance = np.zeros((len(parameters.values),) * 2)
     for blur_px in _BLURS_PX:
         twists = {i: moving.trajectory.twist(i) for i in moving.frames}
         views = {i: _View.of(frame, parameters, twists[i], blur_px) for i, frame in moving.frames.items()}
@@ -82,12 +89,18 @@ def fit_camera(moving: MovingPairs, start: CameraCorrection, fits_lens: bool) ->
         ]
         if len(systems) < _MIN_PAIRS:
             return None
-        update, std = _shared_update(systems, parameters.values)
+        update, covariance = _shared_update(systems, parameters.values)
         parameters = parameters.moved(_RELAXATION * update)
         poses = poses.moved(systems, _RELAXATION * update)
-        if blur_px == _BLURS_PX[-1] and bool((np.abs(update) < _CONVERGED_STDS * std).all()):
+        is_converged = np.abs(update) < _CONVERGED_STDS * np.sqrt(np.diag(covariance))
+        if blur_px == _BLURS_PX[-1] and bool(is_converged.all()):
             break
-    return CameraFit(parameters.correction(), float(std[_READOUT]), float(std[_OFFSET]))
+    readout_std_s, offset_std_s = (float(np.sqrt(covariance[k, k])) for k in (_READOUT, _OFFSET))
+    if not fits_lens:
+        return CameraFit(parameters.correction(), readout_std_s, offset_std_s)
+    radial_std = float(np.sqrt(_RADIAL_SLOPES @ covariance[2:, 2:] @ _RADIAL_SLOPES))
+    radial = float(_RADIAL_SLOPES @ parameters.values[2:])
+    return CameraFit(parameters.correction(), readout_std_s, offset_std_s, radial, radial_std)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,8 +260,8 @@ def _offset_twist(first: _View, second: _View) -> Float64[ndarray, "6"]:
 
 def _shared_update(
     systems: Sequence[_PairSystem], values: Float64[ndarray, " p"]
-) -> tuple[Float64[ndarray, " p"], Float64[ndarray, " p"]]:
-    """Return the update of the shared parameters, and its standard error by the jackknife over the pairs."""
+) -> tuple[Float64[ndarray, " p"], Float64[ndarray, "p p"]]:
+    """Return the update of the shared parameters, and its covariance by the jackknife over the pairs."""
     precision = np.diag(1.0 / np.square(_PRIOR_STD[: len(values)]))
     informations = np.array([system.information for system in systems])
     vectors = np.array([system.vector for system in systems])
@@ -260,5 +273,5 @@ def _shared_update(
     information, vector = informations.sum(axis=0), vectors.sum(axis=0)
     without = np.array([solve(information - informations[k], vector - vectors[k]) for k in range(len(systems))])
     count = len(systems)
-    std = np.sqrt((count - 1) / count * np.square(without - without.mean(axis=0)).sum(axis=0))
-    return solve(information, vector), std
+    deviations = without - without.mean(axis=0)
+    return solve(information, vector), (count - 1) / count * deviations.T @ deviations
