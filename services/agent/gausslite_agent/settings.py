@@ -23,6 +23,7 @@ from gausslite.config.numbers import Number
 from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.config.traces_option import add_traces
 from gausslite.config.values import read_rigid_transform
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import InvalidInputError
@@ -84,6 +85,7 @@ class AgentSettings:
     source: the sequence that replaces the robot's camera, None for frames by IngestFrames. strict: end the mission at a
     frame of the source that cannot be read. state: file of the saved mission; it is saved every save_interval_s seconds
     (0: only at the end). view: port of the page that shows the agent, None for no page.
+    traces: address of an OTLP collector, None for no traces.
     """
 
     listen: str
@@ -102,6 +104,7 @@ class AgentSettings:
     strict: bool = False
     save_interval_s: float = 0.0
     view: int | None = None
+    traces: str | None = None
 
     @property
     def fixed_settings(self) -> tuple[Any, ...]:
@@ -163,6 +166,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.strict,
         options.save_interval,
         options.view,
+        options.traces,
     )
 
 
@@ -220,6 +224,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_switch(parser, "--exit-when-done", "exit after the mission (default: continue to serve)")
     add_view(parser, "the agent")
+    add_traces(parser)
     _add_replay(parser)
     add_frames(parser)
     add_camera_correction(parser)

@@ -18,6 +18,7 @@ from gausslite.view.live_page import own_page
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
+from gausslite.wire.tracing import tracing
 from gausslite_fusion_server.maintenance import COMMANDS, run_command
 from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.mission_router import MissionRouter
@@ -101,7 +102,7 @@ async def _serve(settings: ServerSettings) -> None:
 
     try:
         page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
-        with metrics_server(settings.metrics, missions.engines), page:
+        with tracing(settings.traces, PROGRAM), metrics_server(settings.metrics, missions.engines), page:
             await serve_until_stopped(
                 settings.listen, [service], drain_when_stopping, settings.tls, settings.limits, settings.health
             )

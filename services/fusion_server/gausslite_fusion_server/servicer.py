@@ -40,6 +40,7 @@ from gausslite.wire.convert_task import graph_from_message
 from gausslite.wire.digest_messages import digests_to_messages
 from gausslite.wire.rejection_log import RejectionLog
 from gausslite.wire.server import Service
+from gausslite.wire.tracing import start_span
 from gausslite_fusion_server.change_blocks import ChangeBlocks, WatchedPart
 from gausslite_fusion_server.contributions import (
     agent_of_session,
@@ -161,10 +162,13 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         acknowledged, caller, loop = 0, Caller.of(context), asyncio.get_running_loop()
         async for request in self._gate.admit(request_iterator):
             self._gate.require_open()
-            queued = await loop.run_in_executor(self._decoder, enqueue_subset, self._engine, request, caller)
-            if not queued.put.done():
-                self._committer.submit(self._engine.commit_updates)
-            outcome = await outcome_of(self._engine, queued)
+            with start_span("contribution") as span:
+                queued = await loop.run_in_executor(self._decoder, enqueue_subset, self._engine, request, caller)
+                span.mark("decoded")
+                if not queued.put.done():
+                    self._committer.submit(self._engine.commit_updates)
+                outcome = await outcome_of(self._engine, queued)
+                span.set(agent=queued.agent_id, bytes=len(request.subset), voxels=outcome.accepted_voxels)
             if outcome.status == pb.SUBSET_STATUS_REJECTED:
                 self._rejections.record(caller.key, outcome.reason, outcome.message)
             self._map_changes.notify()

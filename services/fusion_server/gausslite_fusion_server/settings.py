@@ -12,6 +12,7 @@ from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.config.traces_option import add_traces
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
@@ -39,7 +40,7 @@ class ServerSettings:
     shards: the storage is a folder, for shards on Ray; None for a file. max_missions: above one, the storage is a
     folder with a file for each.
     view: port of the page that shows the server, None for no page. health: own address for health checks, None for
-    none.
+    none. traces: address of an OTLP collector, None for no traces.
     """
 
     listen: str = FUSION_ADDRESS
@@ -57,6 +58,7 @@ class ServerSettings:
     metrics: str | None = None
     view: int | None = None
     health: str | None = None
+    traces: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +110,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         options.metrics,
         options.view,
         options.health,
+        options.traces,
     )
 
 
@@ -208,6 +211,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--metrics", metavar="HOST:PORT", help="serve figures for Prometheus there over HTTP (default: no)")
     add("--health", metavar="HOST:PORT", help="answer health checks also there, without encryption (default: no)")
     add_view(parser, "the fused map")
+    add_traces(parser)
     add_tls(parser)
     return parser
 

@@ -9,6 +9,7 @@ from gausslite.process.messages import print_message
 from gausslite.task.backends import open_parser
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
+from gausslite.wire.tracing import tracing
 from gausslite_parser.servicer import parser_service
 from gausslite_parser.settings import parse_arguments
 
@@ -21,5 +22,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except GaussLiteError as error:
         print_message(f"gausslite-parser: {error}")
         return 2
-    services = [parser_service(parser)]
-    return run_service("gausslite-parser", lambda: serve_until_stopped(settings.listen, services, tls=settings.tls))
+
+    async def serve() -> None:
+        with tracing(settings.traces, "gausslite-parser"):
+            await serve_until_stopped(settings.listen, [parser_service(parser)], tls=settings.tls)
+
+    return run_service("gausslite-parser", serve)

@@ -10,7 +10,7 @@ KNOWN_OPTIONS: Final = frozenset(
         *("agents", "corpus", "held", "hostile", "kills", "messages", "seconds", "server", "watchers"),
         *("absent", "accept-similar", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps"),
         "changes",
-        *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
+        *("traces", "deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
         *("frame-alignment", "frame-error", "free-space", "homes", "late-joiner", "positions", "team-map"),
         *("external-rasterizer", "fit-views", "frames", "frames-a", "frames-b", "fusion", "gaussians"),
         *(
