@@ -231,6 +231,12 @@ def _maintenance_parser() -> argparse.ArgumentParser:
         ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
         ("verify", ("store",), "check every row; a server may be using the store"),
         ("compact", ("store",), "rewrite the file without unused space; no server may be using it"),
+        (
+            "check-claims",
+            ("store",),
+            "compare the voxels that each agent wins with the other agents' keyframes; no server may be using the "
+            "store: check a backup",
+        ),
     ):
         command = commands.add_parser(name, help=text, description=text.capitalize() + ".")
         for path in paths:

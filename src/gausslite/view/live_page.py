@@ -27,16 +27,28 @@ _ANY_HOST = ("0.0.0.0", "[::]")  # noqa: S104  (recognised, not bound)
 
 @contextmanager
 def live_page(
-    port: int, address: str, is_agent: bool, tls: Tls | None = None, limit: int = DEFAULT_LIMIT
+    port: int,
+    address: str,
+    is_agent: bool,
+    tls: Tls | None = None,
+    limit: int = DEFAULT_LIMIT,
+    mission_id: str = "",
 ) -> Iterator[str]:
     """Serve the page of an agent or a fusion server, also one that starts later; yield the page's URL.
 
-    Raises InvalidInputError for an unusable address or port.
+    mission_id: of the fusion server's missions; empty for its only one. Raises InvalidInputError for an unusable
+    address or port.
     """
     require_callable("view", address)
     page = open_page(port, f"GaussLite {'agent' if is_agent else 'fusion server'}", limit)
     stopped = threading.Event()
-    follower = threading.Thread(target=_follow, args=(page, address, is_agent, tls, stopped), daemon=True)
+
+    def open_client() -> AgentClient | FusionClient:
+        if is_agent:
+            return AgentClient(address, _DEADLINE_S, tls)
+        return FusionClient(address, _DEADLINE_S, mission_id=mission_id, tls=tls)
+
+    follower = threading.Thread(target=_follow, args=(page, open_client, stopped), daemon=True)
     follower.start()
     try:
         yield page.url
@@ -70,15 +82,12 @@ def own_address(listen: str) -> str:
     return f"localhost:{port}" if host in _ANY_HOST else listen
 
 
-def _follow(page: MapPage, address: str, is_agent: bool, tls: Tls | None, stopped: threading.Event) -> None:
+def _follow(page: MapPage, open_client: Callable[[], AgentClient | FusionClient], stopped: threading.Event) -> None:
     from gausslite.view.agent_panel import AgentPanel
     from gausslite.view.fusion_panel import FusionPanel
 
-    panel: AgentPanel | FusionPanel
-    if is_agent:
-        panel = AgentPanel(page, AgentClient(address, _DEADLINE_S, tls))
-    else:
-        panel = FusionPanel(page, FusionClient(address, _DEADLINE_S, tls=tls))
+    client = open_client()
+    panel = AgentPanel(page, client) if isinstance(client, AgentClient) else FusionPanel(page, client)
     poll: Callable[[], None] = panel.poll
     try:
         while not stopped.wait(_POLL_S):
