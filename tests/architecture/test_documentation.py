@@ -121,8 +121,9 @@ def known_flags() -> set[str]:
 
 
 def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
-    # of pip, docker and our tools
-    others = {"--check", "--editable", "--no-index", "--build", "--python", "--masks", "--homes", "--gains"}
+    # of pip, docker and our own scripts
+    others = {"--check", "--editable", "--no-index", "--build", "--python"}
+    others |= {"--masks", "--homes", "--gains", "--pose-noise"}
     # of cibuildwheel, mkdocs, pytest-xdist and cmake
     others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel"}
     unknown = []

@@ -31,6 +31,8 @@ _RADIAL = (-0.3, -0.15, 0.0, 0.15, 0.3)
 _MIN_ROTATION_DEG = 0.01
 _MIN_TIMING_RESIDUAL_GAIN, _MIN_MOTION_GAIN = 0.005, 0.3
 _CLEAR_STDS, _CLEAR_TIME_S, _CLEAR_ROTATION_DEG, _MAX_RESIDUAL_LOSS = 5.0, 0.004, 0.1, 0.03
+_CERTAIN_STDS, _CERTAIN_TIME_S = 15.0, 0.008
+"""Times this far from 0 count although drifting poses hide what they change: without shutter, fits stay below 1 ms."""
 _MIN_COARSE_LENS_GAIN, _MIN_LENS_RESIDUAL_GAIN = 0.01, 0.03
 _CLEAR_RADIAL_STDS, _CLEAR_RADIAL, _CLEAR_LENS_RESIDUAL_GAIN = 10.0, 0.02, 0.01
 
@@ -121,7 +123,7 @@ def _with_times(moving: MovingPairs, coarse: MovingPairs, known: CameraCorrectio
         f"frames: residual {before.residual:.2f} becomes {after.residual:.2f} of 255, "
         f"rotation error {before.rotation_deg:.2f} becomes {after.rotation_deg:.2f} deg"
     )
-    if _explain_motion(before, after, _has_clear_time(fit)):
+    if _is_used(before, after, fit):
         return found, evidence
     return known, f"{evidence}; no clear gain, not used"
 
@@ -136,25 +138,28 @@ def _milliseconds(seconds: float, std_s: float) -> str:
     return f"{1e3 * seconds:.1f} ± {1e3 * std_s:.1f} ms"
 
 
-def _has_clear_time(fit: CameraFit) -> bool:
-    """Return True if readout time or offset differ from 0 by far more than their standard errors."""
+def _differs(fit: CameraFit, stds: float, least_s: float) -> bool:
+    """Return True if readout time or offset differ from 0 by this many standard errors and this much."""
     times = (
         (fit.correction.readout_s, fit.readout_std_s),
         (fit.correction.time_offset_s, fit.offset_std_s),
     )
-    return any(abs(value_s) >= max(_CLEAR_STDS * std_s, _CLEAR_TIME_S) for value_s, std_s in times)
+    return any(abs(value_s) >= max(stds * std_s, least_s) for value_s, std_s in times)
 
 
-def _explain_motion(before: PairError, after: PairError, is_clear: bool) -> bool:
-    """Return True if new times lower both errors, or, if they are clear, the rotation alone.
+def _is_used(before: PairError, after: PairError, fit: CameraFit) -> bool:
+    """Return True if new times lower both errors, or are clear and lower the rotation, or are certain.
 
     The pose fit hides a slow camera's readout from the residual: most of it looks like a rotation of the whole image.
+    Where the stated poses drift, the rotation that this hides is small beside that of the drift.
     """
     rotation_gain = 1.0 - after.rotation_deg / max(before.rotation_deg, _MIN_ROTATION_DEG)
     residual_gain = 1.0 - after.residual / before.residual
+    if _differs(fit, _CERTAIN_STDS, _CERTAIN_TIME_S):
+        return rotation_gain >= 0.0 and residual_gain >= -_MAX_RESIDUAL_LOSS
     if rotation_gain < _MIN_MOTION_GAIN:
         return False
-    if is_clear and before.rotation_deg >= _CLEAR_ROTATION_DEG:
+    if _differs(fit, _CLEAR_STDS, _CLEAR_TIME_S) and before.rotation_deg >= _CLEAR_ROTATION_DEG:
         return residual_gain >= -_MAX_RESIDUAL_LOSS
     return residual_gain >= _MIN_TIMING_RESIDUAL_GAIN
 

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
+from tool_modules import load_tool
 from tum_recording import write_home
 
 from gausslite.calibration.camera_estimate import estimate_camera, minimum
@@ -51,6 +52,17 @@ def test_an_ideal_camera_is_left_alone() -> None:
     estimate = estimate_camera(open_source(f"{HOME}&speed=60"), CameraCorrection())
     assert estimate.correction.is_identity
     assert all("not used" in line or "expected at least" in line for line in estimate.evidence), estimate.evidence
+
+
+@pytest.mark.parametrize("readout_ms", [0, 30])
+def test_drifting_poses_neither_hide_nor_feign_a_readout_time(tmp_path: Path, readout_ms: int) -> None:
+    shutter = f"&shutter={readout_ms}ms" if readout_ms else ""
+    home = f"sim:home-1?frames=60&size=160x120&noise=0&exposure=0&speed=60{shutter}"
+    # 2 degrees: more than the shutter turns any pair of frames
+    load_tool("write_recording").write_recording(home, "", tmp_path / "recording", 0.015, 2.0, 5)
+    estimate = estimate_camera(open_source(str(tmp_path / "recording")), CameraCorrection(PINHOLE))
+    assert estimate.correction.readout_s == pytest.approx(1e-3 * readout_ms, abs=0.003), estimate.evidence
+    assert ("not used" in estimate.evidence[0]) == (readout_ms == 0)
 
 
 def test_a_slow_camera_gives_no_estimate() -> None:
