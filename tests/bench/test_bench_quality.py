@@ -76,7 +76,7 @@ def test_a_real_sequences_kinds_are_chosen_by_name() -> None:
 def test_components_are_enabled_one_by_one() -> None:
     variants = cumulative_variants()
     label_textures = [variant.label for variant in variants]
-    beyond = ["+long-term-keyframes", "+roi-context", "+background-reserve", "+ema", "+lr-decay"]
+    beyond = ["+long-term-keyframes", "+roi-context", "+depth-edge-mask", "+background-reserve", "+ema", "+lr-decay"]
     assert label_textures == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond, "+saturation"]
     off = [variant.disabled for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from gausslite.domain.depth_edges import without_depth_edges
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
@@ -97,9 +98,10 @@ def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSe
     if settings.roi_context_weight > 0:
         context = np.float32(settings.roi_context_weight) * _pixels_inside(tiles, pixel_weights.shape)
         pixel_weights = np.maximum(pixel_weights, context)
+    depth_m = without_depth_edges(frame.depth_m, settings.depth_edge_px)
     return WindowView(
         keyframe=keyframe,
-        training_view=rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera, pixel_weights, frame.motion),
+        training_view=rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, pixel_weights, frame.motion),
         T_camera_world=inverse(frame.T_world_camera),
         roi=Subset(tiles),
     )

@@ -45,7 +45,9 @@ def paper_policy() -> MapperSettings:
             min_density_ratio=1.0,
             background_share=0.0,
         ),
-        keyframes=KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0, pose_updates_per_frame=0),
+        keyframes=KeyframeSettings(
+            long_term_keyframes=0, roi_context_weight=0.0, pose_updates_per_frame=0, depth_edge_px=0
+        ),
         optimization=OptimizationSettings(
             active_phase=ActivePhase.ACTIVE_ONLY,
             loss=LossWeights(),
@@ -97,6 +99,10 @@ def _without_roi_context(settings: MapperSettings) -> MapperSettings:
     return replace(settings, keyframes=replace(settings.keyframes, roi_context_weight=0.0))
 
 
+def _without_depth_edge_mask(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, keyframes=replace(settings.keyframes, depth_edge_px=0))
+
+
 def _without_background_reserve(settings: MapperSettings) -> MapperSettings:
     return replace(settings, seeding=replace(settings.seeding, background_share=0.0))
 
@@ -116,6 +122,7 @@ def _without_saturation(settings: MapperSettings) -> MapperSettings:
 EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "long-term-keyframes": _without_long_term_keyframes,
     "roi-context": _without_roi_context,
+    "depth-edge-mask": _without_depth_edge_mask,
     "background-reserve": _without_background_reserve,
     "ema": _without_ema,
     "lr-decay": _without_lr_decay,

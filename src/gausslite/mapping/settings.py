@@ -108,7 +108,8 @@ class KeyframeSettings:
     keyframe of the window. roi_margin_px: margin around the ROI within which tiles are rendered in the active phase.
     roi_context_weight: weight in the active phase's loss of pixels outside the ROI but inside its tiles, 0 to 1; 0 is
     the paper's binary mask. pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame
-    if `MapperSettings.pose_prior` allows an error. max_pixels: cap on the pixels of all keyframes together, reached
+    if `MapperSettings.pose_prior` allows an error. depth_edge_px: depth within this distance of a depth jump is not
+    trained; 0 trains all depth, as the paper. max_pixels: cap on the pixels of all keyframes together, reached
     with images larger than about 1280x720; a pixel needs 13 bytes, or 20 with refined poses.
     """
 
@@ -119,12 +120,13 @@ class KeyframeSettings:
     roi_margin_px: int = 5
     roi_context_weight: float = 0.3
     pose_updates_per_frame: int = 2
+    depth_edge_px: int = 2
     max_pixels: int = 160_000_000
 
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer", "max_pixels"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
-        for name in ("long_term_keyframes", "roi_margin_px", "pose_updates_per_frame"):
+        for name in ("long_term_keyframes", "roi_margin_px", "pose_updates_per_frame", "depth_edge_px"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
         weight = self.roi_context_weight
         _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)

@@ -65,7 +65,7 @@ def test_the_paper_policy_has_the_settings_of_the_paper() -> None:
     assert not seeding.fill_sparse_roi
     assert seeding.background_share == 0.0
     assert (keyframes.every, keyframes.window, keyframes.long_term_keyframes) == (5, 24, 0)
-    assert keyframes.roi_context_weight == 0.0
+    assert (keyframes.roi_context_weight, keyframes.depth_edge_px) == (0.0, 0)
     assert (optimization.warmup_iterations, optimization.active_iterations) == (2, 6)
     assert optimization.active_phase is ActivePhase.ACTIVE_ONLY
     assert optimization.loss == LossWeights(colour=0.8, depth=1.0, ssim=0.2, normalise_by_image=False)
@@ -127,7 +127,7 @@ def test_a_mission_maps_with_the_parts_disabled(name: str, iterations: int | Non
 def test_with_all_flags_disabled_no_component_is_left() -> None:
     bare = disable(policy(TASK), ABLATION_FLAGS)
     assert bare.components == Components(sb=False, mvo=False, roi=False, sis=False, gfd=False)
-    keyframes = KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0)
+    keyframes = KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0, depth_edge_px=0)
     assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == keyframes
 
 
