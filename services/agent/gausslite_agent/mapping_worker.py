@@ -17,10 +17,11 @@ from typing import TypeVar
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, group_by_voxel
+from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, replace_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.free_space import FreeSpaceMap
 from gausslite.mapping.mapper import GaussianMapper
@@ -32,6 +33,7 @@ from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.timeline import Timeline
+from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.frame_queue import FrameQueue, QueuedFrame
 from gausslite_agent.idle_training import IdleTraining
@@ -72,6 +74,8 @@ class MappingWorker:
         self._clock = clock
         self._mapper = build_mapper(settings)
         self._sent_voxels = SentVoxelTracker(grid)
+        # updates that the spool refused
+        self._unpublished = empty_batch()
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
         self._timeline = Timeline()
@@ -109,7 +113,7 @@ class MappingWorker:
         return self._submit(lambda: self._assign(graph))
 
     def restore(self, saved: SavedMission) -> Future[None]:
-        """Continue a saved mission; call it before the first frame. The future raises MapFileError."""
+        """Continue a saved mission; call it before the first frame. The future raises MapFileError, StorageError."""
         return self._submit(lambda: self._restore(saved))
 
     def save(self, path: Path, config: ResumeConfig, requested_task: str) -> Future[float]:
@@ -155,8 +159,11 @@ class MappingWorker:
         return self._submit(lambda: self._insert_team_voxels(received))
 
     def handover_batch(self) -> Future[VoxelBatch]:
-        """Return updates of the whole map, except voxels of an earlier task that were sent with a higher Σkappa."""
-        return self.run(lambda mapper: self._sent_voxels.exclude_frozen(group_by_voxel(mapper.gaussians(), self._grid)))
+        """Return updates of the whole map, except voxels of an earlier task that were sent with a higher Σkappa.
+
+        Voxels of an earlier handover that the map has lost get tombstones. The future raises StorageError.
+        """
+        return self._submit(lambda: self._voxels_to_send(self._mapper.gaussians()))
 
     def select_keyframes(self) -> Future[None]:
         """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""
@@ -208,9 +215,19 @@ class MappingWorker:
         self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
         self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
         # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
-        roi = group_by_voxel(self._mapper.roi_gaussians(), self._grid)
-        self._publish(self._sent_voxels.exclude_frozen(roi))
+        # and the server may have voxels that the saved map does not
+        self._publish(self._voxels_to_send(self._mapper.roi_gaussians(), Purpose.ROI))
         self._on_change()
+
+    def _voxels_to_send(self, gaussians: Gaussians, purpose: Purpose | None = None) -> VoxelBatch:
+        """Return updates of these Gaussians' voxels, and tombstones of the voxels sent for this purpose beyond them.
+
+        Raises StorageError.
+        """
+        batch = self._sent_voxels.exclude_frozen(group_by_voxel(gaussians, self._grid))
+        if self.uplink is None:
+            return batch
+        return self._sent_voxels.add_tombstones(batch, self.uplink.spooled_voxels(purpose))
 
     def _save(self, path: Path, config: ResumeConfig, requested_task: str) -> float:
         graph, task_mapper = self.status().graph, self._task_mapper
@@ -312,15 +329,16 @@ class MappingWorker:
             self._publish(batch)
 
     def _publish(self, batch: VoxelBatch) -> None:
-        """Pass updates to the uplink. If its spool is full, all voxels are published again with the next frame."""
+        """Pass updates to the uplink. Those that its spool refuses are published again with the next frame."""
         if self.uplink is None:
             return
         publish_error = ""
+        self._unpublished = replace_voxels(self._unpublished, batch)
         try:
-            self.uplink.enqueue(batch)
+            self.uplink.enqueue(self._unpublished)
+            self._unpublished = empty_batch()
         except StorageError as error:
             publish_error = str(error)
-            self._sent_voxels.mark_all_unsent()
         is_new = publish_error and not self.status().publish_error
         self._status.update(publish_error=publish_error)
         if is_new:

@@ -69,10 +69,6 @@ class VoxelChangeTracker:
         """Store these signatures; they replace those of the same voxels."""
         self._store(added, self.signatures.select(~np.isin(self.signatures.keys, added.keys)))
 
-    def reset(self) -> None:
-        """Clear all signatures, so that every voxel counts as new at the next update."""
-        self.signatures = VoxelSignatures.empty()
-
     def state(self) -> State:
         """Return the signatures of the last update."""
         return {"keys": self.signatures.keys, "signatures": self.signatures.values}

@@ -81,6 +81,11 @@ def merge_batches(*batches: VoxelBatch) -> VoxelBatch:
     return VoxelBatch(keys[order], sums[order], counts[order], gaussians)
 
 
+def replace_voxels(older: VoxelBatch, newer: VoxelBatch) -> VoxelBatch:
+    """Return the voxels of both batches; a voxel of both is the newer one."""
+    return merge_batches(select_voxels(older, ~np.isin(older.keys, newer.keys)), newer)
+
+
 def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]:
     """Return the indices start, start + 1, … of every run (start, count), concatenated."""
     ends = np.cumsum(counts, dtype=np.int64)

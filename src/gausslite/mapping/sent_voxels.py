@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
@@ -64,10 +64,9 @@ class SentVoxelTracker:
         values[:, 0] = batch.kappa_sums
         return select_voxels(batch, self._may_replace(VoxelSignatures(batch.keys, values)))
 
-    def mark_all_unsent(self) -> None:
-        """Treat every voxel as new at the next call, because the receiver has lost the earlier updates."""
-        self._tracker.reset()
-        self._frozen = np.zeros(0, np.int64)
+    def add_tombstones(self, batch: VoxelBatch, stored: Int64[ndarray, " s"]) -> VoxelBatch:
+        """Return the batch, with a tombstone for each stored voxel that is neither in the batch nor frozen."""
+        return merge_batches(batch, tombstones(np.setdiff1d(stored, np.union1d(batch.keys, self._frozen))))
 
     def state(self) -> State:
         """Return what later calls depend on."""

@@ -16,7 +16,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
 from gausslite.domain.pose import require_rigid
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
+from gausslite.domain.voxel_operations import empty_batch, replace_voxels, select_voxels
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.v1 import gaussians_pb2, geometry_pb2
 from gausslite.wire.camera_messages import (
@@ -59,8 +59,8 @@ class MapUpdate:
         before = empty_batch() if self.snapshot and self.first else batch
         if self.batch is None:
             return before
-        kept = select_voxels(before, ~np.isin(before.keys, self.batch.keys))
-        return merge_batches(kept, select_voxels(self.batch, self.batch.counts > 0))
+        after = replace_voxels(before, self.batch)
+        return select_voxels(after, after.counts > 0)
 
 
 def camera_to_message(camera: Camera) -> geometry_pb2.Camera:

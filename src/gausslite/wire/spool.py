@@ -144,6 +144,15 @@ class Spool:
                 ),
             )
 
+    def voxels(self, purpose: Purpose | None = None) -> Int64[ndarray, " v"]:
+        """Return the keys of the voxels whose latest update has Gaussians, ascending; purpose: only updates for it."""
+        with self._transaction():
+            rows = self._database.execute(
+                "SELECT key FROM voxel_updates WHERE count > 0 AND (? IS NULL OR purpose = ?) ORDER BY key",
+                (purpose, purpose),
+            ).fetchall()
+        return np.array([key for (key,) in rows], np.int64)
+
     def next_round(self, max_bytes: int, resend_threshold: float) -> SpoolRound | None:
         """Return what is due with the highest value per byte, about max_bytes, at least one; None if nothing is due.
 

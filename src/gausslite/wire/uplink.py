@@ -14,6 +14,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from jaxtyping import Int64
+from numpy import ndarray
+
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -84,6 +87,13 @@ class Uplink:
             self._spool.enqueue(batch, purpose)
             with self._changed:
                 self._changed.notify_all()
+
+    def spooled_voxels(self, purpose: Purpose | None = None) -> Int64[ndarray, " v"]:
+        """Return the keys of the voxels that the server has or will have, ascending; purpose: only those sent for it.
+
+        Without a file for the spool, it knows only the voxels of this process. Raises StorageError.
+        """
+        return self._spool.voxels(purpose)
 
     def report_objects(self, report: ObjectReport) -> None:
         """Send the agent's task and objects with the next round; a newer report replaces one that waits."""

@@ -8,7 +8,7 @@ from sample_gaussians import some_gaussians
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxel_operations import empty_batch, group_by_voxel
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.sent_voxels import SentVoxelTracker
 
@@ -83,11 +83,17 @@ def test_a_voxel_that_lost_its_gaussians_gets_one_tombstone() -> None:
     assert len(tracker.collect_changes(left)) == 0
 
 
-def test_after_mark_all_unsent_every_voxel_is_returned_again() -> None:
+def test_stored_voxels_get_tombstones_unless_they_are_in_the_batch_or_frozen() -> None:
     tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
-    before = tracker.collect_changes(gaussians)
-    tracker.mark_all_unsent()
-    np.testing.assert_array_equal(tracker.collect_changes(gaussians).keys, before.keys)
+    whole = tracker.collect_changes(gaussians)
+    tracker.freeze_sent()
+    lost = whole.keys[0] - 1
+    result = tracker.add_tombstones(whole, np.array([lost, *whole.keys]))
+    assert result.keys.tolist() == [lost, *whole.keys]
+    assert result.counts.tolist() == [0, *whole.counts]
+    # frozen voxels keep what was sent, also if the batch does not have them
+    assert tracker.add_tombstones(empty_batch(), np.array([lost, *whole.keys])).keys.tolist() == [lost]
+    assert SentVoxelTracker(GRID).add_tombstones(empty_batch(), whole.keys).keys.tolist() == whole.keys.tolist()
 
 
 def test_frozen_voxels_get_no_updates_and_no_tombstones() -> None:

@@ -26,7 +26,7 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient
-from gausslite.wire.spool import Spool
+from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.agent_mission import AgentMission
@@ -118,7 +118,7 @@ def restored_map(options: AgentSettings) -> Gaussians:
 
 @pytest.mark.parametrize("keeps_spool", [True, False])
 def test_the_fused_map_follows_the_agent_through_clean_and_unsaved_ends(keeps_spool: bool, tmp_path: Path) -> None:
-    """The third run ends unsaved: on the voxels of the agent's map, the server equals the agent."""
+    """The third run ends unsaved: the server then equals the agent; without a spool's file on the agent's voxels."""
     store, options = MemoryStore(), settings(tmp_path / "robot.state")
     spool = tmp_path / "robot.spool" if keeps_spool else None
     with fusion_server(store) as fusion:
@@ -143,6 +143,37 @@ def test_the_fused_map_follows_the_agent_through_clean_and_unsaved_ends(keeps_sp
             batch = region_batch(worker)
             np.testing.assert_array_equal(batch.kappa_sums, kept.kappa_sums)
             assert totals_on(store).items() >= totals(batch).items()
+            if keeps_spool:
+                assert totals_on(store) == totals(batch)
+
+
+def test_voxels_sent_after_the_last_save_are_removed_by_the_restored_agent(tmp_path: Path) -> None:
+    """The killed process had sent voxels and a whole map beyond the saved one."""
+    store, options, spool = MemoryStore(), settings(tmp_path / "robot.state"), tmp_path / "robot.spool"
+    with fusion_server(store) as fusion:
+        with agent_run(options, fusion, spool) as (mission, worker):
+            map_frames(worker, 0, 1)
+            mission.finish()
+            kept = region_batch(worker)
+            beyond = group_by_voxel(shifted(map_of(worker), 3.0), GRID)
+            assert worker.uplink is not None
+            worker.uplink.enqueue(beyond)
+            worker.uplink.enqueue(group_by_voxel(shifted(map_of(worker), -3.0), GRID), Purpose.HANDOVER)
+            assert worker.uplink.drain(20.0)
+            assert len(totals_on(store)) > len(beyond) + len(kept)
+        with agent_run(options, fusion, spool) as (_, worker):
+            assert worker.uplink is not None
+            assert worker.uplink.drain(20.0)
+            assert not set(totals_on(store)) & set(beyond.keys.tolist())
+            worker.uplink.enqueue(worker.handover_batch().result(), Purpose.HANDOVER)
+            assert worker.uplink.drain(20.0)
+            assert totals_on(store) == totals(group_by_voxel(map_of(worker), GRID))
+
+
+def shifted(gaussians: Gaussians, distance_m: float) -> Gaussians:
+    moved = gaussians.take(np.arange(len(gaussians)))
+    moved.means_m[:, 0] += np.float32(distance_m)
+    return moved
 
 
 def test_a_server_that_lost_its_data_receives_it_again(tmp_path: Path) -> None:
