@@ -147,7 +147,11 @@ class GsplatKernels:
 
 
 class TorchKernels:
-    """The same operations on the CPU, slow, for tests of the code around the kernels."""
+    """The same operations on the CPU, slow, for tests of the code around the kernels.
+
+    They compute in double precision: gsplat's functions use matrix products, which round by the number of rows and by
+    the processor, so that in single precision the image of a subset would differ from that of the whole map.
+    """
 
     def __init__(self) -> None:
         from gsplat.cuda import _torch_impl
@@ -161,8 +165,10 @@ class TorchKernels:
 
     def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
         """Return the covariances [m 3 3]."""
-        covariances, _ = self._gsplat._quat_scale_to_covar_preci(quats_wxyz, scales_m, compute_preci=False)
-        return cast(Tensor, covariances)
+        covariances, _ = self._gsplat._quat_scale_to_covar_preci(
+            quats_wxyz.double(), scales_m.double(), compute_preci=False
+        )
+        return cast(Tensor, covariances).float()
 
     def project(
         self,
@@ -173,14 +179,14 @@ class TorchKernels:
     ) -> tuple[Tensor, Tensor]:
         """Return means and covariances in the image."""
         means_px, covariances_px2 = self._gsplat._persp_proj(
-            points_m[None], covariances_m2[None], intrinsics[None], *size
+            points_m[None].double(), covariances_m2[None].double(), intrinsics[None].double(), *size
         )
-        return means_px[0], covariances_px2[0]
+        return means_px[0].float(), covariances_px2[0].float()
 
     def composite(
         self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
     ) -> tuple[Tensor, Tensor]:
-        """Blend front to back with gsplat's limits, in double precision."""
+        """Blend front to back with gsplat's limits."""
         columns = (footprints.means_px, footprints.conics, footprints.opacities, footprints.channels)
         blend: Callable[..., Tensor] = _Composite.apply
         images = blend(*columns, footprints.order_m, footprints.radius_px, size, tiles)
