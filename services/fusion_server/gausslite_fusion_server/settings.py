@@ -223,9 +223,21 @@ def parse_maintenance(arguments: Sequence[str]) -> MaintenanceSettings:
     return MaintenanceSettings(options.command, options.store, other, options.json, getattr(options, "repair", False))
 
 
+def build_parser_with_commands() -> argparse.ArgumentParser:
+    """Return the parser of the server's options and of the maintenance commands, for the completion of a shell."""
+    parser = build_parser()
+    _add_maintenance_commands(parser, required=False)
+    return parser
+
+
 def _maintenance_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Maintain the file of a store.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_maintenance_commands(parser, required=True)
+    return parser
+
+
+def _add_maintenance_commands(parser: argparse.ArgumentParser, *, required: bool) -> None:
+    commands = parser.add_subparsers(dest="command", required=required, metavar="COMMAND")
     for name, paths, text in (
         ("backup", ("store", "target"), "copy a store to a new file and verify the copy; a server may be using it"),
         ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
@@ -244,4 +256,3 @@ def _maintenance_parser() -> argparse.ArgumentParser:
         command.add_argument("--json", action="store_true", help="print one JSON object")
         if name == "verify":
             command.add_argument("--repair", action="store_true", help="delete the damaged rows; without a server")
-    return parser

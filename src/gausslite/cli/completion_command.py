@@ -9,17 +9,18 @@ from pathlib import Path
 from types import ModuleType
 
 from gausslite.cli.commands import build_parser
+from gausslite.config.layers import add_configuration, subcommands
 from gausslite.config.paths import read_path
 from gausslite.domain.errors import InvalidInputError
 
 _SHELLS = ("bash", "zsh", "fish")
 _GAUSSLITE = "gausslite"
 _SERVICES = {
-    "gausslite-agent": "gausslite_agent.settings",
-    "gausslite-fusion-server": "gausslite_fusion_server.settings",
-    "gausslite-parser": "gausslite_parser.settings",
+    "gausslite-agent": ("gausslite_agent.settings", "build_parser"),
+    "gausslite-fusion-server": ("gausslite_fusion_server.settings", "build_parser_with_commands"),
+    "gausslite-parser": ("gausslite_parser.settings", "build_parser"),
 }
-"""Modules of the service programs; imported by name, because the services are siblings of the command line."""
+"""Modules and functions of the service programs; by name, because the services are siblings of the command line."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -49,9 +50,23 @@ def run(options: argparse.Namespace) -> int:
 
 def _parser_of(program: str) -> argparse.ArgumentParser:
     if program == _GAUSSLITE:
-        return build_parser()
-    parser: argparse.ArgumentParser = importlib.import_module(_SERVICES[program]).build_parser()
+        parser = build_parser()
+    else:
+        module, function = _SERVICES[program]
+        parser = getattr(importlib.import_module(module), function)()
+    for configurable in _configurable(parser):
+        add_configuration(configurable)
     return parser
+
+
+def _configurable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield the parsers that read a configuration: commands of `gausslite`, or a service program itself."""
+    commands = subcommands(parser)
+    if commands is None or parser.prog in _SERVICES:
+        yield parser
+    else:
+        for command in commands.values():
+            yield from _configurable(command)
 
 
 def _import_shtab() -> ModuleType:

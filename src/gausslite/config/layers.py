@@ -42,9 +42,9 @@ def parse_options(
     """
     parser, arguments = _leaf_parser(parser, list(sys.argv[1:] if arguments is None else arguments))
     environment = os.environ if environment is None else environment
-    if _subparsers(parser) is not None:
+    if subcommands(parser) is not None:
         return parser.parse_args(arguments)
-    _add_configuration(parser)
+    add_configuration(parser)
     # values such as -1,0,0 are no flags
     parser._negative_number_matcher = _NEGATIVE_NUMBERS
     table = OptionTable.of(parser)
@@ -70,13 +70,14 @@ def _leaf_parser(
     parser: argparse.ArgumentParser, arguments: Sequence[str]
 ) -> tuple[argparse.ArgumentParser, Sequence[str]]:
     """Return the parser of the chosen sub-command and the arguments after the command's name."""
-    commands = _subparsers(parser)
+    commands = subcommands(parser)
     if commands is None or not arguments or arguments[0] not in commands:
         return parser, arguments
     return _leaf_parser(commands[arguments[0]], arguments[1:])
 
 
-def _subparsers(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser] | None:
+def subcommands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser] | None:
+    """Return the parsers of the sub-commands by name; None for a parser without sub-commands."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             choices: Mapping[str, argparse.ArgumentParser] = action.choices
@@ -84,7 +85,8 @@ def _subparsers(parser: argparse.ArgumentParser) -> Mapping[str, argparse.Argume
     return None
 
 
-def _add_configuration(parser: argparse.ArgumentParser) -> None:
+def add_configuration(parser: argparse.ArgumentParser) -> None:
+    """Add --config and --print-config."""
     add = parser.add_argument_group("configuration").add_argument
     add(
         "--config",

@@ -57,6 +57,8 @@ def test_bash_completes_commands_options_choices_and_files(bash_script: Path, tm
     assert completions(bash_script, tmp_path, "bench", "ras") == {"raster"}
     assert completions(bash_script, tmp_path, "completion", "") >= {"bash", "zsh", "fish"}
     assert "kitchen.ply" in completions(bash_script, tmp_path, "eval", "kit")
+    assert completions(bash_script, tmp_path, "map", "--print-c") == {"--print-config"}
+    assert "kitchen.ply" in completions(bash_script, tmp_path, "bench", "raster", "--config", "kit")
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
@@ -65,6 +67,8 @@ def test_bash_completes_commands_options_choices_and_files(bash_script: Path, tm
     [
         ("gausslite-agent", "--hand", "--handover"),
         ("gausslite-fusion-server", "--max-miss", "--max-missions"),
+        ("gausslite-fusion-server", "check", "check-claims"),
+        ("gausslite-fusion-server", "--print-c", "--print-config"),
         ("gausslite-parser", "--llm-u", "--llm-url"),
     ],
 )
