@@ -34,15 +34,27 @@ def _ray_starts() -> None:
 @pytest.fixture
 def cluster(_ray_starts: None) -> Iterator[Any]:
     """Three nodes on this machine; the store connects to the first one, which stays."""
+    cluster = start_cluster()
+    yield cluster
+    ray.shutdown()
+    cluster.shutdown()
+
+
+def start_cluster(attempts: int = 3) -> Any:
+    """Start the nodes. Ray gives each one 30 s, which a busy machine can exceed; then all are started again."""
     from ray.cluster_utils import Cluster
 
     arguments = {"num_cpus": NODE_CPUS, "object_store_memory": 100 << 20}
     cluster = Cluster(initialize_head=True, head_node_args={**arguments, "include_dashboard": False})
-    for _ in range(2):
-        cluster.add_node(**arguments)
-    yield cluster
-    ray.shutdown()
-    cluster.shutdown()
+    try:
+        for _ in range(2):
+            cluster.add_node(**arguments)
+    except Exception as error:
+        cluster.shutdown()
+        if attempts == 1 or "timed out during startup" not in str(error):
+            raise
+        return start_cluster(attempts - 1)
+    return cluster
 
 
 def wait_for_standbys(store: RayStore) -> None:
