@@ -20,6 +20,7 @@ from gausslite.config.mapping_options import (
     perception_settings,
 )
 from gausslite.config.numbers import Number
+from gausslite.config.options_without_effect import require_effect
 from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
@@ -118,6 +119,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     if options.source is not None and options.task is None:
         raise InvalidInputError("--task: expected a task for the source, got none")
     _require_valid(options)
+    require_effect(options)
     source = None
     if options.source is not None:
         source = SourceSettings(

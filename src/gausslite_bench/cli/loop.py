@@ -10,6 +10,7 @@ from gausslite.cli.map_inputs import choose_roi
 from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import add_regions, open_with_warnings, selected_regions
 from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings, perception_settings
+from gausslite.config.options_without_effect import require_effect
 from gausslite.config.source_options import add_frames
 from gausslite.config.switches import add_switch
 from gausslite.datasets.held_out import HeldOutSplit
@@ -63,6 +64,7 @@ def run_loop(options: argparse.Namespace) -> int:
     """Map the sequence and print the time of each stage. Reading frames is not counted."""
     if options.source == _HOME and options.policy in (None, TASK) and not _has_task(options):
         options.task = _HOME_TASK
+    require_effect(options)
     if options.loop is not None and options.loop < 2:
         raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
     source, _ = open_with_warnings(options.source, options.up, options.register_depth)

@@ -8,6 +8,7 @@ import pytest
 from tiny_sequences import write_tum
 
 from gausslite.cli.main import main
+from gausslite_agent.program import run as run_agent
 
 
 @pytest.mark.parametrize(
@@ -22,13 +23,21 @@ from gausslite.cli.main import main
         (("--resegment",), "--detector FILE.onnx"),
     ],
 )
-@pytest.mark.parametrize("command", ["map", "demo"])
+@pytest.mark.parametrize("command", ["map", "demo", "agent", "bench loop"])
 def test_an_option_without_effect_is_refused(
     command: str, given: tuple[str, ...], needed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sequence = str(write_tum(tmp_path / "room"))
-    source = {"map": [sequence], "demo": ["--source", sequence, "--task-a", "Find the mug", "--task-b", "Find it"]}
-    assert main([command, *source[command], *given, "--out", str(tmp_path / "out")]) == 2
-    message = f"gausslite: {given[0]}: has an effect only with {needed}; give both, or omit {given[0]}"
+    sequence, out = str(write_tum(tmp_path / "room")), ["--out", str(tmp_path / "out")]
+    demo_tasks = ["--task-a", "Find the mug", "--task-b", "Find it"]
+    arguments = {
+        "map": ["map", sequence, *out],
+        "demo": ["demo", "--source", sequence, *demo_tasks, *out],
+        "agent": ["--source", sequence, "--task", "Find the mug", *out],
+        "bench loop": ["bench", "loop", sequence],
+    }
+    run = run_agent if command == "agent" else main
+    assert run([*arguments[command], *given]) == 2
+    program = "gausslite-agent" if command == "agent" else "gausslite"
+    message = f"{program}: {given[0]}: has an effect only with {needed}; give both, or omit {given[0]}"
     assert capsys.readouterr().err.splitlines() == [message]
     assert not (tmp_path / "out").exists()
