@@ -17,6 +17,7 @@ from gausslite.perception.surface_votes import SurfaceVotes
 
 _CELL_GRID: Final = VoxelGrid(0.05)
 _MIN_MATCH_DISTANCE_M: Final = 0.15
+_MAX_SIZE_RATIO: Final = 2.0
 _MIN_SHARED: Final = 0.3
 _MIN_COUNT_SHARE: Final = 0.15
 _MIN_RELIABLE_SHARE: Final = 0.25
@@ -123,9 +124,17 @@ class Landmark:
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
-        """Return True if the centroids are so close that both are one object; their phrases may differ."""
+        """Return True if the centroids are close for the size of the smaller object."""
         max_distance_m = max(_MIN_MATCH_DISTANCE_M, 0.75 * min(self.radius_m, other.radius_m))
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < max_distance_m
+
+    def may_equal(self, other: Observation) -> bool:
+        """Return True if an observation of another phrase may show this object: the same place, and a similar size.
+
+        A bowl in the middle of a table has the table's centroid, but not its size.
+        """
+        is_similar = max(self.radius_m, other.radius_m) <= _MAX_SIZE_RATIO * min(self.radius_m, other.radius_m)
+        return is_similar and self.is_colocated_with(other)
 
     def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
         """Return the whole object as an observation by a camera, to evaluate relations."""

@@ -236,7 +236,7 @@ class SpatialFilter:
     def _anchors(self, relation: Relation, observation: Observation) -> list[Landmark]:
         """Return the relation's anchors without the target itself."""
         landmarks = self._confirmed_landmarks(relation.anchor)
-        return [each for each in landmarks if not each.is_colocated_with(observation)]
+        return [each for each in landmarks if not each.may_equal(observation)]
 
     def _holds(self, relation: Relation, observation: Observation) -> bool:
         """Return whether the relation holds, regardless of its negation."""

@@ -59,6 +59,14 @@ def test_each_predicate_holds_in_its_own_region(predicate, inside, outside):
     assert not satisfies(predicate, small_object("mug", *outside), TABLE)
 
 
+def test_a_bowl_in_the_middle_of_a_table_is_on_it_and_a_table_is_not_on_itself():
+    bowl = box("bowl", (0.0, -0.08, 0.0), (0.25, 0.1, 0.25))
+    assert satisfies(Predicate.ON, bowl, TABLE)
+    # the same object, detected as two phrases
+    desk = box("desk", (0.0, -0.05, 0.0), (1.1, 0.6, 0.6))
+    assert not satisfies(Predicate.ON, desk, TABLE)
+
+
 @given(
     st.sampled_from(sorted(MIRRORED)),
     st.floats(-2.5, 2.5).filter(lambda x: abs(x) > 0.1),
