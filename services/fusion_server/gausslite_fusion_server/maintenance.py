@@ -15,11 +15,9 @@ from gausslite.process.messages import print_message
 from gausslite_fusion_server.settings import PROGRAM, MaintenanceSettings, parse_maintenance
 from gausslite_fusion_server.stored_claims import check_stored_claims
 
-COMMANDS = ("backup", "restore", "verify", "compact", "check-claims")
-
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run one of COMMANDS and print what it did.
+    """Run one of MAINTENANCE_COMMANDS and print what it did.
 
     Returns 0, 1 for damaged rows or claims that are not confirmed, or 2 with one line on stderr.
     """

@@ -19,13 +19,13 @@ from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.tracing import tracing
-from gausslite_fusion_server.maintenance import COMMANDS, run_command
+from gausslite_fusion_server.maintenance import run_command
 from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.mission_router import MissionRouter
 from gausslite_fusion_server.missions import Mission, Missions, mission_file, stored_missions
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
-from gausslite_fusion_server.settings import PROGRAM, ServerSettings, parse_arguments
+from gausslite_fusion_server.settings import MAINTENANCE_COMMANDS, PROGRAM, ServerSettings, parse_arguments
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -34,7 +34,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     Returns the exit code: 0, or 2 with one line on stderr if the server fails.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    if given and given[0] in COMMANDS:
+    if given and given[0] in MAINTENANCE_COMMANDS:
         return run_command(given)
 
     async def serve() -> None:

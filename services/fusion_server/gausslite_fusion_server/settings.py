@@ -31,6 +31,19 @@ MAX_SHARDS = 1024
 MAX_MISSIONS = 256
 _CORRECT, _TRUST = "correct", "trust"
 _MAX_STORE_MB = 1 << 24
+_MAINTENANCE = (
+    ("backup", ("store", "target"), "copy a store to a new file and verify the copy; a server may be using it"),
+    ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
+    ("verify", ("store",), "check every row; a server may be using the store"),
+    ("compact", ("store",), "rewrite the file without unused space; no server may be using it"),
+    (
+        "check-claims",
+        ("store",),
+        "compare the voxels that each agent wins with the other agents' keyframes; no server may be using the "
+        "store: check a backup",
+    ),
+)
+MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +146,8 @@ def build_parser() -> argparse.ArgumentParser:
         prog=PROGRAM,
         description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "
         "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins.",
+        epilog=f"Commands that maintain the file of a store: {', '.join(MAINTENANCE_COMMANDS)}. `{PROGRAM} COMMAND "
+        "--help` describes each.",
     )
     defaults, quotas = ServerSettings(), Quotas()
     add = parser.add_argument
@@ -238,18 +253,7 @@ def _maintenance_parser() -> argparse.ArgumentParser:
 
 def _add_maintenance_commands(parser: argparse.ArgumentParser, *, required: bool) -> None:
     commands = parser.add_subparsers(dest="command", required=required, metavar="COMMAND")
-    for name, paths, text in (
-        ("backup", ("store", "target"), "copy a store to a new file and verify the copy; a server may be using it"),
-        ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
-        ("verify", ("store",), "check every row; a server may be using the store"),
-        ("compact", ("store",), "rewrite the file without unused space; no server may be using it"),
-        (
-            "check-claims",
-            ("store",),
-            "compare the voxels that each agent wins with the other agents' keyframes; no server may be using the "
-            "store: check a backup",
-        ),
-    ):
+    for name, paths, text in _MAINTENANCE:
         command = commands.add_parser(name, help=text, description=text.capitalize() + ".")
         for path in paths:
             command.add_argument(path, type=Path, metavar=path.upper())

@@ -51,6 +51,11 @@ def test_the_help_states_no_raw_defaults() -> None:
         assert not re.findall(r"\(default: (?:None|False|True|\[\]|\(\))?\)|\) \(default:", text), parser.prog
 
 
+def test_the_help_of_the_fusion_server_names_its_maintenance_commands() -> None:
+    text = " ".join(fusion_server.build_parser().format_help().split())
+    assert "file of a store: backup, restore, verify, compact, check-claims." in text
+
+
 def test_the_list_of_known_options_is_complete() -> None:
     tables = [OptionTable.of(parser) for parser in parsers()]
     assert {table.key(dest) for table in tables for dest in table.actions} == KNOWN_OPTIONS
