@@ -45,7 +45,7 @@ def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
             deadline_slack=0.25,
             pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.03),
         ),
-        MissionSettings(skip_stages=(SkippableStage.SEEDING,)),
+        MissionSettings(rate_hz=2.0, skip_stages=(SkippableStage.SEEDING,)),
     ],
 )
 def test_an_agent_restores_the_settings_of_its_configuration_file(tmp_path: Path, mission: MissionSettings) -> None:
