@@ -68,10 +68,7 @@ class ShardedStore:
         for subset in subsets:
             require_storable(subset)
         with self._lock:
-            masks = [
-                newer_voxels(self._index, subset, voxel_records(subset.batch), self._records_of(subset))
-                for subset in subsets
-            ]
+            masks = [newer_voxels(self._index, subset, self._records_of(subset)) for subset in subsets]
             newer = [
                 replace(subset, batch=select_voxels(subset.batch, mask))
                 for subset, mask in zip(subsets, masks, strict=True)
@@ -146,8 +143,9 @@ class ShardedStore:
         return self._shards[0].mission_config()
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
-        """Store the mission's configuration."""
-        self._shards[0].set_mission_config(mission_config)
+        """Store the mission's configuration; every shard has it, for the voxel size of its rows."""
+        for shard in self._shards:
+            shard.set_mission_config(mission_config)
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""

@@ -43,9 +43,11 @@ def encode_scales(scales_m: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
 
 def decode_scales(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
     """Decode scales in metres."""
-    octaves = SCALE_MIN_EXPONENT + codes.astype(np.float64) / SCALE_STEPS_PER_OCTAVE
-    scales_m: Float32[ndarray, "n 3"] = np.exp2(octaves).astype(np.float32)
+    scales_m: Float32[ndarray, "n 3"] = _SCALES_M[codes]
     return scales_m
+
+
+_SCALES_M = np.exp2(SCALE_MIN_EXPONENT + np.arange(256) / SCALE_STEPS_PER_OCTAVE).astype(np.float32)
 
 
 def quat_steps(scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
@@ -54,8 +56,9 @@ def quat_steps(scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
     A rotation by t changes the covariance, relative to the product of two scales of ratio r, by t * (r - 1/r). The
     steps grow with r - 1/r, up to 127, so that this change is at most 0.25 for ratios up to 32.
     """
-    spread = scale_codes.max(axis=1, initial=0).astype(np.int64) - scale_codes.min(axis=1, initial=255)
-    steps: Int64[ndarray, " n"] = _STEPS_BY_SPREAD[spread]
+    # NumPy reduces three long rows much faster than many short ones
+    axes = np.ascontiguousarray(scale_codes.T)
+    steps: Int64[ndarray, " n"] = _STEPS_BY_SPREAD[axes.max(axis=0) - axes.min(axis=0)]
     return steps
 
 
@@ -72,7 +75,7 @@ def encode_quats(
 ) -> tuple[UInt8[ndarray, " n"], UInt8[ndarray, "n 3"]]:
     """Return the index of the largest component, and the other three over it in these steps, plus 128."""
     exact = quats_wxyz.astype(np.float64)
-    codes = np.rint(exact * (steps / np.abs(exact).max(axis=1, initial=0))[:, None]).astype(np.int64)
+    codes = np.rint(exact * (steps / np.ascontiguousarray(np.abs(exact).T).max(axis=0))[:, None]).astype(np.int64)
     # q and -q are one rotation, so the largest component is made positive; ties use the quantised values
     rows = np.arange(len(codes))
     largest = np.abs(codes).argmax(axis=1)

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.codec.bit_fields import pack_bits, unpack_bits
 from gausslite.codec.columns import SCALE_MIN_EXPONENT, SCALE_STEPS_PER_OCTAVE
@@ -22,6 +24,8 @@ from gausslite.domain.voxels import VoxelGrid
 MAX_FINE_BITS = 15
 MIN_COARSE_BITS, MAX_COARSE_BITS = 2, 5
 _CELL_SHARE = 0.5
+# the centre of a cell of MAX_FINE_BITS is an odd number of these parts
+_FRACTIONS = 1 << (MAX_FINE_BITS + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +49,7 @@ class PositionPrecision:
 
     def bits(self, scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
         """Return the bits per axis of each Gaussian's position."""
-        smallest = scale_codes.min(axis=1, initial=255).astype(np.int64)
+        smallest = np.ascontiguousarray(scale_codes.T).min(axis=0).astype(np.int64)
         bits = -((smallest - self.scale_code) // SCALE_STEPS_PER_OCTAVE)
         clipped: Int64[ndarray, " n"] = np.clip(bits, self.coarse_bits, MAX_FINE_BITS)
         return clipped
@@ -69,8 +73,25 @@ def centres_of(
     cells: Int64[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"], grid: VoxelGrid
 ) -> Float32[ndarray, "n 3"]:
     """Return the float32 points inside the voxels that are nearest to the cells' centres."""
-    counts = (np.int64(1) << bits)[:, None]
-    means_m = (voxel * grid.size_m + (cells + 0.5) * (grid.size_m / counts)).astype(np.float32)
+    return points_of((2 * cells + 1) << (MAX_FINE_BITS - bits)[:, None], voxel, grid)
+
+
+def fractions_of(
+    means_m: Float32[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
+) -> Int64[ndarray, "n 3"]:
+    """Return the place of each mean in its voxel in 65536ths of the voxel's size; every cell's centre has one."""
+    offsets_m = means_m.astype(np.float64) - voxel * grid.size_m
+    fractions: Int64[ndarray, "n 3"] = np.clip(
+        np.rint(offsets_m * (_FRACTIONS / grid.size_m)), 0, _FRACTIONS - 1
+    ).astype(np.int64)
+    return fractions
+
+
+def points_of(
+    fractions: NDArray[np.integer[Any]], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
+) -> Float32[ndarray, "n 3"]:
+    """Return the float32 points inside the voxels that are nearest to these fractions."""
+    means_m = (voxel * grid.size_m + fractions * (grid.size_m / _FRACTIONS)).astype(np.float32)
     # rounding to float32 can cross a voxel's face by one float
     index = np.floor(means_m.astype(np.float64) / grid.size_m)
     means_m = np.where(index < voxel, np.nextafter(means_m, np.float32(np.inf)), means_m)

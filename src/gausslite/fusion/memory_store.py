@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.records import from_bytes
+from gausslite.codec.stored_voxels import from_stored, to_stored
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of, voxel_records
 from gausslite.fusion.store import (
@@ -27,7 +28,7 @@ from gausslite.fusion.store import (
 
 
 class MemoryStore:
-    """A FusionStore in dictionaries; 63 bytes per Gaussian and about 400 per voxel."""
+    """A FusionStore in dictionaries; 19 bytes per quantised Gaussian (codec.stored_voxels) and about 400 per voxel."""
 
     def __init__(self) -> None:
         self._lock = RLock()
@@ -36,6 +37,7 @@ class MemoryStore:
         self._updates: dict[str, dict[int, bytes]] = {}
         self._sessions: dict[str, SessionRecord] = {}
         self._mission_config: MissionConfig | None = None
+        self._grid: VoxelGrid | None = None
         self._keyframes: dict[str, dict[int, bytes]] = {}
         self._records: dict[str, dict[str, bytes]] = {}
 
@@ -96,8 +98,8 @@ class MemoryStore:
             wanted = stored if keys is None else (key for key in set(keys.tolist()) if key in stored)
             found = np.array(sorted(wanted), np.int64)
             scores = self._index.stored(agent_id, found)
-            records = b"".join(stored[key] for key in found.tolist())
-        return VoxelBatch(found, scores.kappa_sums, scores.counts, from_bytes(records))
+            rows = [stored[key] for key in found.tolist()]
+        return VoxelBatch(found, scores.kappa_sums, scores.counts, from_stored(found, scores.counts, rows))
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
@@ -112,7 +114,7 @@ class MemoryStore:
     def set_mission_config(self, mission_config: MissionConfig) -> None:
         """Store the mission's configuration."""
         with self._lock:
-            self._mission_config = mission_config
+            self._mission_config, self._grid = mission_config, VoxelGrid(mission_config.voxel_size_m)
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""
@@ -172,11 +174,13 @@ class MemoryStore:
 
     def _put(self, subset: RoiSubset) -> PutOutcome:
         batch = subset.batch
-        records = voxel_records(batch)
-        accepted = newer_voxels(self._index, subset, records, lambda agent_id, key: self._updates[agent_id][key])
+        accepted = newer_voxels(self._index, subset, self._records_of)
         keys = batch.keys[accepted]
         if len(keys):
             stored = self._updates.setdefault(subset.agent_id, {})
-            stored.update(zip(keys.tolist(), itertools.compress(records, accepted), strict=True))
+            stored.update(zip(keys.tolist(), itertools.compress(to_stored(batch, self._grid), accepted), strict=True))
             self._index.put(subset.agent_id, keys, scores_of(subset, accepted))
         return PutOutcome(keys, batch.keys[~accepted])
+
+    def _records_of(self, agent_id: str, key: int) -> bytes:
+        return voxel_records(self.batch(agent_id, np.array([key])))[0]

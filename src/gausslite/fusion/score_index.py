@@ -107,7 +107,7 @@ class ScoreIndex:
         return reduce(or_, map(self._holders.get, keys.tolist(), repeat(0)), 0)
 
 
-def newer_voxels(index: ScoreIndex, subset: RoiSubset, records: list[bytes], read: ReadRecords) -> Bool[ndarray, " v"]:
+def newer_voxels(index: ScoreIndex, subset: RoiSubset, read: ReadRecords) -> Bool[ndarray, " v"]:
     """Return a mask of the message's voxels that replace the stored ones.
 
     The higher sequence number wins; between equal ones the larger (Σkappa, count, records) does, so that the outcome
@@ -121,6 +121,7 @@ def newer_voxels(index: ScoreIndex, subset: RoiSubset, records: list[bytes], rea
     larger = (sums > stored.kappa_sums) | ((sums == stored.kappa_sums) & (batch.counts > stored.counts))
     newer |= same_seq & larger
     same_totals = same_seq & (sums == stored.kappa_sums) & (batch.counts == stored.counts) & (batch.counts > 0)
+    records = voxel_records(batch) if same_totals.any() else []
     for i in np.flatnonzero(same_totals).tolist():
         newer[i] = records[i] > read(subset.agent_id, int(batch.keys[i]))
     return newer

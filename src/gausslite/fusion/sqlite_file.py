@@ -15,7 +15,7 @@ import google_crc32c
 
 from gausslite.domain.errors import StorageError
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 PAGE_BYTES = 4096
 RESTORE_ADVICE = (
     "restore a backup (gausslite-fusion-server restore BACKUP STORE), or delete the damaged rows "
@@ -27,7 +27,7 @@ _CHECKPOINT_PAGES = 8192
 _SCHEMA = """
 CREATE TABLE voxel_updates (
     agent_id TEXT NOT NULL, voxel INTEGER NOT NULL, update_seq INTEGER NOT NULL,
-    kappa_sum INTEGER NOT NULL, count INTEGER NOT NULL, checksum INTEGER NOT NULL, records BLOB NOT NULL,
+    kappa_sum INTEGER NOT NULL, count INTEGER NOT NULL, checksum INTEGER NOT NULL, gaussians BLOB NOT NULL,
     PRIMARY KEY (agent_id, voxel));
 CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
 CREATE TABLE keyframes (
@@ -119,10 +119,10 @@ def remove_store(path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
-def update_checksum(agent_id: str, voxel: int, scores: tuple[int, int, int], records: bytes) -> int:
+def update_checksum(agent_id: str, voxel: int, scores: tuple[int, int, int], gaussians: bytes) -> int:
     """Return the CRC32C of an update; scores: its update_seq, Σkappa and count."""
     head = agent_id.encode() + _UPDATE_HEADER.pack(voxel, *scores)
-    return int(google_crc32c.extend(google_crc32c.value(head), records))
+    return int(google_crc32c.extend(google_crc32c.value(head), gaussians))
 
 
 def data_checksum(owner: str, name: str | int, data: bytes) -> int:

@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray
 
-from gausslite.codec.records import RECORD, from_bytes
+from gausslite.codec.stored_voxels import from_stored, is_stored, to_stored
 from gausslite.domain.errors import StorageError
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of, voxel_records
 from gausslite.fusion.sqlite_file import (
@@ -45,9 +46,9 @@ _LOADED_ROWS = 10_000
 _UPSERT = """
 INSERT INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (agent_id, voxel) DO UPDATE SET
     update_seq = excluded.update_seq, kappa_sum = excluded.kappa_sum, count = excluded.count,
-    checksum = excluded.checksum, records = excluded.records
+    checksum = excluded.checksum, gaussians = excluded.gaussians
 """
-SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, records FROM voxel_updates"
+SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, gaussians FROM voxel_updates"
 """Rows as `is_intact` reads them."""
 _SELECT_POSITION = "SELECT value FROM properties WHERE name = 'log_position'"
 _SET_POSITION = "INSERT OR REPLACE INTO properties VALUES ('log_position', ?)"
@@ -81,6 +82,7 @@ class SqliteStore:
             self._load()
             self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
             self._log_position = sum(int(row[0]) for row in self._read(_SELECT_POSITION))
+            self._grid = _grid_of(self.mission_config())
             self._opened = opened.pop_all()
 
     @property
@@ -101,16 +103,13 @@ class SqliteStore:
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
         for subset in subsets:
             require_storable(subset)
-        records = [voxel_records(subset.batch) for subset in subsets]
+        encoded = [to_stored(subset.batch, self._grid) for subset in subsets]
         with self._write_lock:
-            masks = [
-                newer_voxels(self._index, subset, data, self._records_of)
-                for subset, data in zip(subsets, records, strict=True)
-            ]
+            masks = [newer_voxels(self._index, subset, self._records_of) for subset in subsets]
             if any(mask.any() for mask in masks):
                 with self._transaction() as db:
-                    for subset, data, mask in zip(subsets, records, masks, strict=True):
-                        db.executemany(_UPSERT, _rows(subset, data, mask))
+                    for subset, own, mask in zip(subsets, encoded, masks, strict=True):
+                        db.executemany(_UPSERT, _rows(subset, own, mask))
             with self._index_lock:
                 for subset, mask in zip(subsets, masks, strict=True):
                     self._index.put(subset.agent_id, subset.batch.keys[mask], scores_of(subset, mask))
@@ -161,12 +160,9 @@ class SqliteStore:
         )
         for row in rows:
             self._require_intact(row)
-        return VoxelBatch(
-            np.array([row[1] for row in rows], np.int64),
-            np.array([row[3] for row in rows], np.uint64),
-            np.array([row[4] for row in rows], np.uint32),
-            from_bytes(b"".join(row[6] for row in rows)),
-        )
+        keys, counts = np.array([row[1] for row in rows], np.int64), np.array([row[4] for row in rows], np.uint32)
+        sums = np.array([row[3] for row in rows], np.uint64)
+        return VoxelBatch(keys, sums, counts, from_stored(keys, counts, [row[6] for row in rows]))
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
@@ -195,6 +191,7 @@ class SqliteStore:
         values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
         with self._transaction() as db:
             db.execute("INSERT OR REPLACE INTO mission_config VALUES (1, ?, ?, ?)", values)
+        self._grid = _grid_of(mission_config)
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""
@@ -274,9 +271,7 @@ class SqliteStore:
                     self._index.put(agent_id, np.array(voxels, np.int64), StoredScores(*columns))
 
     def _records_of(self, agent_id: str, voxel: int) -> bytes:
-        rows = self._read(f"{SELECT_UPDATES} WHERE agent_id = ? AND voxel = ?", (agent_id, voxel))
-        self._require_intact(rows[0])
-        return bytes(rows[0][6])
+        return voxel_records(self.batch(agent_id, np.array([voxel])))[0]
 
     def _require_intact(self, row: _UpdateRow) -> None:
         if not is_intact(row):
@@ -305,20 +300,24 @@ class SqliteStore:
 
 
 def is_intact(row: _UpdateRow) -> bool:
-    """Return whether a row of updates has its checksum and as many records as it counts."""
-    agent_id, voxel, update_seq, kappa_sum, count, checksum, records = row
+    """Return whether a row of updates has its checksum and as many Gaussians as it counts."""
+    agent_id, voxel, update_seq, kappa_sum, count, checksum, gaussians = row
     return (
-        len(records) == count * RECORD.itemsize
-        and update_checksum(agent_id, voxel, (update_seq, kappa_sum, count), records) == checksum
+        is_stored(gaussians, count)
+        and update_checksum(agent_id, voxel, (update_seq, kappa_sum, count), gaussians) == checksum
     )
 
 
-def _rows(subset: RoiSubset, records: list[bytes], selected: Bool[ndarray, " v"]) -> Iterator[_UpdateRow]:
+def _rows(subset: RoiSubset, encoded: list[bytes], selected: Bool[ndarray, " v"]) -> Iterator[_UpdateRow]:
     batch = subset.batch
     for i in np.flatnonzero(selected).tolist():
         key = int(batch.keys[i])
         scores = subset.update_seq, int(batch.kappa_sums[i]), int(batch.counts[i])
-        yield (subset.agent_id, key, *scores, update_checksum(subset.agent_id, key, scores, records[i]), records[i])
+        yield (subset.agent_id, key, *scores, update_checksum(subset.agent_id, key, scores, encoded[i]), encoded[i])
+
+
+def _grid_of(mission_config: MissionConfig | None) -> VoxelGrid | None:
+    return None if mission_config is None else VoxelGrid(mission_config.voxel_size_m)
 
 
 def _as_json(keys: Int64[ndarray, " k"]) -> str:

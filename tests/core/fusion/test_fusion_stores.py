@@ -15,12 +15,16 @@ from threading import Thread
 import numpy as np
 import pytest
 from support.local_replicas import LocalHosts
+from support.sample_batches import make_batch
 
 from gausslite.cluster.sharded_store import ShardedStore
+from gausslite.codec.records import to_records
+from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import gather_rows, select_keys
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_file import SCHEMA_VERSION
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -92,6 +96,18 @@ def test_stored_updates_are_read_back(store: FusionStore) -> None:
     assert batch.gaussians.means_m.tobytes() == message.batch.gaussians.means_m.tobytes()
     assert batch.gaussians.active.tolist() == message.batch.gaussians.active.tolist()
     assert store.agents() == ("ant",)
+
+
+def test_received_updates_are_stored_compactly_and_read_back_exactly(store: FusionStore) -> None:
+    grid = VoxelGrid(0.05)
+    store.set_mission_config(MissionConfig("m", "map", grid.size_m))
+    message, _ = decode_subset(encode_subset(RoiSubset("ant", "session", 1, 1, make_batch(0, 60, grid)), grid))
+    store.put(message)
+    batch = store.batch("ant")
+    assert to_records(batch.gaussians).tobytes() == to_records(message.batch.gaussians).tobytes()
+    assert batch.kappa_sums.tolist() == message.batch.kappa_sums.tolist()
+    # the same content again is no change, in its decoded form too
+    assert store.put(message).accepted.tolist() == []
 
 
 def test_the_highest_update_seq_wins(store: FusionStore) -> None:

@@ -36,7 +36,7 @@ def flip_a_bit(path: Path, table: str, column: str, where: str = "1") -> None:
     db.close()
 
 
-@pytest.mark.parametrize("column", ["update_seq", "kappa_sum", "count", "records", "voxel"])
+@pytest.mark.parametrize("column", ["update_seq", "kappa_sum", "count", "gaussians", "voxel"])
 def test_a_damaged_row_is_refused_with_the_way_out_and_repair_removes_only_it(path: Path, column: str) -> None:
     before = SqliteStore(path)
     incarnation_id = before.incarnation_id
@@ -115,7 +115,7 @@ def test_a_backup_of_a_running_store_is_restored_as_another_incarnation(tmp_path
 def test_a_damaged_backup_replaces_nothing(path: Path, tmp_path: Path) -> None:
     backup = tmp_path / "backup.sqlite"
     back_up(path, backup)
-    flip_a_bit(backup, "voxel_updates", "records")
+    flip_a_bit(backup, "voxel_updates", "gaussians")
     with pytest.raises(StorageError, match="1 damaged"):
         restore(backup, path)
     assert verify(path).voxels == len(VOXELS)
