@@ -95,7 +95,7 @@ def test_a_store_at_its_limit_is_not_writable_until_data_is_deleted(tmp_path: Pa
         health = watch_health(t.channel)
         assert next(health) == SERVING
         with pytest.raises(StorageError):
-            t.send(*(request(session, make_subset("ant", seq, {seq: [1] * 1000})) for seq in range(1, 30)))
+            t.send(*(request(session, make_subset("ant", seq, {seq: [1] * 1000})) for seq in range(1, 90)))
         assert next(health) == NOT_SERVING
         t.client.leave(session, forget=True)
         assert next(health) == SERVING

@@ -192,7 +192,7 @@ def test_a_full_store_ends_the_stream_and_the_server_keeps_serving(tmp_path: Pat
         with pytest.raises(grpc.RpcError) as caught:
             list(
                 t.stub.ContributeSubsets(
-                    iter([request(session, make_subset("ant", 1, {c: [1] * 50 for c in range(100)}))])
+                    iter([request(session, make_subset("ant", 1, {c: [1] * 200 for c in range(100)}))])
                 )
             )
         assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
