@@ -82,7 +82,10 @@ def open_existing(path: Path) -> sqlite3.Connection:
                 raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
             version = db.execute("PRAGMA user_version").fetchone()[0]
             if version != SCHEMA_VERSION:
-                raise StorageError(f"store {path}: expected schema version {SCHEMA_VERSION}, got {version}")
+                raise StorageError(
+                    f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use "
+                    "that release, or another file, and the agents send their updates again"
+                )
     except BaseException:
         db.close()
         raise

@@ -7,10 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from gausslite.codec.free_space import decode_free_space
 from gausslite.codec.object_report import decode_object_report
 from gausslite.codec.ply import gaussians_from_ply, world_frame_from_ply
 from gausslite.codec.records import from_bytes
+from gausslite.codec.stored_voxels import CODES, from_stored
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.convert import decode_frame
@@ -24,15 +27,29 @@ def _decode_ply(data: bytes) -> None:
     gaussians_from_ply(data)
 
 
+def _decode_stored_voxel(data: bytes) -> None:
+    count = np.array([len(data) // CODES.itemsize], np.uint32)
+    from_stored(np.zeros(1, np.int64), count, [data])
+
+
 DECODERS: Mapping[str, Callable[[bytes], object]] = {
     "subset": decode_subset,
     "free-space": decode_free_space,
     "keyframe": decode_frame,
     "object-report": decode_object_report,
     "records": from_bytes,
+    "stored-voxel": _decode_stored_voxel,
     "ply": _decode_ply,
 }
-_SHARES = {"subset": 0.5, "free-space": 0.15, "keyframe": 0.1, "object-report": 0.1, "records": 0.05, "ply": 0.1}
+_SHARES = {
+    "subset": 0.45,
+    "free-space": 0.15,
+    "keyframe": 0.1,
+    "object-report": 0.1,
+    "records": 0.05,
+    "stored-voxel": 0.05,
+    "ply": 0.1,
+}
 
 
 @dataclass(slots=True)
