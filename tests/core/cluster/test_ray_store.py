@@ -45,8 +45,10 @@ def start_cluster(attempts: int = 3) -> Any:
     from ray.cluster_utils import Cluster
 
     arguments = {"num_cpus": NODE_CPUS, "object_store_memory": 100 << 20}
-    cluster = Cluster(initialize_head=True, head_node_args={**arguments, "include_dashboard": False})
+    cluster = Cluster()
     try:
+        # the first node is the head
+        cluster.add_node(**arguments, include_dashboard=False)
         for _ in range(2):
             cluster.add_node(**arguments)
     except Exception as error:
