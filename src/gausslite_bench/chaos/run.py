@@ -37,6 +37,7 @@ _POLL_S = 0.02
 _MAX_FAULT_S, _MAX_FULL_S = 1.0, 5.0
 _MAX_DELAY_S = 0.15
 _RESENT_MESSAGES = 20
+_RESEND_LIMIT_S = 10.0
 _DISK_FULL_SHARE, _RESEND_SHARE, _CLOCK_SHARE = 0.15, 0.4, 0.5
 _FREE_BYTES = 50_000
 
@@ -205,9 +206,12 @@ class _ChaosRun:
         acknowledged.read()
         if acknowledged.sent:
             messages = self._random.choices(list(acknowledged.sent), k=_RESENT_MESSAGES)
-            self.faults[Fault.RESEND] += asyncio.run(
-                _resend_messages(self.server.address, acknowledged.session_id, messages)
-            )
+            limit_s, resent = time.monotonic() + _RESEND_LIMIT_S, 0
+            while resent == 0 and time.monotonic() < limit_s:
+                # an agent that joins again has another session, which its journal shows with its next message
+                acknowledged.read()
+                resent = asyncio.run(_resend_messages(self.server.address, acknowledged.session_id, messages))
+            self.faults[Fault.RESEND] += resent
 
     def _start_agent(self, agent_id: str) -> None:
         self.team.start(agent_id, self._random.getrandbits(31), self._clock_offset_s())
