@@ -22,7 +22,7 @@ from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.score_index import ReadRecords, ScoreIndex, newer_voxels, scores_of, voxel_records
+from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
 from gausslite.fusion.store import (
     AgentTotals,
     FusionStore,
@@ -40,7 +40,7 @@ class ShardedStore:
     """A FusionStore over shards, with the same content and outcomes as one store. The only writer of its shards.
 
     The totals of all updates are here too (ScoreIndex), so only Gaussians are read from the shards. The first shard has
-    sessions, configuration and records. If a shard fails, `put_all` raises and counts nothing as stored, although
+    sessions and records. If a shard fails, `put_all` raises and counts nothing as stored, although
     other shards may have their parts. Sending the messages again gives the same outcome as a first attempt.
     """
 
@@ -68,7 +68,7 @@ class ShardedStore:
         for subset in subsets:
             require_storable(subset)
         with self._lock:
-            masks = [newer_voxels(self._index, subset, self._records_of(subset)) for subset in subsets]
+            masks = [newer_voxels(self._index, subset, self.batch) for subset in subsets]
             newer = [
                 replace(subset, batch=select_voxels(subset.batch, mask))
                 for subset, mask in zip(subsets, masks, strict=True)
@@ -144,8 +144,7 @@ class ShardedStore:
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
         """Store the mission's configuration; every shard has it, for the voxel size of its rows."""
-        for shard in self._shards:
-            shard.set_mission_config(mission_config)
+        self._each(lambda shard: shard.set_mission_config(mission_config))
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""
@@ -217,18 +216,6 @@ class ShardedStore:
         self._in_parallel(
             [partial(shard.put_all, own) for shard, own in zip(self._shards, of_shards, strict=True) if own]
         )
-
-    def _records_of(self, subset: RoiSubset) -> ReadRecords:
-        """Return a reader of the stored records, which reads all voxels of the message together when it is used."""
-        records: dict[int, bytes] = {}
-
-        def read(agent_id: str, key: int) -> bytes:
-            if not records:
-                stored = self.batch(agent_id, subset.batch.keys)
-                records.update(zip(stored.keys.tolist(), voxel_records(stored), strict=True))
-            return records[key]
-
-        return read
 
     def _keyframe_shard(self, agent_id: str, index: int) -> FusionStore:
         return self._shards[shard_of_keyframe(agent_id, index, len(self._shards))]

@@ -1,4 +1,4 @@
-"""Encode Gaussians as packed rows of bytes, the exact representation in stores and spools."""
+"""Encode Gaussians as packed rows of bytes, the exact representation in spools and of refined maps."""
 
 from __future__ import annotations
 

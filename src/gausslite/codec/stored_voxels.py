@@ -41,6 +41,7 @@ for `active`, seven for the target plus one."""
 _SIZE = struct.Struct("<d")
 _OPACITY_BITS, _TARGET_BITS = 6, 7
 _MAX_TARGET = (1 << _TARGET_BITS) - 2
+# a valid element of CODES, in place of a Gaussian that has none
 _ANY_CODE = ((0, 0, 0), (0, 0, 0), (128, 128, 128), 0, (0, 0, 0), 0, 0)
 
 
@@ -87,6 +88,7 @@ def is_stored(row: bytes, count: int) -> bool:
 def _of_one_kind(
     keys: Int64[ndarray, " v"], counts: UInt32[ndarray, " v"], rows: Sequence[bytes], size: bytes = b""
 ) -> Gaussians:
+    """Decode rows that all begin with this voxel size, or that are exact if it is empty."""
     if not size:
         return from_bytes(b"".join(rows))
     codes = np.frombuffer(b"".join(row[_SIZE.size :] for row in rows), CODES)

@@ -16,7 +16,7 @@ from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of, voxel_records
+from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
 from gausslite.fusion.store import (
     AgentTotals,
     PutOutcome,
@@ -174,13 +174,10 @@ class MemoryStore:
 
     def _put(self, subset: RoiSubset) -> PutOutcome:
         batch = subset.batch
-        accepted = newer_voxels(self._index, subset, self._records_of)
+        accepted = newer_voxels(self._index, subset, self.batch)
         keys = batch.keys[accepted]
         if len(keys):
             stored = self._updates.setdefault(subset.agent_id, {})
             stored.update(zip(keys.tolist(), itertools.compress(to_stored(batch, self._grid), accepted), strict=True))
             self._index.put(subset.agent_id, keys, scores_of(subset, accepted))
         return PutOutcome(keys, batch.keys[~accepted])
-
-    def _records_of(self, agent_id: str, key: int) -> bytes:
-        return voxel_records(self.batch(agent_id, np.array([key])))[0]

@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from gausslite.codec.records import RECORD, to_records
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.domain.voxel_operations import select_voxels
 from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
 
 _FIRST_CAPACITY = 64
-ReadRecords = Callable[[str, int], bytes]
-"""Returns the stored records of an agent's voxel."""
+ReadBatch = Callable[[str, Int64[ndarray, " k"]], VoxelBatch]
+"""Returns an agent's stored updates of some voxels."""
 
 
 class ScoreIndex:
@@ -107,7 +108,7 @@ class ScoreIndex:
         return reduce(or_, map(self._holders.get, keys.tolist(), repeat(0)), 0)
 
 
-def newer_voxels(index: ScoreIndex, subset: RoiSubset, read: ReadRecords) -> Bool[ndarray, " v"]:
+def newer_voxels(index: ScoreIndex, subset: RoiSubset, read: ReadBatch) -> Bool[ndarray, " v"]:
     """Return a mask of the message's voxels that replace the stored ones.
 
     The higher sequence number wins; between equal ones the larger (Σkappa, count, records) does, so that the outcome
@@ -121,9 +122,10 @@ def newer_voxels(index: ScoreIndex, subset: RoiSubset, read: ReadRecords) -> Boo
     larger = (sums > stored.kappa_sums) | ((sums == stored.kappa_sums) & (batch.counts > stored.counts))
     newer |= same_seq & larger
     same_totals = same_seq & (sums == stored.kappa_sums) & (batch.counts == stored.counts) & (batch.counts > 0)
-    records = voxel_records(batch) if same_totals.any() else []
-    for i in np.flatnonzero(same_totals).tolist():
-        newer[i] = records[i] > read(subset.agent_id, int(batch.keys[i]))
+    if same_totals.any():
+        received = voxel_records(select_voxels(batch, same_totals))
+        stored_records = voxel_records(read(subset.agent_id, batch.keys[same_totals]))
+        newer[same_totals] = [own > other for own, other in zip(received, stored_records, strict=True)]
     return newer
 
 

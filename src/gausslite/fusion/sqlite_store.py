@@ -22,7 +22,7 @@ from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of, voxel_records
+from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
 from gausslite.fusion.sqlite_file import (
     PAGE_BYTES,
     RESTORE_ADVICE,
@@ -105,7 +105,7 @@ class SqliteStore:
             require_storable(subset)
         encoded = [to_stored(subset.batch, self._grid) for subset in subsets]
         with self._write_lock:
-            masks = [newer_voxels(self._index, subset, self._records_of) for subset in subsets]
+            masks = [newer_voxels(self._index, subset, self.batch) for subset in subsets]
             if any(mask.any() for mask in masks):
                 with self._transaction() as db:
                     for subset, own, mask in zip(subsets, encoded, masks, strict=True):
@@ -269,9 +269,6 @@ class SqliteStore:
                     _, voxels, seqs, sums, counts, _, _ = zip(*own, strict=True)
                     columns = np.array(seqs, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32)
                     self._index.put(agent_id, np.array(voxels, np.int64), StoredScores(*columns))
-
-    def _records_of(self, agent_id: str, voxel: int) -> bytes:
-        return voxel_records(self.batch(agent_id, np.array([voxel])))[0]
 
     def _require_intact(self, row: _UpdateRow) -> None:
         if not is_intact(row):
