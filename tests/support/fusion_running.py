@@ -109,7 +109,7 @@ def fusion_server(
 
 @contextmanager
 def server_process(
-    *arguments: str, log: Path = Path(os.devnull)
+    *arguments: str, log: Path = Path(os.devnull), ready_s: float = 30
 ) -> Iterator[tuple[subprocess.Popen[bytes], FusionClient]]:
     """Start a server in another process and wait until it is ready; it is killed at the end."""
     with tempfile.TemporaryDirectory() as folder, log.open("wb") as stderr:
@@ -118,7 +118,7 @@ def server_process(
         try:
             options = [("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 200)]
             with grpc.insecure_channel(address, options) as channel:
-                grpc.channel_ready_future(channel).result(30)
+                grpc.channel_ready_future(channel).result(ready_s)
             with FusionClient(address, deadline_s=20.0) as client:
                 yield process, client
         finally:

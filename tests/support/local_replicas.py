@@ -50,6 +50,11 @@ class LocalHosts:
         """Start a directory on the folder, and return a store of it."""
         self.directory = ShardDirectory(self.folder, shards, self)
         self.directory.check()
+        return self.share_store(shards)
+
+    def share_store(self, shards: int) -> ShardedStore:
+        """Return the store of another server on the same replicas."""
+        assert self.directory is not None
         return ShardedStore([RemoteStore(shard, self.directory, self.call) for shard in range(shards)])
 
     def close(self) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from gausslite.domain.errors import InvalidInputError, RevisionGoneError
 from gausslite.domain.voxel_operations import crop_to_box
 from gausslite.domain.voxels import TILE_VOXELS, AxisAlignedBox, VoxelGrid
-from gausslite.fusion.fused_map import FusedMapLayers, MapLayer, WonVoxels
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fused_map import MapLayer, WonVoxels
 from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite_fusion_server.encoded_blocks import EncodedPart, EncodedPartCache, encode_parts
 
@@ -31,8 +32,8 @@ class WatchedPart:
 class ChangeBlocks:
     """Encodes blocks for all watchers of a map. Thread-safe; each iterator belongs to one watcher."""
 
-    def __init__(self, maps: FusedMapLayers, grid: VoxelGrid) -> None:
-        self._maps, self._grid = maps, grid
+    def __init__(self, engine: FusionEngine) -> None:
+        self._engine, self._grid = engine, engine.grid
         self._cache = EncodedPartCache()
 
     def blocks(self, watched: WatchedPart, since_revision: int) -> Iterator[MapBlock]:
@@ -45,7 +46,7 @@ class ChangeBlocks:
         snapshot = since_revision == 0
         revision = since_revision
         if snapshot:
-            revision, tiles = self._maps.tiles(watched.layer)
+            revision, tiles = self._engine.maps.tiles(watched.layer)
             for tile in self._in_region(tiles, watched.region).tolist():
                 for part in self._tile(watched, tile):
                     if waiting is not None:
@@ -68,9 +69,9 @@ class ChangeBlocks:
 
     def _changes(self, watched: WatchedPart, since_revision: int) -> tuple[int, tuple[EncodedPart, ...]]:
         """Return the current revision and what changed since."""
-        if self._maps.revision(watched.layer) == since_revision:
+        if self._engine.maps.revision(watched.layer) == since_revision:
             return since_revision, ()
-        changes = self._maps.changes(since_revision, watched.layer)
+        changes = self._engine.maps.changes(since_revision, watched.layer)
 
         def encode() -> tuple[EncodedPart, ...]:
             won = self._select(watched, changes.won)
@@ -86,10 +87,10 @@ class ChangeBlocks:
         if watched.region is not None and _contains(watched.region, tile, self._grid):
             watched = WatchedPart(watched.layer, None, watched.exclude_agent)
         # read before the tile: a change in between makes the kept tile newer than its revision, never older
-        revision = self._maps.tile_revision(watched.layer, tile)
+        revision = self._engine.maps.tile_revision(watched.layer, tile)
 
         def encode() -> tuple[EncodedPart, ...]:
-            won = self._select(watched, self._maps.tile(watched.layer, tile))
+            won = self._select(watched, self._engine.maps.tile(watched.layer, tile))
             return encode_parts(won, np.zeros(0, np.int64), self._grid)
 
         return self._cache.get((watched, tile, revision), encode)

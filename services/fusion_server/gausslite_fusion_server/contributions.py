@@ -17,7 +17,7 @@ from gausslite.domain.errors import (
 )
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframes import EncodedKeyframe
-from gausslite.fusion.store import PutOutcome
+from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.caller import Caller

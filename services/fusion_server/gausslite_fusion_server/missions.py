@@ -16,6 +16,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.sqlite_file import remove_store
 from gausslite.fusion.store import FusionStore
 from gausslite_fusion_server.servicer import FusionServicer
+from gausslite_fusion_server.store_follower import ServerLeadership, follow_store
 
 _log = logging.getLogger(__name__)
 _SUFFIX = ".sqlite"
@@ -23,12 +24,23 @@ _SUFFIX = ".sqlite"
 
 @dataclass(frozen=True, slots=True)
 class Mission:
-    """One fused map and what serves it. file: its own file, which ends with it if it is unused."""
+    """One fused map and what serves it. file: its own file, which ends with it if it is unused.
+
+    leadership: for a store that several servers share.
+    """
 
     store: FusionStore
     engine: FusionEngine
     servicer: FusionServicer
     file: Path | None = None
+    leadership: ServerLeadership | None = None
+
+    async def follow_others(self) -> None:
+        """Apply what other servers write to the store, until the task is cancelled."""
+        if self.leadership is None:
+            await asyncio.Event().wait()
+        else:
+            await follow_store(self.engine, self.leadership, self.servicer.publish_changes)
 
     def close(self) -> None:
         """End the work in threads, save the counters, and close the store."""

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.joint_refinement import rasterizer_of_backend
+from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
@@ -26,6 +30,10 @@ from gausslite_fusion_server.missions import Mission, Missions, mission_file, st
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import MAINTENANCE_COMMANDS, PROGRAM, ServerSettings, parse_arguments
+from gausslite_fusion_server.store_follower import ServerLeadership
+
+if TYPE_CHECKING:
+    from gausslite.cluster.ray_store import RayStore
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -51,25 +59,49 @@ def _open_missions(settings: ServerSettings) -> Missions:
 
     def open_mission(mission_id: str) -> Mission:
         fusion = replace(settings.fusion, mission_id=mission_id) if mission_id else settings.fusion
-        store = _open_store(settings, mission_id)
-        try:
-            engine = FusionEngine(store, fusion, decode_keyframe=decode_frame)
-        except BaseException:
-            store.close()
-            raise
-        refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
-        return Mission(store, engine, FusionServicer(engine, refinement), _file_of(settings, mission_id))
+        if settings.store is not None and settings.shards is not None:
+            ray_store = _open_ray_store(settings.store, settings.shards, settings)
+            return _open_mission(settings, fusion, ray_store, leadership=ray_store)
+        store, file = _open_store(settings, mission_id), _file_of(settings, mission_id)
+        return _open_mission(settings, fusion, store, file)
 
     has_folder = settings.max_missions > 1 and settings.store is not None
     stored = stored_missions(settings.store) if has_folder and settings.store is not None else ()
     return Missions(open_mission, settings.max_missions, stored)
 
 
+def _open_mission(
+    settings: ServerSettings,
+    fusion: FusionSettings,
+    store: FusionStore,
+    file: Path | None = None,
+    leadership: ServerLeadership | None = None,
+) -> Mission:
+    try:
+        if leadership is None:
+            engine = FusionEngine(store, fusion, decode_keyframe=decode_frame)
+        else:
+            leadership.renew()
+            engine = FusionEngine(store, fusion, _revision_of_one_server(), decode_frame, leadership.leads)
+    except BaseException:
+        store.close()
+        raise
+    refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
+    return Mission(store, engine, FusionServicer(engine, refinement), file, leadership)
+
+
+def _revision_of_one_server() -> int:
+    """Return a first revision so that the revisions of servers that share a store differ.
+
+    A watcher that changes the server then gets a snapshot, and not changes since another server's revision. A server
+    would need 4096 revisions in each microsecond to reach those of one that started later.
+    """
+    return (time.time_ns() // 1000 << 12) + secrets.randbelow(1 << 12)
+
+
 def _open_store(settings: ServerSettings, mission_id: str) -> FusionStore:
     if settings.store is None:
         return MemoryStore()
-    if settings.shards is not None:
-        return _open_ray_store(settings.store, settings.shards, settings)
     return SqliteStore(_file_of(settings, mission_id) or settings.store, settings.store_max_bytes)
 
 
@@ -78,7 +110,7 @@ def _file_of(settings: ServerSettings, mission_id: str) -> Path | None:
     return mission_file(settings.store, mission_id) if mission_id and settings.store is not None else None
 
 
-def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> FusionStore:
+def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> RayStore:
     try:
         # Ray is large, and an extra
         from gausslite.cluster.ray_store import RaySettings, RayStore
@@ -93,9 +125,10 @@ async def _serve(settings: ServerSettings) -> None:
     missions = _open_missions(settings)
     service = missions.only.servicer.service() if settings.max_missions == 1 else MissionRouter(missions).service()
 
-    async def drain_when_stopping() -> None:
+    async def work_until_stopped() -> None:
         try:
-            await asyncio.Event().wait()
+            # a store that servers share holds one mission
+            await (missions.only.follow_others() if settings.max_missions == 1 else asyncio.Event().wait())
         finally:
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
             missions.drain()
@@ -104,7 +137,7 @@ async def _serve(settings: ServerSettings) -> None:
         page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
         with tracing(settings.traces, PROGRAM), metrics_server(settings.metrics, missions.engines), page:
             await serve_until_stopped(
-                settings.listen, [service], drain_when_stopping, settings.tls, settings.limits, settings.health
+                settings.listen, [service], work_until_stopped, settings.tls, settings.limits, settings.health
             )
     finally:
         missions.close()

@@ -81,7 +81,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._decoder = ThreadPoolExecutor(1, "decode")
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
-        self._change_blocks = ChangeBlocks(engine.maps, engine.grid)
+        self._change_blocks = ChangeBlocks(engine)
         # one thread: an estimate of frames or a rendering must not delay the acknowledgements
         self._background = ThreadPoolExecutor(1, "background")
         self._aligning = False
@@ -104,6 +104,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """End every open stream and every later call with UNAVAILABLE."""
         self._gate.close()
         self._map_changes.notify()
+
+    def publish_changes(self) -> None:
+        """Send watchers what other servers have changed, and look which frames are due. Use it on the event loop."""
+        self._map_changes.notify()
+        self._align_in_background()
 
     def close(self) -> None:
         """Wait until the work in threads has ended."""
@@ -171,8 +176,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 span.set(agent=queued.agent_id, bytes=len(request.subset), voxels=outcome.accepted_voxels)
             if outcome.status == pb.SUBSET_STATUS_REJECTED:
                 self._rejections.record(caller.key, outcome.reason, outcome.message)
-            self._map_changes.notify()
-            self._align_in_background()
+            self.publish_changes()
             acknowledged = max(acknowledged, request.sequence)
             yield pb.ContributeSubsetsResponse(acknowledged=acknowledged, outcomes=[outcome])
 

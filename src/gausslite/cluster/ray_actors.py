@@ -19,6 +19,7 @@ import ray
 from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from gausslite.cluster.leadership import Leadership
 from gausslite.cluster.replica import ShardReplica
 from gausslite.cluster.shard_directory import Primary, ShardDirectory, ShardState
 from gausslite.cluster.store_calls import LogEntry, LogPosition, StoreCall, StoreReply
@@ -89,6 +90,10 @@ class DirectoryProxy:
         states: tuple[ShardState, ...] = _result(self.actor.states.remote(), _CALL_LIMIT_S)
         return states
 
+    def lead(self, server_id: str) -> bool:
+        """Return whether this server leads, see Leadership.ask. Raises UnavailableError."""
+        return bool(_result(self.actor.lead.remote(server_id), _CALL_LIMIT_S))
+
     def close(self) -> None:
         """Wait until no standby is being started."""
         with contextlib.suppress(GaussLiteError):
@@ -137,6 +142,7 @@ class _DirectoryActor:
 
     def __init__(self, folder: Path, shards: int, max_bytes: int | None) -> None:
         self._directory = ShardDirectory(folder, shards, _RayHosts(max_bytes))
+        self._leadership = Leadership()
         self._closing = threading.Event()
         threading.Thread(target=self._check_regularly, name="check", daemon=True).start()
 
@@ -154,6 +160,9 @@ class _DirectoryActor:
 
     def states(self) -> tuple[ShardState, ...]:
         return self._directory.states()
+
+    def lead(self, server_id: str) -> bool:
+        return self._leadership.ask(server_id)
 
     def close(self) -> None:
         self._closing.set()

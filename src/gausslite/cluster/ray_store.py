@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import secrets
+import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from gausslite.cluster.leadership import LEADERSHIP_S
 from gausslite.cluster.ray_actors import call_replica, connect, disconnect, open_directory
 from gausslite.cluster.remote_store import RemoteStore
 from gausslite.cluster.shard_directory import ShardState, read_states
@@ -32,7 +36,7 @@ class RaySettings:
 class RayStore(ShardedStore):
     """A sharded store whose shards are actors. A local Ray ends with it; actors in a cluster go on.
 
-    One process at a time can use a folder.
+    Any number of servers can use a folder in one cluster. A local Ray belongs to one server.
     """
 
     def __init__(self, settings: RaySettings) -> None:
@@ -46,12 +50,22 @@ class RayStore(ShardedStore):
         except OSError as error:
             raise StorageError(f"store {self._folder}: cannot be made ({error.strerror})") from error
         read_states(self._folder, settings.shards)
-        self._lock_of_server = StoreLock(self._folder / "server")
-        try:
+        self._server_id, self._leads_until_s = secrets.token_hex(16), -float("inf")
+        with ExitStack() as opened:
+            if self._is_local:
+                opened.callback(StoreLock(self._folder / "server").release)
             self._open(settings)
-        except BaseException:
-            self._lock_of_server.release()
-            raise
+            self._opened = opened.pop_all()
+
+    def leads(self) -> bool:
+        """Return whether this server has the leadership."""
+        return time.monotonic() < self._leads_until_s
+
+    def renew(self) -> None:
+        """Ask for the leadership, or for more time of it. Raises UnavailableError."""
+        asked_s = time.monotonic()
+        if self._directory.lead(self._server_id):
+            self._leads_until_s = asked_s + LEADERSHIP_S
 
     def positions(self) -> tuple[LogPosition, ...]:
         """Return the position of each shard after its latest acknowledged call."""
@@ -67,7 +81,7 @@ class RayStore(ShardedStore):
         if self._is_local:
             self._directory.close()
         disconnect()
-        self._lock_of_server.release()
+        self._opened.close()
 
     def _open(self, settings: RaySettings) -> None:
         # the actors of two stores in one cluster have the same names

@@ -8,7 +8,9 @@ from pathlib import Path
 from threading import RLock
 from typing import Any, Protocol, runtime_checkable
 
-from gausslite.cluster.store_calls import READS, WRITES, LogEntry, LogPosition, StoreCall, StoreReply
+from gausslite.cluster.journal import Journal, JournalEntry, changes_of
+from gausslite.cluster.session_fence import SessionFence
+from gausslite.cluster.store_calls import JOURNAL, READS, WRITES, LogEntry, LogPosition, StoreCall, StoreReply
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_maintenance import back_up
@@ -40,13 +42,16 @@ class ShardReplica:
 
     A write is durable here, then durable in the standby, then acknowledged. So either file has every acknowledged
     write. A standby refuses entries of an earlier epoch, and a primary without its standby must ask before it goes on:
-    a primary that has been replaced can acknowledge nothing.
+    a primary that has been replaced can acknowledge nothing. The journal has what both files have, so no server follows
+    a write that a failover takes back.
     """
 
     def __init__(self, path: Path, max_bytes: int | None = None) -> None:
         """Open the file. Raises StorageError."""
         self._path = path
         self._store = SqliteStore(path, max_bytes)
+        self._journal = Journal(self._store.log_position)
+        self._fence = SessionFence(self._store.sessions())
         self._lock = RLock()
         self._epoch = 0
         self._is_primary = False
@@ -84,19 +89,27 @@ class ShardReplica:
                 raise InvalidInputError(
                     f"shard {self._path.name}: expected the entry after {self._position()}, got {entry.position}"
                 )
-            self._run(entry.call)
+            self._record(entry.call, self._write(entry.call))
 
     def call(self, epoch: int, call: StoreCall) -> StoreReply:
-        """Run a call as the primary of this epoch. Raises EpochError, and what the store raises."""
+        """Run a call as the primary of this epoch.
+
+        Raises EpochError, JournalGapError, SessionUnknownError for data of a session that has ended, and the errors of
+        the store.
+        """
         if call.method in READS:
             self._require_primary(epoch)
             return StoreReply(self._run(call), LogPosition(epoch, self._store.log_position))
         with self._lock:
             self._require_primary(epoch)
+            if call.method == JOURNAL:
+                return StoreReply(self._journal.after(*call.arguments), self._position())
+            self._fence.require_open(call)
             before = self._position()
-            result = self._run(call)
+            result = self._write(call)
             if self._position() != before:
                 self._ship(LogEntry(before, call))
+                self._record(call, result)
             return StoreReply(result, self._position())
 
     def leads(self, epoch: int) -> bool:
@@ -135,6 +148,14 @@ class ShardReplica:
         """Close the file."""
         with self._lock:
             self._store.close()
+
+    def _write(self, call: StoreCall) -> Any:
+        result = self._run(call)
+        self._fence.record(call)
+        return result
+
+    def _record(self, call: StoreCall, result: Any) -> None:
+        self._journal.record(JournalEntry(self._store.log_position, call.origin, changes_of(call, result)))
 
     def _run(self, call: StoreCall) -> Any:
         if call.method not in READS and call.method not in WRITES:

@@ -22,26 +22,30 @@ from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
-from gausslite.fusion.store import (
-    AgentTotals,
-    FusionStore,
-    PutOutcome,
-    SessionRecord,
-    StoredScores,
-    VoxelScoreTable,
-    require_storable,
+from gausslite.fusion.score_index import ScoreIndex, compare_scores, newer_voxels, scores_of, select_scores
+from gausslite.fusion.store import FusionStore, require_storable
+from gausslite.fusion.store_changes import (
+    AgentRemoved,
+    ContentReplaced,
+    MissionConfigSet,
+    SessionEnded,
+    SessionSaved,
+    StoreChange,
+    UpdatesStored,
 )
+from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
 
 _Result = TypeVar("_Result")
 
 
 class ShardedStore:
-    """A FusionStore over shards, with the same content and outcomes as one store. The only writer of its shards.
+    """A FusionStore over shards, with the same content and outcomes as one store.
 
-    The totals of all updates are here too (ScoreIndex), so only Gaussians are read from the shards. The first shard has
-    sessions and records. If a shard fails, `put_all` raises and counts nothing as stored, although
-    other shards may have their parts. Sending the messages again gives the same outcome as a first attempt.
+    The totals of all updates are here too (ScoreIndex), so only Gaussians are read from the shards. Other servers may
+    write to the same shards; `take_changes` counts their updates. The first shard has the records, every shard has the
+    sessions (see SessionFence). If a shard fails, `put_all` raises and counts nothing as stored, although other shards
+    may have their parts. Sending the messages again gives the same outcome as a first attempt, or reports as stale what
+    `take_changes` has counted in between.
     """
 
     def __init__(self, shards: Sequence[FusionStore]) -> None:
@@ -50,8 +54,8 @@ class ShardedStore:
         self._lock, self._index_lock = RLock(), RLock()
         self._threads = ThreadPoolExecutor(len(self._shards), "shard")
         self._index = ScoreIndex()
-        for table in self._each(lambda shard: shard.scores()):
-            _add_all(self._index, table)
+        self._is_outdated = False
+        self._read_totals()
 
     @property
     def incarnation_id(self) -> str:
@@ -152,11 +156,11 @@ class ShardedStore:
 
     def save_session(self, session: SessionRecord) -> None:
         """Store a session; it replaces any other session of the same agent."""
-        self._shards[0].save_session(session)
+        self._each(lambda shard: shard.save_session(session))
 
     def end_session(self, session_id: str) -> None:
         """Delete a session, if it exists. The agent's updates stay."""
-        self._shards[0].end_session(session_id)
+        self._each(lambda shard: shard.end_session(session_id))
 
     def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
         """Store an encoded keyframe; it replaces the agent's one of this frame index."""
@@ -189,11 +193,59 @@ class ShardedStore:
         """Return the record of this name of every agent that has one."""
         return self._shards[0].records(name)
 
+    def fetch_changes(self) -> bool:
+        """Fetch what other servers have written; returns whether there is anything to take. Raises StorageError."""
+        return any(self._each(lambda shard: shard.fetch_changes()))
+
+    def take_changes(self) -> list[StoreChange]:
+        """Count the fetched updates in the totals; returns all changes but the updates that were counted already."""
+        taken: list[StoreChange] = []
+        for number, shard in enumerate(self._shards):
+            for change in shard.take_changes():
+                match change:
+                    case ContentReplaced():
+                        self._is_outdated = True
+                    case UpdatesStored():
+                        taken += self._count(change)
+                    case AgentRemoved(agent_id, keys):
+                        with self._index_lock:
+                            self._index.remove_voxels(agent_id, keys)
+                        taken.append(replace(change, has_records=number == 0))
+                    case SessionSaved() | SessionEnded() | MissionConfigSet() if number > 0:
+                        # the first shard has reported it
+                        continue
+                    case _:
+                        taken.append(change)
+        if not self._is_outdated:
+            return taken
+        self._read_totals()
+        self._is_outdated = False
+        return [ContentReplaced()]
+
     def close(self) -> None:
         """Close the shards."""
         self._threads.shutdown(wait=True)
         for shard in self._shards:
             shard.close()
+
+    def _read_totals(self) -> None:
+        index = ScoreIndex()
+        for table in self._each(lambda shard: shard.scores()):
+            _add_all(index, table)
+        with self._index_lock:
+            self._index = index
+
+    def _count(self, change: UpdatesStored) -> list[StoreChange]:
+        """Add the updates that are newer than the known ones to the index; returns those that may have changed."""
+        with self._index_lock:
+            known = self._index.stored(change.agent_id, change.keys)
+            newer, same = compare_scores(change.scores, known)
+            self._index.put(change.agent_id, change.keys[newer], select_scores(change.scores, newer))
+        # between equal totals the shard keeps the larger content, which the index does not know
+        changed = newer if change.is_own else newer | same
+        if not changed.any():
+            return []
+        return [UpdatesStored(change.agent_id, change.keys[changed], select_scores(change.scores, changed))]
 
     def _read_agent(self, agent_id: str) -> None:
         """Replace the agent's totals by those of the shards, as far as these answer."""

@@ -34,14 +34,17 @@ READS = frozenset(
         "records",
     }
 )
+JOURNAL = "journal_after"
+"""Returns the JournalEntries after a number of transactions; a call of a replica, not of its store."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoreCall:
-    """A method of FusionStore and its arguments, in their order."""
+    """A method of FusionStore and its arguments, in their order. origin: the server that calls."""
 
     method: str
     arguments: tuple[Any, ...] = ()
+    origin: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from gausslite.domain.errors import InvalidInputError, NotPermittedError
 from gausslite.domain.names import quote_name
 from gausslite.fusion.store import FusionStore
 
-_RECORD = "ban"
+RECORD = "ban"
 _BANNED, _ALLOWED = b"banned", b""
 
 
@@ -15,7 +15,7 @@ class BanList:
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
-        self._agents = {agent_id for agent_id, data in store.records(_RECORD).items() if data == _BANNED}
+        self._agents = {agent_id for agent_id, data in store.records(RECORD).items() if data == _BANNED}
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -29,13 +29,20 @@ class BanList:
 
     def add(self, agent_id: str) -> None:
         """Ban an agent. Call it after the agent's other records were deleted. Raises StorageError."""
-        self._store.save_record(agent_id, _RECORD, _BANNED)
+        self._store.save_record(agent_id, RECORD, _BANNED)
         self._agents.add(agent_id)
+
+    def follow(self, agent_id: str, data: bytes) -> None:
+        """Apply a record that another server has saved."""
+        if data == _BANNED:
+            self._agents.add(agent_id)
+        else:
+            self._agents.discard(agent_id)
 
     def remove(self, agent_id: str) -> None:
         """Allow a banned agent again. Raises InvalidInputError if it is not banned, StorageError."""
         if agent_id not in self._agents:
             expected = ", ".join(self.agents[:8]) or "none is banned"
             raise InvalidInputError(f"agent_id: expected a banned agent ({expected}), got {quote_name(agent_id)}")
-        self._store.save_record(agent_id, _RECORD, _ALLOWED)
+        self._store.save_record(agent_id, RECORD, _ALLOWED)
         self._agents.remove(agent_id)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future
 from threading import RLock
 from typing import NamedTuple
@@ -20,32 +20,33 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.agent_data import AgentData
-from gausslite.fusion.frame_aligner import FrameAligner
-from gausslite.fusion.frame_alignment import FrameAlignments
-from gausslite.fusion.free_space import FreeSpaceRecords
-from gausslite.fusion.fused_map import FusedMapLayers
+from gausslite.fusion.change_follower import ChangeFollower
+from gausslite.fusion.engine_parts import EngineParts
+from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.keyframes import (
     AgentKeyframe,
     EncodedKeyframe,
     FrameDecoder,
-    KeyframePool,
     in_fused_frame,
     no_decoder,
 )
 from gausslite.fusion.limits import FusionSettings, VoteRule
-from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.refined_map import load_refinement, save_refinement
+from gausslite.fusion.mission_status import mission_status
+from gausslite.fusion.refined_map import save_refinement
 from gausslite.fusion.storage_probe import StorageProbe
-from gausslite.fusion.store import FusionStore, PutOutcome, SessionRecord, require_storable
-from gausslite.fusion.team_objects import TeamObjects, find_objects
-from gausslite.fusion.traffic import AgentContribution, MissionStatus, TrafficCounters, TrafficLog
-from gausslite.fusion.update_checks import UpdateChecks
+from gausslite.fusion.store import FusionStore, require_storable
+from gausslite.fusion.store_changes import ContentReplaced
+from gausslite.fusion.store_values import PutOutcome, SessionRecord
+from gausslite.fusion.team_objects import find_objects
+from gausslite.fusion.traffic import MissionStatus, TrafficCounters
 from gausslite.fusion.update_committer import UpdateCommitter
 from gausslite.fusion.update_queue import PendingUpdate
 from gausslite.fusion.usage import require_within_quotas
-from gausslite.fusion.vote_input import VoteInput
+
+
+def _always() -> bool:
+    return True
 
 
 class JoinResult(NamedTuple):
@@ -63,9 +64,11 @@ class JoinResult(NamedTuple):
 class FusionEngine:
     """Owns the store, the sessions, the keyframes and the refined map of one mission. Thread-safe.
 
-    Updates, sessions, keyframes, objects, counters and the refined map persist with the store.
-    decode_keyframe reads keyframes as they were received; only a refinement needs it. first_revision must exceed the
-    revisions from before a restart; by default it is the time in microseconds.
+    Updates, sessions, keyframes, objects, counters and the refined map persist with the store. Several servers may
+    share a store; `follow` applies what the others have written.
+    first_revision must exceed the revisions from before a restart; by default it is the time in microseconds.
+    decode_keyframe reads keyframes as they were received; only a refinement needs it. leads: whether this server, of
+    those that share the store, estimates the agents' frames.
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
@@ -75,30 +78,16 @@ class FusionEngine:
         settings: FusionSettings,
         first_revision: int | None = None,
         decode_keyframe: FrameDecoder = no_decoder,
+        leads: Callable[[], bool] = _always,
     ) -> None:
         self._lock = RLock()
         self._store = store
         self._settings = settings
-        self._members = Membership(store, settings)
         self._storage = StorageProbe(store)
-        first_revision = time.time_ns() // 1000 if first_revision is None else first_revision
-        quotas = settings.quotas
-        self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
-        self._objects = TeamObjects(store)
-        self._checks = UpdateChecks(store, quotas)
-        self._traffic = TrafficLog(store)
-        self._alignments = FrameAlignments(store)
-        self._free_space = FreeSpaceRecords(store, settings.grid)
-        uses_free_space = settings.vote is VoteRule.FREE_SPACE
-        free_space = self._free_space if uses_free_space else None
-        self._votes = VoteInput(store, self._alignments, settings.grid, free_space)
-        self._aligner = FrameAligner(
-            store, self._alignments, self._votes, self._free_space, self._lock, settings.alignment
-        )
-        refined, max_removed = load_refinement(store), settings.max_removed_voxels
-        self._maps = FusedMapLayers(self._votes, self._lock, settings.grid, first_revision, max_removed, refined)
-        parts = self._aligner, self._free_space, self._checks, self._traffic, self._keyframes, self._objects
-        self._data = AgentData(store, self._votes, self._maps, self._alignments, parts)
+        if first_revision is None:
+            first_revision = time.time_ns() // 1000
+        self._decode_keyframe, self._leads = decode_keyframe, leads
+        self._parts, self._follower = self._open_parts(first_revision)
         self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_update)
 
     @property
@@ -115,13 +104,13 @@ class FusionEngine:
     def mission_config(self) -> MissionConfig:
         """The mission's configuration, with default names in place of empty ones."""
         with self._lock:
-            return self._members.mission_config
+            return self._parts.members.mission_config
 
     @property
     def is_unused(self) -> bool:
         """Whether no agent has a lease, none has data, and none is banned."""
         with self._lock:
-            return self._members.is_unused
+            return self._parts.members.is_unused
 
     @property
     def incarnation_id(self) -> str:
@@ -144,12 +133,12 @@ class FusionEngine:
     @property
     def revision(self) -> int:
         """The revision of the vote; it increases with every change."""
-        return self._maps.revision()
+        return self._parts.maps.revision()
 
     @property
     def maps(self) -> FusedMapLayers:
         """The layers of the fused map."""
-        return self._maps
+        return self._parts.maps
 
     def require_mission(self, mission_id: str) -> None:
         """Raise MismatchError unless the id is this mission's, or empty."""
@@ -164,22 +153,26 @@ class FusionEngine:
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
         with self._committer.committing, self._lock:
-            self._members.admit(agent_id, requested, token)
+            self._apply_new_changes()
+            self._parts.members.admit(agent_id, requested, token)
+            session = self._parts.members.open_session(agent_id, token)
+            # from now on, no server stores anything of an earlier session
+            self._apply_new_changes()
             if fresh_map:
-                self._data.begin_new_map(agent_id)
-            session = self._members.open_session(agent_id, token)
-            self._checks.record_join(agent_id)
+                self._parts.data.begin_new_map(agent_id)
+                self._parts.members.save_token(agent_id, token)
+            self._parts.checks.record_join(agent_id)
             return JoinResult(
                 session,
                 self.highest_update_seq(agent_id),
-                self._maps.revision(),
-                self._keyframes.indices(agent_id),
+                self._parts.maps.revision(),
+                self._parts.keyframes.indices(agent_id),
             )
 
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
         with self._lock:
-            return self._members.session(session_id)
+            return self._parts.members.session(session_id)
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Store an agent's voxel updates; they are durable on return, if the store is.
@@ -216,18 +209,34 @@ class FusionEngine:
         It takes up to seconds, mostly without the lock. Call it from one thread at a time. Raises StorageError.
         """
         changed = False
-        for agent_id in self._aligner.due():
-            keys = self._aligner.estimate(agent_id)
+        for agent_id in self._parts.aligner.due() if self._leads() else ():
+            keys = self._parts.aligner.estimate(agent_id)
             with self._lock:
-                self._maps.record(agent_id, keys)
-                changed |= self._data.drop_contradicted(agent_id) or len(keys) > 0
+                self._parts.maps.record(agent_id, keys)
+                changed |= self._parts.data.drop_contradicted(agent_id) or len(keys) > 0
         return changed
+
+    def follow(self) -> bool:
+        """Apply what other servers have written to the store; returns whether there was anything.
+
+        It may wait for other machines, without a lock. Raises StorageError.
+        """
+        if not self._store.fetch_changes() and not self._follower.has_deferred:
+            return False
+        with self._committer.committing, self._lock:
+            self._apply_changes()
+        return True
+
+    def save_leases(self) -> None:
+        """Tell the other servers of the store which agents are alive. Raises StorageError."""
+        with self._lock:
+            self._parts.members.save_leases()
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
         """Set the motion from the agent's frame to the fused map's that the agent declares. Raises StorageError."""
         with self._lock:
-            self._alignments.declare(agent_id, T_fused_agent)
-            self._maps.record(agent_id, self._votes.refresh(agent_id))
+            self._parts.alignments.declare(agent_id, T_fused_agent)
+            self._parts.maps.record(agent_id, self._parts.votes.refresh(agent_id))
 
     def contribute_free_space(self, session_id: str, blocks: FreeSpace, grid: VoxelGrid) -> int:
         """Replace what an agent observed as free in these blocks; returns its number of free voxels.
@@ -235,20 +244,20 @@ class FusionEngine:
         Raises SessionUnknownError, MismatchError (another grid), QuotaError, StorageError.
         """
         with self._lock:
-            agent_id = self._members.session(session_id).agent_id
+            agent_id = self._parts.members.session(session_id).agent_id
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
-            keys = self._free_space.contribute(agent_id, blocks)
-            self._aligner.record_free_space(agent_id)
+            keys = self._parts.free_space.contribute(agent_id, blocks)
+            self._parts.aligner.record_free_space(agent_id)
             if self._settings.vote is VoteRule.FREE_SPACE:
-                for name in self._votes.agents():
-                    self._maps.record(name, keys)
-            return self._free_space.free_voxels(agent_id)
+                for name in self._parts.votes.agents():
+                    self._parts.maps.record(name, keys)
+            return self._parts.free_space.free_voxels(agent_id)
 
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         with self._lock:
-            self._traffic.record(agent_id, traffic)
+            self._parts.traffic.record(agent_id, traffic)
 
     def add_keyframe(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store a keyframe for the refinement; the agent's others that are not `selected` are deleted.
@@ -256,27 +265,27 @@ class FusionEngine:
         An empty `selected` deletes none. Raises QuotaError, StorageError.
         """
         with self._lock:
-            self._keyframes.add(keyframe, selected)
+            self._parts.keyframes.add(keyframe, selected)
 
     def encoded_keyframe(self, agent_id: str, index: int | None = None) -> tuple[bytes, tuple[int, ...]]:
         """Return a keyframe of the agent (see KeyframePool.find) and the indices of all. Raises InvalidInputError."""
         with self._lock:
-            return self._keyframes.find(agent_id, index), self._keyframes.indices(agent_id)
+            return self._parts.keyframes.find(agent_id, index), self._parts.keyframes.indices(agent_id)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""
         with self._lock:
-            self._objects.report(self._members.session(session_id).agent_id, report)
+            self._parts.objects.report(self._parts.members.session(session_id).agent_id, report)
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
         with self._lock:
-            return self._objects.of_task(agent_id, graph)
+            return self._parts.objects.of_task(agent_id, graph)
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
         with self._lock:
-            reports, frames = self._objects.reports(), self._alignments.transforms()
+            reports, frames = self._parts.objects.reports(), self._parts.alignments.transforms()
         return find_objects(reports, frames, noun)
 
     def evict(self, agent_id: str, ban: bool = False) -> int:
@@ -286,45 +295,47 @@ class FusionEngine:
         only that. Raises InvalidInputError for an unknown agent that is not banned, StorageError.
         """
         with self._committer.committing, self._lock:
+            self._apply_new_changes()
             voxels = self._store.totals(agent_id).voxels
-            self._members.require_evictable(agent_id, ban)
-            self._members.end_agent(agent_id)
-            self._data.remove(agent_id)
+            self._parts.members.require_evictable(agent_id, ban)
+            self._parts.members.end_agent(agent_id)
+            self._parts.data.remove(agent_id)
             if ban:
-                self._members.ban(agent_id)
+                self._parts.members.ban(agent_id)
             return voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
-        with self._lock:
-            self._members.unban(agent_id)
+        with self._committer.committing, self._lock:
+            self._apply_new_changes()
+            self._parts.members.unban(agent_id)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._committer.committing, self._lock:
-            agent_id = self._members.session(session_id).agent_id
+            agent_id = self._parts.members.session(session_id).agent_id
             if forget:
-                self._data.remove(agent_id)
-            self._members.end_session(session_id)
-            return self._maps.revision()
+                self._parts.data.remove(agent_id)
+            self._parts.members.end_session(session_id)
+            return self._parts.maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
         """Return the fused map, all agents' keyframes, and the map's revision. Raises MismatchError if one is empty."""
         with self._lock:
-            revision = self._maps.revision()
-            encoded, gaussians = self._keyframes.encoded(), self._maps.voted_map().gaussians
+            revision = self._parts.maps.revision()
+            encoded, gaussians = self._parts.keyframes.encoded(), self._parts.maps.voted_map().gaussians
         if not encoded or len(gaussians) == 0:
             raise MismatchError(
                 f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
                 f"{len(encoded)} keyframes; agents send keyframes with --handover"
             )
-        return gaussians, self.in_fused_frame(self._keyframes.decode(encoded)), revision
+        return gaussians, self.in_fused_frame(self._parts.keyframes.decode(encoded)), revision
 
     def store_refined(self, gaussians: Gaussians, revision: int) -> None:
         """Store the result of a refinement of the vote at this revision. Raises RevisionGoneError, StorageError."""
         # no update may be in the store without being in the change log
         with self._committer.committing:
-            stored = self._maps.show_refined(gaussians, revision)
+            stored = self._parts.maps.show_refined(gaussians, revision)
         save_refinement(self._store, stored)
 
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
@@ -333,66 +344,56 @@ class FusionEngine:
         Those of quarantined agents, and those too far from the origin, are left out.
         """
         with self._lock:
-            frames, quarantined = self._alignments.transforms(), self._alignments.quarantined
+            frames, quarantined = self._parts.alignments.transforms(), self._parts.alignments.quarantined
         moved = (in_fused_frame(each, frames) for each in keyframes if each.agent_id not in quarantined)
         return [each for each in moved if each is not None]
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
         with self._lock:
-            fused_voxels, fused_gaussians = self._maps.size()
-            return MissionStatus(
-                self._members.mission_config,
-                self._maps.revision(),
-                fused_gaussians,
-                fused_voxels,
-                len(self._keyframes),
-                self._maps.is_refined,
-                tuple(self._contribution(agent_id) for agent_id in sorted(self._members.sources)),
-                self._members.banned,
-            )
+            return mission_status(self._store, self._parts)
 
     def save_counters(self) -> None:
         """Save the agents' counters, which are otherwise saved every 10 s. Raises StorageError."""
         with self._lock:
-            self._traffic.save()
+            self._parts.traffic.save()
 
     def close(self) -> None:
         """Close the store."""
         with self._lock:
             self._store.close()
 
-    def _contribution(self, agent_id: str) -> AgentContribution:
-        totals = self._store.totals(agent_id)
-        return AgentContribution(
-            agent_id,
-            joined=agent_id in self._members.joined,
-            voxels=totals.occupied_voxels,
-            gaussians=totals.gaussians,
-            kappa_sum=totals.kappa_sum,
-            won_voxels=self._maps.won_voxels(agent_id),
-            last_update_seq=totals.highest_update_seq,
-            keyframes=self._keyframes.count(agent_id),
-            targets=self._objects.targets(agent_id),
-            free_voxels=self._free_space.free_voxels(agent_id),
-            alignment=self._alignments.get(agent_id),
-            traffic=self._traffic.of(agent_id),
-        )
+    def _apply_new_changes(self) -> None:
+        if self._store.fetch_changes():
+            self._apply_changes()
+
+    def _apply_changes(self) -> None:
+        changes = self._store.take_changes()
+        if ContentReplaced() in changes:
+            newest = max(self.maps.revision(layer) for layer in MapLayer)
+            self._parts, self._follower = self._open_parts(newest + 1)
+        else:
+            self._follower.apply(changes)
+
+    def _open_parts(self, first_revision: int) -> tuple[EngineParts, ChangeFollower]:
+        parts = EngineParts.open(self._store, self._settings, self._lock, first_revision, self._decode_keyframe)
+        return parts, ChangeFollower(parts, self._leads)
 
     def _check_update(self, update: PendingUpdate) -> RoiSubset:
         """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
-        self._members.session(update.session_id)
+        self._parts.members.session(update.session_id)
         if update.outcomes:
             return update.subset
-        subset = self._checks.check(update.subset)
+        subset = self._parts.checks.check(update.subset)
         require_storable(subset)
         require_within_quotas(subset, self._store, self._settings.quotas)
         return subset
 
     def _record_update(self, subset: RoiSubset, outcome: PutOutcome) -> None:
         """Update the fused map after a commit."""
-        self._aligner.record(subset.agent_id, outcome.accepted)
+        if self._leads():
+            self._parts.aligner.record(subset.agent_id, outcome.accepted)
         if len(outcome.accepted):
-            self._maps.record(subset.agent_id, self._votes.changed_keys(subset.agent_id, outcome.accepted))
-            self._data.drop_outgrown(subset.agent_id)
-        self._traffic.save_if_due()
+            self._parts.maps.record(subset.agent_id, self._parts.votes.changed_keys(subset.agent_id, outcome.accepted))
+            self._parts.data.drop_outgrown(subset.agent_id)
+        self._parts.traffic.save_if_due()

@@ -20,7 +20,7 @@ from gausslite.domain.pose import require_rigid
 from gausslite.fusion.alignment import FrameFit, Misfit
 from gausslite.fusion.store import FusionStore
 
-_RECORD = "alignment"
+RECORD = "alignment"
 _MAX_SEGMENTS = 200
 
 
@@ -136,7 +136,7 @@ class FrameAlignments:
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
-        self._by_agent = {agent_id: _decode(data) for agent_id, data in store.records(_RECORD).items()}
+        self._by_agent = {agent_id: _decode(data) for agent_id, data in store.records(RECORD).items()}
 
     def get(self, agent_id: str) -> FrameAlignment:
         """Return the agent's alignment."""
@@ -148,8 +148,12 @@ class FrameAlignments:
 
     def put(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Replace the agent's alignment. Raises StorageError."""
-        self._store.save_record(agent_id, _RECORD, _encode(alignment))
+        self._store.save_record(agent_id, RECORD, _encode(alignment))
         self._by_agent[agent_id] = alignment
+
+    def follow(self, agent_id: str, data: bytes) -> None:
+        """Apply an alignment that another server has stored. Raises CodecError."""
+        self._by_agent[agent_id] = _decode(data)
 
     def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
         """Set the motion that the agent declares; estimates from before are dropped if it changed."""

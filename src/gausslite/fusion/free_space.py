@@ -14,7 +14,7 @@ from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.store import FusionStore
 
-_RECORD = "free_space"
+RECORD = "free_space"
 _STORED_BYTES = 1 << 23
 MIN_VIEWS = 2
 """Views of one agent that have to agree: one view may have a wrong depth or pose."""
@@ -25,7 +25,7 @@ class FreeSpaceRecords:
 
     def __init__(self, store: FusionStore, grid: VoxelGrid) -> None:
         self._store, self.grid = store, grid
-        stored = store.records(_RECORD).items()
+        stored = store.records(RECORD).items()
         self._by_agent = {agent_id: decode_free_space(data, _STORED_BYTES)[0] for agent_id, data in stored}
 
     def contribute(self, agent_id: str, blocks: FreeSpace) -> Int64[ndarray, " k"]:
@@ -38,8 +38,18 @@ class FreeSpaceRecords:
             raise QuotaError(f"free space: expected at most {MAX_BLOCKS} blocks of an agent, got {len(after.keys)}")
         # before it is stored, because blocks outside the grid's range raise here
         earlier, now = (each.voxel_keys(self.grid, MIN_VIEWS) for each in (before, after))
-        self._store.save_record(agent_id, _RECORD, encode_free_space(after, self.grid))
+        self._store.save_record(agent_id, RECORD, encode_free_space(after, self.grid))
         self._by_agent[agent_id] = after
+        return np.setxor1d(earlier, now)
+
+    def follow(self, agent_id: str, data: bytes) -> Int64[ndarray, " k"]:
+        """Apply what another server has stored of an agent; returns the voxels where its view may have changed.
+
+        Raises CodecError.
+        """
+        before, after = self._by_agent.get(agent_id, FreeSpace.empty()), decode_free_space(data, _STORED_BYTES)[0]
+        self._by_agent[agent_id] = after
+        earlier, now = (each.voxel_keys(self.grid, MIN_VIEWS) for each in (before, after))
         return np.setxor1d(earlier, now)
 
     def free_voxels(self, agent_id: str) -> int:

@@ -20,7 +20,7 @@ from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import FusedMap, VoteResult
 
 # no agent can have an empty id
-_OWNER, _RECORD = "", "refined-map"
+_OWNER, RECORD = "", "refined-map"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,14 +78,17 @@ def save_refinement(store: FusionStore, stored: StoredRefinement) -> None:
         "voted_keys": stored.voted_keys,
         "winner_hashes": stored.winner_hashes,
     }
-    store.save_record(_OWNER, _RECORD, save({name: np.ascontiguousarray(each) for name, each in columns.items()}))
+    store.save_record(_OWNER, RECORD, save({name: np.ascontiguousarray(each) for name, each in columns.items()}))
 
 
 def load_refinement(store: FusionStore) -> StoredRefinement | None:
     """Return the store's refinement, None without one. Raises CodecError, StorageError."""
-    data = store.records(_RECORD).get(_OWNER)
-    if data is None:
-        return None
+    data = store.records(RECORD).get(_OWNER)
+    return None if data is None else decode_refinement(data)
+
+
+def decode_refinement(data: bytes) -> StoredRefinement:
+    """Return a stored refinement. Raises CodecError."""
     try:
         columns = load(data)
         gaussians = from_bytes(columns["records"].tobytes())

@@ -21,7 +21,7 @@ from gausslite.codec.records import RECORD, to_records
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import select_voxels
-from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
+from gausslite.fusion.store_values import AgentTotals, StoredScores, VoxelScoreTable
 
 _FIRST_CAPACITY = 64
 ReadBatch = Callable[[str, Int64[ndarray, " k"]], VoxelBatch]
@@ -104,6 +104,16 @@ class ScoreIndex:
                 del self._holders[key]
         return keys
 
+    def remove_voxels(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Int64[ndarray, " r"]:
+        """Delete the agent's rows of these voxels, at the cost of all its rows; returns the keys that had one."""
+        if agent_id not in self._rows:
+            return np.zeros(0, np.int64)
+        own_keys, *columns = self._rows[agent_id].sorted_columns(None)
+        removed = np.isin(own_keys, keys)
+        self.remove_agent(agent_id)
+        self.put(agent_id, own_keys[~removed], select_scores(StoredScores(*columns), ~removed))
+        return own_keys[removed]
+
     def _holders_of(self, keys: Int64[ndarray, " k"]) -> int:
         return reduce(or_, map(self._holders.get, keys.tolist(), repeat(0)), 0)
 
@@ -115,18 +125,28 @@ def newer_voxels(index: ScoreIndex, subset: RoiSubset, read: ReadBatch) -> Bool[
     does not depend on the order of arrival.
     """
     batch = subset.batch
-    stored = index.stored(subset.agent_id, batch.keys)
-    newer: Bool[ndarray, " v"] = stored.update_seqs < subset.update_seq
-    same_seq = stored.update_seqs == subset.update_seq
-    sums = batch.kappa_sums
-    larger = (sums > stored.kappa_sums) | ((sums == stored.kappa_sums) & (batch.counts > stored.counts))
-    newer |= same_seq & larger
-    same_totals = same_seq & (sums == stored.kappa_sums) & (batch.counts == stored.counts) & (batch.counts > 0)
+    every = np.ones(len(batch), np.bool_)
+    newer, same = compare_scores(scores_of(subset, every), index.stored(subset.agent_id, batch.keys))
+    same_totals = same & (batch.counts > 0)
     if same_totals.any():
         received = voxel_records(select_voxels(batch, same_totals))
         stored_records = voxel_records(read(subset.agent_id, batch.keys[same_totals]))
         newer[same_totals] = [own > other for own, other in zip(received, stored_records, strict=True)]
     return newer
+
+
+def compare_scores(scores: StoredScores, stored: StoredScores) -> tuple[Bool[ndarray, " v"], Bool[ndarray, " v"]]:
+    """Return where the totals are those of a newer update than the stored ones, and where they are equal."""
+    same_seq = scores.update_seqs == stored.update_seqs
+    same_sum = scores.kappa_sums == stored.kappa_sums
+    larger = (scores.kappa_sums > stored.kappa_sums) | (same_sum & (scores.counts > stored.counts))
+    newer = (scores.update_seqs > stored.update_seqs) | (same_seq & larger)
+    return newer, same_seq & same_sum & (scores.counts == stored.counts)
+
+
+def select_scores(scores: StoredScores, selected: Bool[ndarray, " v"]) -> StoredScores:
+    """Return the totals of the selected voxels."""
+    return StoredScores(scores.update_seqs[selected], scores.kappa_sums[selected], scores.counts[selected])
 
 
 def voxel_records(batch: VoxelBatch) -> list[bytes]:

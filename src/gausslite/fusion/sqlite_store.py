@@ -33,14 +33,9 @@ from gausslite.fusion.sqlite_file import (
     storage_errors,
     update_checksum,
 )
-from gausslite.fusion.store import (
-    AgentTotals,
-    PutOutcome,
-    SessionRecord,
-    StoredScores,
-    VoxelScoreTable,
-    require_storable,
-)
+from gausslite.fusion.store import require_storable
+from gausslite.fusion.store_changes import StoreChange
+from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
 
 _LOADED_ROWS = 10_000
 _UPSERT = """
@@ -249,6 +244,14 @@ class SqliteStore:
             if data_checksum(agent_id, name, data) != checksum:
                 raise self._damaged(f"record {name!r} of agent {agent_id!r}")
         return {agent_id: data for agent_id, data, _ in rows}
+
+    def fetch_changes(self) -> bool:
+        """Return False: one server uses this store."""
+        return False
+
+    def take_changes(self) -> list[StoreChange]:
+        """Return nothing."""
+        return []
 
     def close(self) -> None:
         """Write the log into the file and close it."""

@@ -9,83 +9,18 @@ still arrive.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int32, Int64, UInt32, UInt64
+from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.mission_config import MissionConfig
-
-
-@dataclass(frozen=True, slots=True)
-class SessionRecord:
-    """An agent's permission to contribute, from joining until it leaves or joins again."""
-
-    session_id: str
-    agent_id: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PutOutcome:
-    """The voxels of a message that were stored, and those that were stale; keys in ascending order."""
-
-    accepted: Int64[ndarray, " a"]
-    stale: Int64[ndarray, " s"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VoxelScoreTable:
-    """The totals of every update (tombstones included) without the Gaussians: the input of the vote.
-
-    agent_index holds indices into `agents`, which is sorted; rows are sorted by (agent, key).
-    """
-
-    agents: tuple[str, ...]
-    agent_index: Int32[ndarray, " w"]
-    keys: Int64[ndarray, " w"]
-    update_seqs: Int64[ndarray, " w"]
-    kappa_sums: UInt64[ndarray, " w"]
-    counts: UInt32[ndarray, " w"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredScores:
-    """The totals of an agent's updates of some voxels; update_seq is -1 where it has no update."""
-
-    update_seqs: Int64[ndarray, " k"]
-    kappa_sums: UInt64[ndarray, " k"]
-    counts: UInt32[ndarray, " k"]
-
-    @classmethod
-    def missing(cls, voxels: int) -> StoredScores:
-        """Return the totals of an agent without updates."""
-        return cls(np.full(voxels, -1, np.int64), np.zeros(voxels, np.uint64), np.zeros(voxels, np.uint32))
-
-
-@dataclass(frozen=True, slots=True)
-class AgentTotals:
-    """Sums over an agent's updates: voxels with and without tombstones, Gaussians, Σkappa; the highest update_seq."""
-
-    voxels: int = 0
-    occupied_voxels: int = 0
-    gaussians: int = 0
-    kappa_sum: int = 0
-    highest_update_seq: int = 0
-
-    def replace_part(self, removed: StoredScores, added: StoredScores) -> AgentTotals:
-        """Return the totals after `added` replaced `removed`."""
-        return AgentTotals(
-            self.voxels + len(added.counts) - int(np.count_nonzero(removed.update_seqs >= 0)),
-            self.occupied_voxels + int(np.count_nonzero(added.counts)) - int(np.count_nonzero(removed.counts)),
-            self.gaussians + int(added.counts.sum(dtype=np.int64)) - int(removed.counts.sum(dtype=np.int64)),
-            self.kappa_sum + _exact_sum(added.kappa_sums) - _exact_sum(removed.kappa_sums),
-            max(self.highest_update_seq, int(added.update_seqs.max(initial=0))),
-        )
+from gausslite.fusion.store_changes import StoreChange
+from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
 
 
 @runtime_checkable
@@ -97,6 +32,9 @@ class FusionStore(Protocol):
 
     When a method of a durable store has returned, its effect survives a crash. All methods raise StorageError if the
     storage refuses; the store stays usable for other calls.
+
+    Several servers may share a store. What the others write counts in `agents`, `totals`, `digests`, `stored` and
+    `scores` from `take_changes` on; all other methods read the content as it is.
     """
 
     @property
@@ -188,6 +126,17 @@ class FusionStore(Protocol):
         """Return the record of this name of every agent that has one."""
         ...
 
+    def fetch_changes(self) -> bool:
+        """Fetch what other servers have written since the last call; returns whether there is anything to take.
+
+        It may wait for other machines, and changes nothing. A store that one server uses returns False.
+        """
+        ...
+
+    def take_changes(self) -> list[StoreChange]:
+        """Count what was fetched in the totals, and return it in the order in which each part of the store has it."""
+        ...
+
     def close(self) -> None:
         """Close the files; no other method may be called afterwards."""
         ...
@@ -201,8 +150,3 @@ def require_storable(subset: RoiSubset) -> None:
     for name, value in numbers:
         if value > limit:
             raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")
-
-
-def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
-    """Return a sum that cannot wrap around."""
-    return (int((values >> np.uint64(32)).sum()) << 32) + int((values & np.uint64(0xFFFFFFFF)).sum())

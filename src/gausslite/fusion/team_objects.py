@@ -19,7 +19,7 @@ from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.object_merge import merge_objects
 from gausslite.fusion.store import FusionStore
 
-_RECORD = "objects"
+RECORD = "objects"
 
 
 class TeamObjects:
@@ -30,12 +30,16 @@ class TeamObjects:
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
-        self._reports = {agent_id: decode_object_report(data) for agent_id, data in store.records(_RECORD).items()}
+        self._reports = {agent_id: decode_object_report(data) for agent_id, data in store.records(RECORD).items()}
 
     def report(self, agent_id: str, report: ObjectReport) -> None:
         """Replace the agent's report. Raises StorageError."""
-        self._store.save_record(agent_id, _RECORD, encode_object_report(report))
+        self._store.save_record(agent_id, RECORD, encode_object_report(report))
         self._reports[agent_id] = report
+
+    def follow(self, agent_id: str, data: bytes) -> None:
+        """Apply a report that another server has stored. Raises CodecError."""
+        self._reports[agent_id] = decode_object_report(data)
 
     def targets(self, agent_id: str) -> tuple[str, ...]:
         """Return the noun phrases of an agent's targets, by the `target` of its Gaussians; empty without a report."""

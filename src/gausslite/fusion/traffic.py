@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 
 from gausslite.domain.errors import CodecError, StorageError
 from gausslite.fusion.frame_alignment import FrameAlignment
@@ -15,7 +15,7 @@ from gausslite.fusion.store import FusionStore
 
 _SAVE_INTERVAL_S = 10.0
 # no agent can have an empty id
-_OWNER, _RECORD = "", "traffic"
+_OWNER, RECORD = "", "traffic"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,10 @@ class TrafficCounters:
             self.subsets_rejected + newer.subsets_rejected,
         )
 
+    def at_least(self, other: TrafficCounters) -> TrafficCounters:
+        """Return the larger value of each counter."""
+        return TrafficCounters(*(max(getattr(self, each.name), getattr(other, each.name)) for each in fields(self)))
+
 
 class TrafficLog:
     """The counters of each agent, saved in the store every 10 s. Not thread-safe; FusionEngine holds a lock."""
@@ -47,7 +51,7 @@ class TrafficLog:
     def __init__(self, store: FusionStore, clock_s: Callable[[], float] = time.monotonic) -> None:
         """Raises CodecError if the stored counters are damaged."""
         self._store, self._clock_s = store, clock_s
-        self._by_agent = _decode(store.records(_RECORD).get(_OWNER, b"{}"))
+        self._by_agent = _decode(store.records(RECORD).get(_OWNER, b"{}"))
         self._is_saved, self._next_save_s = True, clock_s() + _SAVE_INTERVAL_S
 
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
@@ -67,8 +71,13 @@ class TrafficLog:
     def save(self) -> None:
         """Save the counters. Raises StorageError."""
         if not self._is_saved:
-            self._store.save_record(_OWNER, _RECORD, _encode(self._by_agent))
+            self._store.save_record(_OWNER, RECORD, _encode(self._by_agent))
             self._is_saved = True
+
+    def follow(self, _owner: str, data: bytes) -> None:
+        """Take over counters that another server has saved, where they are higher. Raises CodecError."""
+        for agent_id, counters in _decode(data).items():
+            self._by_agent[agent_id] = self.of(agent_id).at_least(counters)
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""

@@ -17,7 +17,7 @@ from gausslite.fusion.store import FusionStore
 
 MAX_SEQ_STEP = 1 << 32
 """An honest agent counts its messages; a larger step would let one message use up all later numbers."""
-_JOINED_RECORD = "first-joined"
+RECORD = "first-joined"
 _JOINED = struct.Struct("<d")
 
 
@@ -29,16 +29,18 @@ class UpdateChecks:
 
     def __init__(self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float] = time.time) -> None:
         self._store, self._quotas, self._clock_s = store, quotas, clock_s
-        self._first_joined_s = {
-            agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(_JOINED_RECORD).items()
-        }
+        self._first_joined_s = {agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(RECORD).items()}
 
     def record_join(self, agent_id: str) -> None:
         """Note the agent's first join. Raises StorageError."""
         if agent_id not in self._first_joined_s:
             now_s = self._clock_s()
-            self._store.save_record(agent_id, _JOINED_RECORD, _JOINED.pack(now_s))
+            self._store.save_record(agent_id, RECORD, _JOINED.pack(now_s))
             self._first_joined_s[agent_id] = now_s
+
+    def follow(self, agent_id: str, data: bytes) -> None:
+        """Apply a first join at another server."""
+        self._first_joined_s[agent_id] = _JOINED.unpack(data)[0]
 
     def check(self, subset: RoiSubset) -> RoiSubset:
         """Return the message with Σkappa computed from its Gaussians, whatever it declares.

@@ -8,7 +8,8 @@ from threading import Lock, RLock
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.fusion.store import FusionStore, PutOutcome
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.update_queue import PendingUpdate, UpdateQueue
 
 _GROUP_VOXELS = 4096

@@ -14,7 +14,7 @@ from gausslite.domain.errors import UnavailableError
 from gausslite.domain.names import quote_name
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxel_operations import slice_voxels
-from gausslite.fusion.store import PutOutcome
+from gausslite.fusion.store_values import PutOutcome
 
 SLICE_VOXELS = 2048
 """A larger message is stored in parts of this size, so that it does not delay the other agents."""

@@ -17,7 +17,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import gather_rows
 from gausslite.domain.voxels import VoxelScore, VoxelVotes
-from gausslite.fusion.store import VoxelScoreTable
+from gausslite.fusion.store_values import VoxelScoreTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,8 @@ from gausslite.domain.voxel_operations import VoxelIndex, empty_batch, group_by_
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.free_space import FreeSpaceRecords
-from gausslite.fusion.store import FusionStore, VoxelScoreTable
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import VoxelScoreTable
 
 
 class VoteInput:
@@ -43,6 +44,11 @@ class VoteInput:
         for agent_id in store.agents():
             if not self._is_as_sent(agent_id):
                 self.refresh(agent_id)
+
+    @property
+    def uses_free_space(self) -> bool:
+        """Whether updates in observed free space are left out."""
+        return self._free_space is not None
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""

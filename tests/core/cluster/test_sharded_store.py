@@ -19,7 +19,8 @@ from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore, PutOutcome
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import PutOutcome
 
 GRID = VoxelGrid(0.10)
 # in voxels of many tiles, so that every shard has some

@@ -26,9 +26,11 @@ from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.domain.voxel_operations import gather_rows, select_keys
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.sqlite_file import SCHEMA_VERSION
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import AgentTotals, FusionStore, MissionConfig, SessionRecord
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import AgentTotals, SessionRecord
 
 KEYS = (11, 22, 33)
 

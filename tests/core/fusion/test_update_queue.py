@@ -19,7 +19,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store import PutOutcome
+from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.update_queue import SLICE_VOXELS, PendingUpdate, UpdateQueue
 from gausslite.fusion.vote import fuse
 

@@ -1,0 +1,56 @@
+"""The parts of a fusion engine that hold data of one mission, opened on one store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from threading import RLock
+
+from gausslite.fusion.agent_data import AgentData
+from gausslite.fusion.frame_aligner import FrameAligner
+from gausslite.fusion.frame_alignment import FrameAlignments
+from gausslite.fusion.free_space import FreeSpaceRecords
+from gausslite.fusion.fused_map import FusedMapLayers
+from gausslite.fusion.keyframes import FrameDecoder, KeyframePool
+from gausslite.fusion.limits import FusionSettings, VoteRule
+from gausslite.fusion.membership import Membership
+from gausslite.fusion.refined_map import load_refinement
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.team_objects import TeamObjects
+from gausslite.fusion.traffic import TrafficLog
+from gausslite.fusion.update_checks import UpdateChecks
+from gausslite.fusion.vote_input import VoteInput
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EngineParts:
+    """Each part reads its data from the store when it is opened. FusionEngine guards them with one lock."""
+
+    members: Membership
+    keyframes: KeyframePool
+    objects: TeamObjects
+    checks: UpdateChecks
+    traffic: TrafficLog
+    alignments: FrameAlignments
+    free_space: FreeSpaceRecords
+    votes: VoteInput
+    aligner: FrameAligner
+    maps: FusedMapLayers
+    data: AgentData
+
+    @classmethod
+    def open(
+        cls, store: FusionStore, settings: FusionSettings, lock: RLock, first_revision: int, decode: FrameDecoder
+    ) -> EngineParts:
+        """Open all parts. Raises MismatchError, CodecError for damaged records, StorageError."""
+        grid, quotas = settings.grid, settings.quotas
+        members = Membership(store, settings)
+        keyframes = KeyframePool(store, quotas.keyframe_limits, decode)
+        objects, checks, traffic = TeamObjects(store), UpdateChecks(store, quotas), TrafficLog(store)
+        alignments, free_space = FrameAlignments(store), FreeSpaceRecords(store, grid)
+        votes = VoteInput(store, alignments, grid, free_space if settings.vote is VoteRule.FREE_SPACE else None)
+        aligner = FrameAligner(store, alignments, votes, free_space, lock, settings.alignment)
+        refined = load_refinement(store)
+        maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
+        of_agents = aligner, free_space, checks, traffic, keyframes, objects
+        data = AgentData(store, votes, maps, alignments, of_agents)
+        return cls(members, keyframes, objects, checks, traffic, alignments, free_space, votes, aligner, maps, data)
