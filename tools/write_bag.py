@@ -26,8 +26,8 @@ from gausslite.datasets.intrinsics import read_folder_camera
 from gausslite.datasets.text_files import read_rows
 from gausslite.domain.lens import Lens
 
-COLOUR_FRAME, DEPTH_FRAME, WORLD_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame", "odom"
-COLOUR, DEPTH = "/camera/color", "/camera/depth"
+COLOUR_FRAME, WORLD_FRAME = "camera_color_optical_frame", "odom"
+COLOUR = "/camera/color"
 _TUM_UNITS_PER_METRE = 5000.0
 
 

@@ -102,7 +102,7 @@ class NumberedFolderSource(FolderSource, ABC):
         """Return a frame's pose as its file states it. Raises DatasetError."""
 
     @abstractmethod
-    def _place_of_pose(self, number: int) -> str:
+    def _pose_location(self, number: int) -> str:
         """Return the file, or the file and row, of a frame's pose, for error messages."""
 
     @property
@@ -147,7 +147,7 @@ class NumberedFolderSource(FolderSource, ABC):
     def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
         if not self._require_poses and not self._has_pose(number):
             return np.eye(4)
-        return nearest_rigid(self._place_of_pose(number), self._read_matrix(number))
+        return nearest_rigid(self._pose_location(number), self._read_matrix(number))
 
     def _has_pose(self, number: int) -> bool:
         try:

@@ -142,38 +142,38 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     return decode_image(str(path), data, path.suffix.lower(), flags)
 
 
-def decode_image(place: str, data: bytes, suffix: str, flags: int) -> NDArray[Any]:
+def decode_image(location: str, data: bytes, suffix: str, flags: int) -> NDArray[Any]:
     """Return an encoded image as OpenCV decodes it with these flags; suffix: ".png", ".jpg", ".jpeg", or another.
 
-    Size and checksums are checked before memory is taken. Raises DatasetError with the place.
+    Size and checksums are checked before memory is taken. Raises DatasetError with the location.
     """
     # decoders fill a truncated file with grey without an error, so check the end marker first
     ending = _ENDINGS.get(suffix, b"")
     if ending not in data[-_ENDING_WINDOW_BYTES:]:
-        raise DatasetError(f"{place}: expected a whole image file, got one cut short or of another format")
-    _require_undamaged(place, data, suffix)
+        raise DatasetError(f"{location}: expected a whole image file, got one cut short or of another format")
+    _require_undamaged(location, data, suffix)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
-        raise DatasetError(f"{place}: expected an image, got bytes that cannot be decoded")
+        raise DatasetError(f"{location}: expected an image, got bytes that cannot be decoded")
     return np.asarray(image)
 
 
-def _require_undamaged(place: str, data: bytes, suffix: str) -> None:
+def _require_undamaged(location: str, data: bytes, suffix: str) -> None:
     """Raise DatasetError for an image too large for memory, or a PNG with a wrong checksum, on which libpng prints."""
     width_px, height_px = image_size(data) or (0, 0)
-    require_pixel_count(place, width_px, height_px)
+    require_pixel_count(location, width_px, height_px)
     position = _PNG_START if suffix == ".png" else len(data)
     while position + 12 <= len(data):
         end = position + 8 + int.from_bytes(data[position : position + 4], "big")
         if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            raise DatasetError(f"{place}: expected an undamaged image, got one whose checksum is wrong")
+            raise DatasetError(f"{location}: expected an undamaged image, got one whose checksum is wrong")
         position = end + 4
 
 
-def require_pixel_count(place: str, width_px: int, height_px: int) -> None:
-    """Raise DatasetError with the place for an empty image and for one that is too large for memory."""
+def require_pixel_count(location: str, width_px: int, height_px: int) -> None:
+    """Raise DatasetError with the location for an empty image and for one that is too large for memory."""
     if not (width_px > 0 and height_px > 0 and width_px * height_px <= _MAX_IMAGE_PX):
-        raise DatasetError(f"{place}: expected an image of 1 to {_MAX_IMAGE_PX} pixels, got {width_px}x{height_px}")
+        raise DatasetError(f"{location}: expected an image of 1 to {_MAX_IMAGE_PX} pixels, got {width_px}x{height_px}")
 
 
 def _size(image: NDArray[Any]) -> str:

@@ -59,7 +59,7 @@ def read_matrix(path: Path) -> FileIntrinsics:
     rows = read_rows(path)
     if len(rows) != 3:
         raise DatasetError(f"{path}: expected the 3 rows of a camera matrix, got {len(rows)}")
-    K = np.array([parse_numbers(place, fields, 3, "a row of a camera matrix") for place, fields in rows])
+    K = np.array([parse_numbers(location, fields, 3, "a row of a camera matrix") for location, fields in rows])
     zeros = (K[0, 1], K[1, 0], K[2, 0], K[2, 1])
     if any(value != 0.0 for value in zeros) or K[2, 2] != 1.0:
         raise DatasetError(f"{path}: expected rows fx 0 cx, 0 fy cy, 0 0 1, got {K.tolist()}")
@@ -125,18 +125,18 @@ def read_colmap_camera(path: Path) -> FolderCamera:
 
     Raises DatasetError.
     """
-    place, fields = next(iter(read_rows(path)), (str(path), []))
+    location, fields = next(iter(read_rows(path)), (str(path), []))
     model = fields[1] if len(fields) > 1 else ""
     if model not in _COLMAP_LENSES:
         raise DatasetError(
-            f"{place}: expected ID MODEL WIDTH HEIGHT PARAMETERS with a model of "
+            f"{location}: expected ID MODEL WIDTH HEIGHT PARAMETERS with a model of "
             f"{', '.join(_COLMAP_LENSES)}, got {model[:30]!r}"
         )
-    numbers = parse_numbers(place, fields[2:], len(fields) - 2, "a camera's size and parameters")
+    numbers = parse_numbers(location, fields[2:], len(fields) - 2, "a camera's size and parameters")
     try:
         fx, fy, cx, cy, *distortion = _COLMAP_LENSES[model](numbers[2:])
     except (IndexError, ValueError):
-        raise DatasetError(f"{place}: expected more parameters for {model}, got {len(numbers) - 2}") from None
+        raise DatasetError(f"{location}: expected more parameters for {model}, got {len(numbers) - 2}") from None
     lens = lens_of(str(path), "equidistant" if model == "OPENCV_FISHEYE" else "plumb_bob", distortion)
     camera = FileIntrinsics(fx, fy, cx - 0.5, cy - 0.5).camera(str(path), int(numbers[0]), int(numbers[1]))
     return FolderCamera(camera, lens=lens)
@@ -151,14 +151,14 @@ _LENS_MODELS = {
 }
 
 
-def lens_of(place: str, model: str, coefficients: Iterable[float]) -> Lens | None:
+def lens_of(location: str, model: str, coefficients: Iterable[float]) -> Lens | None:
     """Return the lens of these coefficients in OpenCV's order; None without distortion. Raises DatasetError."""
     values = tuple(float(value) for value in coefficients)
     if not any(values):
         return None
     if model not in _LENS_MODELS:
-        raise DatasetError(f"{place}: distortion_model: expected one of {', '.join(_LENS_MODELS)}, got {model!r}")
+        raise DatasetError(f"{location}: distortion_model: expected one of {', '.join(_LENS_MODELS)}, got {model!r}")
     try:
         return Lens(_LENS_MODELS[model], values)
     except InvalidInputError as error:
-        raise DatasetError(f"{place}: {error}") from None
+        raise DatasetError(f"{location}: {error}") from None

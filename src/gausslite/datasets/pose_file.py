@@ -28,12 +28,12 @@ def format_pose_rows(title: str, times_ns: Int64[ndarray, " n"], T: Float64[ndar
 def read_pose_rows(path: Path) -> tuple[Int64[ndarray, " n"], Float64[ndarray, "n 4 4"]]:
     """Return times in nanoseconds, ascending, and poses of a pose file. Raises DatasetError, PoseError."""
     times_ns, poses = [], []
-    for place, fields in read_rows(path):
-        row = np.array(parse_numbers(place, fields, 8, _MEANING))
+    for location, fields in read_rows(path):
+        row = np.array(parse_numbers(location, fields, 8, _MEANING))
         if not np.isfinite(row[0]) or abs(row[0]) > 9e9:
-            raise DatasetError(f"{place}: expected a time in seconds, got {fields[0]}")
+            raise DatasetError(f"{location}: expected a time in seconds, got {fields[0]}")
         times_ns.append(round(float(row[0]) * 1e9))
-        poses.append(pose_from_quaternion(place, row[1:4], row[4:8]))
+        poses.append(pose_from_quaternion(location, row[1:4], row[4:8]))
     if not poses:
         raise DatasetError(f"{path}: expected rows of {_MEANING}, got none")
     order = np.argsort(times_ns, kind="stable")

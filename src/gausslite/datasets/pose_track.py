@@ -15,11 +15,11 @@ from gausslite.datasets.poses import pose_from_quaternion, slerp
 class PoseTrack:
     """Poses T_parent_child at ascending times, with quaternions of about unit length in the order x y z w.
 
-    place: file or topic, for error messages. Between two poses at most max_gap_s apart, the position is linear and the
-    rotation spherical (slerp). In longer gaps and outside, a pose within max_lag_s is used.
+    location: file or topic, for error messages. Between two poses at most max_gap_s apart, positions are interpolated
+    linearly and rotations by slerp. In longer gaps and outside, a pose within max_lag_s is used.
     """
 
-    place: str
+    location: str
     times_s: Float64[ndarray, " n"]
     translations_m: Float64[ndarray, "n 3"]
     quats_xyzw: Float64[ndarray, "n 4"]
@@ -41,4 +41,4 @@ class PoseTrack:
         share = (time_s - float(times[before])) / gap_s if gap_s > 0 else 0.0
         a_m, b_m = self.translations_m[before], self.translations_m[after]
         quat_xyzw = slerp(self.quats_xyzw[before], self.quats_xyzw[after], share)
-        return pose_from_quaternion(self.place, a_m + share * (b_m - a_m), quat_xyzw)
+        return pose_from_quaternion(self.location, a_m + share * (b_m - a_m), quat_xyzw)

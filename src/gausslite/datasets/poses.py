@@ -19,38 +19,38 @@ def is_lost(numbers: Float64[ndarray, "..."]) -> bool:
     return not np.isfinite(numbers).any() or not numbers.any()
 
 
-def nearest_rigid(place: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+def nearest_rigid(location: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
     """Return the pose with the nearest exact rotation, if its own is orthonormal up to rounding (|R Rᵀ - I| <= 0.05).
 
-    Raises PoseError with the place for NaN, infinity, a wrong last row, a reflection or a larger deviation.
+    Raises PoseError with the location for NaN, infinity, a wrong last row, a reflection or a larger deviation.
     """
     if not np.isfinite(matrix).all():
         bad = float(matrix[~np.isfinite(matrix)][0])
-        raise PoseError(f"{place}: expected a pose of finite numbers, got {bad}")
+        raise PoseError(f"{location}: expected a pose of finite numbers, got {bad}")
     R = matrix[:3, :3]
     deviation = float(np.abs(R @ R.T - np.eye(3)).max())
     determinant = float(np.linalg.det(R))
     if deviation > _REPAIRABLE_DEVIATION or determinant <= 0:
         raise PoseError(
-            f"{place}: expected a rigid pose (orthonormal rotation, determinant +1), "
+            f"{location}: expected a rigid pose (orthonormal rotation, determinant +1), "
             f"got deviation {deviation:.3g} and determinant {determinant:.3g}"
         )
     U, _, Vt = np.linalg.svd(R)
     T = matrix.copy()
     T[:3, :3] = U @ Vt
-    require_rigid(place, T)
+    require_rigid(location, T)
     return T
 
 
 def pose_from_quaternion(
-    place: str, translation_m: Float64[ndarray, "3"], quat_xyzw: Float64[ndarray, "4"]
+    location: str, translation_m: Float64[ndarray, "3"], quat_xyzw: Float64[ndarray, "4"]
 ) -> Float64[ndarray, "4 4"]:
-    """Return the transform of a translation and a quaternion of about unit length. Raises PoseError with the place."""
+    """Return the transform of a translation and a quaternion near unit length. Raises PoseError with the location."""
     if not (np.isfinite(translation_m).all() and np.isfinite(quat_xyzw).all()):
-        raise PoseError(f"{place}: expected a pose of finite numbers, got NaN or infinity")
+        raise PoseError(f"{location}: expected a pose of finite numbers, got NaN or infinity")
     length = float(np.linalg.norm(quat_xyzw))
     if abs(length - 1.0) > _REPAIRABLE_DEVIATION:
-        raise PoseError(f"{place}: expected a quaternion of length 1, got length {length:.3g}")
+        raise PoseError(f"{location}: expected a quaternion of length 1, got length {length:.3g}")
     x, y, z, w = quat_xyzw / length
     T = np.eye(4)
     T[:3, :3] = (

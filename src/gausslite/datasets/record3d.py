@@ -39,8 +39,8 @@ class Record3dSource(FolderSource):
     def __init__(self, path: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(path)
         self._files = Record3dFiles(path)
-        self._metadata_place = self._files.place(METADATA)
-        self._metadata = Record3dMetadata.parse(self._metadata_place, self._files.read(METADATA))
+        self._metadata_path = self._files.path_of(METADATA)
+        self._metadata = Record3dMetadata.parse(self._metadata_path, self._files.read(METADATA))
         self._require_poses = require_poses
         recorded = self._files.colour_numbers()
         self._recorded = len(recorded)
@@ -80,12 +80,12 @@ class Record3dSource(FolderSource):
         require_position(self.name, i, len(self))
         number = self._numbers[i]
         name = f"rgbd/{number}.jpg"
-        bgr = decode_image(self._files.place(name), self._files.read(name), ".jpg", cv2.IMREAD_COLOR)
-        camera = self._metadata.camera_at(f"{self._metadata_place}: perFrameIntrinsicCoeffs {number}", number)
+        bgr = decode_image(self._files.path_of(name), self._files.read(name), ".jpg", cv2.IMREAD_COLOR)
+        camera = self._metadata.camera_at(f"{self._metadata_path}: perFrameIntrinsicCoeffs {number}", number)
         if bgr.shape[:2] != (camera.height_px, camera.width_px):
             expected = f"{camera.width_px}x{camera.height_px}"
             got = f"{bgr.shape[1]}x{bgr.shape[0]}"
-            raise DatasetError(f"{self._files.place(name)}: expected the size in metadata, {expected}, got {got}")
+            raise DatasetError(f"{self._files.path_of(name)}: expected the size in metadata, {expected}, got {got}")
         depth_m = resize_depth(self._read_depth(number), (camera.width_px, camera.height_px))
         image = resize_rgbd(RgbdImage(np.ascontiguousarray(bgr[..., ::-1]), depth_m, camera), size)
         time_ns = self._metadata.time_ns(number)
@@ -118,7 +118,7 @@ class Record3dSource(FolderSource):
         if not self._has_pose(number):
             return np.eye(4)
         row = self._metadata.poses[number]
-        return pose_from_quaternion(f"{self._metadata_place}: poses {number}", row[4:], row[:4]) @ _OPENGL_TO_OPENCV
+        return pose_from_quaternion(f"{self._metadata_path}: poses {number}", row[4:], row[:4]) @ _OPENGL_TO_OPENCV
 
     def _read_depth(self, number: int) -> Float32[ndarray, "h w"]:
         """Return the recorded depth image, 0 where invalid or of low confidence. Raises DatasetError."""
@@ -133,5 +133,5 @@ class Record3dSource(FolderSource):
 
     def _depth_size(self) -> tuple[int, int]:
         if self._metadata.depth_size is None:
-            raise DatasetError(f"{self._metadata_place}: expected the size of the depth images, dw and dh, got none")
+            raise DatasetError(f"{self._metadata_path}: expected the size of the depth images, dw and dh, got none")
         return self._metadata.depth_size

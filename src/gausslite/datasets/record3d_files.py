@@ -33,7 +33,7 @@ class Record3dFiles:
             raise DatasetError(f"{path}: expected an .r3d file, which is a ZIP; {error}") from None
         weakref.finalize(self, self._zip.close)
 
-    def place(self, name: str) -> str:
+    def path_of(self, name: str) -> str:
         """Return the file's name for messages."""
         return str(self._path / name)
 
@@ -52,7 +52,7 @@ class Record3dFiles:
     def read(self, name: str) -> bytes:
         """Return a file's bytes. Raises DatasetError if it is missing, damaged or too large."""
         if not self.has(name):
-            raise DatasetError(f"{self.place(name)}: expected this file of a Record3D recording, got none")
+            raise DatasetError(f"{self.path_of(name)}: expected this file of a Record3D recording, got none")
         try:
             file = self._path / name
             size_bytes = file.stat().st_size if self._zip is None else self._zip.getinfo(name).file_size
@@ -60,7 +60,7 @@ class Record3dFiles:
                 raise DatasetError(f"{file}: expected at most {_MAX_FILE_BYTES} bytes, got {size_bytes}")
             return file.read_bytes() if self._zip is None else self._zip.read(name)
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError) as error:
-            raise DatasetError(f"{self.place(name)}: expected a readable file; {error}") from None
+            raise DatasetError(f"{self.path_of(name)}: expected a readable file; {error}") from None
 
     def read_array(self, name: str, dtype: type[np.generic], count: int) -> NDArray[Any]:
         """Return the `count` little-endian values of an LZFSE file.
@@ -68,28 +68,28 @@ class Record3dFiles:
         The size that the file declares is checked before it is decompressed. Raises DatasetError, also without the
         extra `record3d`.
         """
-        data, place = self.read(name), self.place(name)
+        data, location = self.read(name), self.path_of(name)
         expected_bytes = count * np.dtype(dtype).itemsize
         declared_bytes = _declared_bytes(data)
         if declared_bytes != expected_bytes:
             got = "bytes of another format" if declared_bytes is None else f"{declared_bytes} bytes"
-            raise DatasetError(f"{place}: expected {expected_bytes} bytes, compressed with LZFSE, got {got}")
-        lzfse = _lzfse(place)
+            raise DatasetError(f"{location}: expected {expected_bytes} bytes, compressed with LZFSE, got {got}")
+        lzfse = _lzfse(location)
         try:
             values = lzfse.decompress(data)
         except lzfse.error as error:
-            raise DatasetError(f"{place}: expected undamaged LZFSE data; {error}") from None
+            raise DatasetError(f"{location}: expected undamaged LZFSE data; {error}") from None
         if len(values) != expected_bytes:
-            raise DatasetError(f"{place}: expected {expected_bytes} bytes, compressed with LZFSE, got {len(values)}")
+            raise DatasetError(f"{location}: expected {expected_bytes} bytes, compressed with LZFSE, got {len(values)}")
         return np.frombuffer(values, np.dtype(dtype).newbyteorder("<")).astype(dtype)
 
 
-def _lzfse(place: str) -> Any:
+def _lzfse(location: str) -> Any:
     try:
         import lzfse
     except ImportError:
         raise DatasetError(
-            f"{place}: a Record3D recording needs the extra `record3d`; install it with: pip install "
+            f"{location}: a Record3D recording needs the extra `record3d`; install it with: pip install "
             "'gausslite[record3d]'"
         ) from None
     return lzfse

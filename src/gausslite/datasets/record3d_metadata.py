@@ -40,36 +40,36 @@ class Record3dMetadata:
     depth_size: tuple[int, int] | None
 
     @classmethod
-    def parse(cls, place: str, data: bytes) -> Record3dMetadata:
-        """Return the content of a metadata file. Raises DatasetError with the place."""
+    def parse(cls, location: str, data: bytes) -> Record3dMetadata:
+        """Return the content of a metadata file. Raises DatasetError with the location."""
         try:
             fields = json.loads(data)
         except (ValueError, RecursionError) as error:
-            raise DatasetError(f"{place}: expected JSON; {str(error)[:120]}") from None
+            raise DatasetError(f"{location}: expected JSON; {str(error)[:120]}") from None
         if not isinstance(fields, dict):
-            raise DatasetError(f"{place}: expected a JSON object, got {type(fields).__name__}")
-        width_px, height_px = _size(place, fields, "w", "h")
-        K = _numbers(place, fields, "K", (9,))
-        times_s = _numbers(place, fields, "frameTimestamps", (-1,), ())
+            raise DatasetError(f"{location}: expected a JSON object, got {type(fields).__name__}")
+        width_px, height_px = _size(location, fields, "w", "h")
+        K = _numbers(location, fields, "K", (9,))
+        times_s = _numbers(location, fields, "frameTimestamps", (-1,), ())
         if (np.diff(times_s) <= 0).any() or np.abs(times_s).max(initial=0.0) > _MAX_TIME_S:
-            raise DatasetError(f"{place}: frameTimestamps: expected ascending times in seconds")
-        rate_hz = float(_numbers(place, fields, "fps", (), 30))
+            raise DatasetError(f"{location}: frameTimestamps: expected ascending times in seconds")
+        rate_hz = float(_numbers(location, fields, "fps", (), 30))
         if rate_hz <= 0:
-            raise DatasetError(f"{place}: fps: expected a positive number, got {rate_hz:g}")
+            raise DatasetError(f"{location}: fps: expected a positive number, got {rate_hz:g}")
         return cls(
-            _camera(f"{place}: K", K[list(_FOCAL_AND_CENTRE)], width_px, height_px),
-            _numbers(place, fields, "perFrameIntrinsicCoeffs", (-1, 4), ()),
-            _numbers(place, fields, "poses", (-1, 7), ()),
+            _camera(f"{location}: K", K[list(_FOCAL_AND_CENTRE)], width_px, height_px),
+            _numbers(location, fields, "perFrameIntrinsicCoeffs", (-1, 4), ()),
+            _numbers(location, fields, "poses", (-1, 7), ()),
             times_s,
             rate_hz,
-            _size(place, fields, "dw", "dh") if "dw" in fields or "dh" in fields else None,
+            _size(location, fields, "dw", "dh") if "dw" in fields or "dh" in fields else None,
         )
 
-    def camera_at(self, place: str, number: int) -> Camera:
+    def camera_at(self, location: str, number: int) -> Camera:
         """Return the camera of a frame: the image stabiliser and the focus change it a little. Raises DatasetError."""
         if number >= len(self.intrinsics):
             return self.camera
-        return _camera(place, self.intrinsics[number], self.camera.width_px, self.camera.height_px)
+        return _camera(location, self.intrinsics[number], self.camera.width_px, self.camera.height_px)
 
     def time_ns(self, number: int) -> int:
         """Return a frame's time."""
@@ -77,27 +77,27 @@ class Record3dMetadata:
         return round(seconds * 1e9)
 
 
-def _camera(place: str, intrinsics: Float64[ndarray, "4"], width_px: int, height_px: int) -> Camera:
+def _camera(location: str, intrinsics: Float64[ndarray, "4"], width_px: int, height_px: int) -> Camera:
     """Return the camera; ARKit counts the principal point from the image's corner, as Camera does."""
     try:
         fx_px, fy_px, cx_px, cy_px = intrinsics.tolist()
         return Camera(fx_px, fy_px, cx_px, cy_px, width_px, height_px)
     except InvalidInputError as error:
-        raise DatasetError(f"{place}: {error}") from None
+        raise DatasetError(f"{location}: {error}") from None
 
 
-def _size(place: str, fields: Mapping[str, Any], width_name: str, height_name: str) -> tuple[int, int]:
-    width_px, height_px = (int(_numbers(place, fields, name, ())) for name in (width_name, height_name))
-    require_pixel_count(f"{place}: {width_name}, {height_name}", width_px, height_px)
+def _size(location: str, fields: Mapping[str, Any], width_name: str, height_name: str) -> tuple[int, int]:
+    width_px, height_px = (int(_numbers(location, fields, name, ())) for name in (width_name, height_name))
+    require_pixel_count(f"{location}: {width_name}, {height_name}", width_px, height_px)
     return width_px, height_px
 
 
 def _numbers(
-    place: str, fields: Mapping[str, Any], name: str, shape: tuple[int, ...], default: Any = None
+    location: str, fields: Mapping[str, Any], name: str, shape: tuple[int, ...], default: Any = None
 ) -> Float64[ndarray, "..."]:
     """Return a field as finite numbers of this shape, -1 for any length. Raises DatasetError."""
     value = fields.get(name, default)
-    expected = f"{place}: {name}: expected finite numbers" + (f" of shape {shape}" if shape else "")
+    expected = f"{location}: {name}: expected finite numbers" + (f" of shape {shape}" if shape else "")
     try:
         array = np.array(value, np.float64)
     except (ValueError, TypeError):

@@ -59,11 +59,11 @@ class ReplicaSource(NumberedFolderSource):
     def _depth_path(self, number: int) -> Path:
         return self._results / f"depth{number:06d}.png"
 
-    def _place_of_pose(self, number: int) -> str:
+    def _pose_location(self, number: int) -> str:
         return self._pose_rows[number][0]
 
     def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
         if number >= len(self._pose_rows):
             raise DatasetError(f"{self._folder}: expected a pose of frame {number} in traj.txt, got none")
-        place, fields = self._pose_rows[number]
-        return np.array(parse_numbers(place, fields, 16, "a 4x4 pose, row by row")).reshape(4, 4)
+        location, fields = self._pose_rows[number]
+        return np.array(parse_numbers(location, fields, 16, "a 4x4 pose, row by row")).reshape(4, 4)

@@ -62,15 +62,15 @@ class SevenScenesSource(NumberedFolderSource):
     def _depth_path(self, number: int) -> Path:
         return self._folder / f"frame-{number:06d}.depth.png"
 
-    def _place_of_pose(self, number: int) -> str:
+    def _pose_location(self, number: int) -> str:
         return str(self._folder / f"frame-{number:06d}.pose.txt")
 
     def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
-        path = Path(self._place_of_pose(number))
+        path = Path(self._pose_location(number))
         rows = read_rows(path)
         if len(rows) != 4:
             raise DatasetError(f"{path}: expected the 4 rows of a 4x4 pose, got {len(rows)}")
-        return np.array([parse_numbers(place, fields, 4, "a row of a 4x4 pose") for place, fields in rows])
+        return np.array([parse_numbers(location, fields, 4, "a row of a 4x4 pose") for location, fields in rows])
 
     def _estimate_up_axis(self) -> UpAxis:
         rotations = []

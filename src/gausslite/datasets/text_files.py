@@ -18,7 +18,7 @@ def read_text(path: Path) -> str:
 
 
 def read_rows(path: Path) -> list[tuple[str, list[str]]]:
-    """Return the place ("FILE line 3") and the fields of each row, without blank rows and comments (#)."""
+    """Return the location ("FILE line 3") and the fields of each row, without blank rows and comments (#)."""
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         text = line.strip()
@@ -27,11 +27,11 @@ def read_rows(path: Path) -> list[tuple[str, list[str]]]:
     return rows
 
 
-def parse_numbers(place: str, fields: list[str], count: int, meaning: str) -> list[float]:
-    """Return exactly `count` numbers, which may be NaN or infinite. Raises DatasetError with the place."""
+def parse_numbers(location: str, fields: list[str], count: int, meaning: str) -> list[float]:
+    """Return exactly `count` numbers, which may be NaN or infinite. Raises DatasetError with the location."""
     if len(fields) != count:
-        raise DatasetError(f"{place}: expected {count} numbers ({meaning}), got {len(fields)}")
+        raise DatasetError(f"{location}: expected {count} numbers ({meaning}), got {len(fields)}")
     try:
         return [float(field) for field in fields]
     except ValueError as error:
-        raise DatasetError(f"{place}: expected {count} numbers ({meaning}); {error}") from None
+        raise DatasetError(f"{location}: expected {count} numbers ({meaning}); {error}") from None

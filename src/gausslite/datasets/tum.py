@@ -140,13 +140,13 @@ def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int]:
 def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
     """Return ascending times in seconds and the image path of each."""
     times, names = [], []
-    for place, fields in read_rows(path):
+    for location, fields in read_rows(path):
         if len(fields) != 2:
-            raise DatasetError(f"{place}: expected a time and a file name, got {len(fields)} fields")
-        times += parse_numbers(place, fields[:1], 1, "a time in seconds")
+            raise DatasetError(f"{location}: expected a time and a file name, got {len(fields)} fields")
+        times += parse_numbers(location, fields[:1], 1, "a time in seconds")
         names.append(fields[1])
         if not np.isfinite(times[-1]) or (len(times) > 1 and times[-1] < times[-2]):
-            raise DatasetError(f"{place}: expected finite times in ascending order, got {fields[0]}")
+            raise DatasetError(f"{location}: expected finite times in ascending order, got {fields[0]}")
     if not times:
         raise DatasetError(f"{path}: expected rows of a time and a file name, got none")
     return np.array(times), names
@@ -156,7 +156,7 @@ def _read_poses(path: Path) -> PoseTrack:
     """Return the poses of rows of: time tx ty tz qx qy qz qw. Raises DatasetError, PoseError."""
     rows = read_rows(path)
     meaning = "time tx ty tz qx qy qz qw"
-    table = np.array([parse_numbers(place, fields, 8, meaning) for place, fields in rows])
+    table = np.array([parse_numbers(location, fields, 8, meaning) for location, fields in rows])
     known = np.array([not is_lost(row[1:]) for row in table], np.bool_)
     if np.count_nonzero(known) < 2:
         lost = f" and {len(rows) - np.count_nonzero(known)} rows of NaN, infinity or zeros" if rows else ""

@@ -67,20 +67,20 @@ class ZedSource(NumberedFolderSource):
         exact = self._folder / f"depth{number:06d}.npy"
         return exact if exact.is_file() else exact.with_suffix(".png")
 
-    def _place_of_pose(self, number: int) -> str:
+    def _pose_location(self, number: int) -> str:
         return self._pose_rows[number][0] if number in self._pose_rows else str(self._folder / _POSE_FILES[0])
 
     def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
         if number not in self._pose_rows:
             return np.full((4, 4), np.nan)
-        place, row = self._pose_rows[number]
+        location, row = self._pose_rows[number]
         if is_lost(row):
             return np.full((4, 4), np.nan)
-        return pose_from_quaternion(place, row[:3], row[3:])
+        return pose_from_quaternion(location, row[:3], row[3:])
 
 
 def _read_pose_rows(folder: Path, required: bool) -> Mapping[int, tuple[str, Float64[ndarray, "7"]]]:
-    """Return place and numbers of each frame's row; none without a file if poses are not required."""
+    """Return location and numbers of each frame's row; none without a file if poses are not required."""
     path = next((folder / name for name in _POSE_FILES if (folder / name).is_file()), None)
     if path is None:
         if required:
@@ -90,13 +90,13 @@ def _read_pose_rows(folder: Path, required: bool) -> Mapping[int, tuple[str, Flo
             )
         return {}
     rows = {}
-    for i, (place, fields) in enumerate(read_rows(path)):
+    for i, (location, fields) in enumerate(read_rows(path)):
         cells = " ".join(fields).replace(",", " ").split()
         if i == 0 and cells and cells[0].isalpha():
             # a header names the columns
             continue
-        numbers = parse_numbers(place, cells, 8, _MEANING)
+        numbers = parse_numbers(location, cells, 8, _MEANING)
         if not 0 <= numbers[0] <= 999_999 or numbers[0] != int(numbers[0]):
-            raise DatasetError(f"{place}: expected a frame's number, such as 12 for left000012.png, got {cells[0]}")
-        rows[int(numbers[0])] = place, np.array(numbers[1:])
+            raise DatasetError(f"{location}: expected a frame's number, such as 12 for left000012.png, got {cells[0]}")
+        rows[int(numbers[0])] = location, np.array(numbers[1:])
     return rows

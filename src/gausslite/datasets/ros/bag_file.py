@@ -32,7 +32,7 @@ class MessageKey:
 
 @dataclass(frozen=True, slots=True)
 class StampedMessage:
-    """A message by its place in the bag and the stamp of its header."""
+    """A message by its position in the bag and the stamp of its header."""
 
     key: MessageKey
     stamp_ns: int
@@ -125,9 +125,9 @@ class BagFile:
         except (DatasetError, GeneratorExit):
             raise
         except Exception as error:
-            place = f"{self._path}: {topic}" if topic else str(self._path)
+            location = f"{self._path}: {topic}" if topic else str(self._path)
             reason = " ".join(str(error).split())[:160] or type(error).__name__
-            raise DatasetError(f"{place}: expected a readable bag; {reason}") from None
+            raise DatasetError(f"{location}: expected a readable bag; {reason}") from None
 
 
 def _reader_class(path: Path) -> Callable[[Path], Any]:

@@ -64,7 +64,7 @@ class TopicPoses:
 
     def __str__(self) -> str:
         """Return where the poses come from."""
-        return f"{self.track.place}, the pose of {self.body}"
+        return f"{self.track.location}, the pose of {self.body}"
 
 
 CameraPoses = TreePoses | TopicPoses
@@ -93,7 +93,7 @@ def choose_poses(bag: BagFile, tree: TransformTree, camera: str, options: BagOpt
         return TreePoses(tree, options.frame, camera)
     ancestors = tree.ancestors(camera)
     for world in (*(name for name in _WORLD_FRAMES if name in ancestors), ancestors[-1]):
-        if tree.moves(world, camera):
+        if tree.changes_over_time(world, camera):
             return TreePoses(tree, world, camera)
     topics = [topic for topic, message_type in bag.types.items() if message_type == _ODOMETRY]
     if len(topics) > 1:

@@ -121,8 +121,8 @@ class BagSource:
         require_position(self.name, i, len(self))
         match = self._matches[i]
         messages = self._bag.read(match.colour), self._bag.read(match.depth)
-        place = str(self._bag.path)
-        return self._converter.frame(place, match.number, messages, match.stamp_ns, match.T_world_camera, size)
+        location = str(self._bag.path)
+        return self._converter.frame(location, match.number, messages, match.stamp_ns, match.T_world_camera, size)
 
     def indices(self) -> Sequence[int]:
         """Return the positions of the colour images in their topic, from 0."""
@@ -157,10 +157,10 @@ class BagSource:
     def _read_camera(self, image: ImageTopic, named: str, option: str) -> FolderCamera:
         topic = choose_info(self._bag, image, named, option)
         message = self._bag.first(topic)
-        place = f"{self._bag.path}: {topic}"
+        location = f"{self._bag.path}: {topic}"
         if message is None:
-            raise DatasetError(f"{place}: expected a camera_info message, got none")
-        return camera_of(place, message, image.camera_name)
+            raise DatasetError(f"{location}: expected a camera_info message, got none")
+        return camera_of(location, message, image.camera_name)
 
     def _read_aligned_camera(self) -> FolderCamera | None:
         """Return the camera of depth with the colour camera's frame; None if the bag does not state it."""

@@ -19,12 +19,12 @@ _SDK_MODELS = {
 """The camera's own ROS driver publishes these models under these names."""
 
 
-def camera_of(place: str, info: Any, image_topic: str) -> FolderCamera:
+def camera_of(location: str, info: Any, image_topic: str) -> FolderCamera:
     """Return the camera of a topic's images, and its lens if they are distorted.
 
     A topic whose last part begins with image_rect has rectified images: the
     projection matrix P describes them, without distortion. Binning and region of interest of the message are applied.
-    Raises DatasetError with the place.
+    Raises DatasetError with the location.
     """
     if _is_rectified(image_topic):
         values = float_field(info, "p")
@@ -36,7 +36,7 @@ def camera_of(place: str, info: Any, image_topic: str) -> FolderCamera:
     if fx == 0.0:
         values = float_field(info, "k")
         if len(values) != 9 or values[0] == 0.0:
-            raise DatasetError(f"{place}: expected an intrinsic matrix K, got zeros; is the camera calibrated?")
+            raise DatasetError(f"{location}: expected an intrinsic matrix K, got zeros; is the camera calibrated?")
         fx, cx, fy, cy = (values[i] for i in (0, 2, 4, 5))
     binning = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     roi_size = int(info.roi.width), int(info.roi.height)
@@ -45,8 +45,8 @@ def camera_of(place: str, info: Any, image_topic: str) -> FolderCamera:
     intrinsics = FileIntrinsics(
         fx / binning[0], fy / binning[1], (cx + 0.5) / binning[0] - 0.5, (cy + 0.5) / binning[1] - 0.5
     )
-    lens = lens_of(place, _model_name(str(info.distortion_model)), _known_coefficients(place, coefficients))
-    return FolderCamera(intrinsics.camera(place, size[0] // binning[0], size[1] // binning[1]), lens=lens)
+    lens = lens_of(location, _model_name(str(info.distortion_model)), _known_coefficients(location, coefficients))
+    return FolderCamera(intrinsics.camera(location, size[0] // binning[0], size[1] // binning[1]), lens=lens)
 
 
 def _is_rectified(image_topic: str) -> bool:
@@ -58,11 +58,11 @@ def _model_name(name: str) -> str:
     return _SDK_MODELS.get(name.lower().replace("_", " "), name)
 
 
-def _known_coefficients(place: str, coefficients: list[float]) -> list[float]:
+def _known_coefficients(location: str, coefficients: list[float]) -> list[float]:
     """Return at most 8 coefficients; OpenCV's further ones (thin prism, tilt) must be zero."""
     if any(coefficients[_LENS_COEFFICIENTS:]):
         raise DatasetError(
-            f"{place}: expected a lens of at most {_LENS_COEFFICIENTS} coefficients, got {len(coefficients)}; "
+            f"{location}: expected a lens of at most {_LENS_COEFFICIENTS} coefficients, got {len(coefficients)}; "
             "rectify the images with image_proc, and use image_rect_color"
         )
     return coefficients[:_LENS_COEFFICIENTS]

@@ -50,18 +50,18 @@ class FrameConverter:
 
     def frame(
         self,
-        place: str,
+        location: str,
         number: int,
         messages: tuple[Any, Any],
         stamp_ns: int,
         T_world_camera: Float64[ndarray, "4 4"],
         size: tuple[int, int] | None = None,
     ) -> Frame:
-        """Return the frame of the colour and the depth message, resized. Raises DatasetError with the place."""
-        place = f"{place}: message at {stamp_ns / 1e9:.9f} s"
-        rgb = _colour_image(f"{place}: {self.colour_topic}", messages[0])
-        depth_m = _depth_image(f"{place}: {self.depth_topic}", messages[1], self.units_per_metre)
-        image = resize_rgbd(self.cameras.join(place, rgb, depth_m), size)
+        """Return the frame of the colour and the depth message, resized. Raises DatasetError with the location."""
+        location = f"{location}: message at {stamp_ns / 1e9:.9f} s"
+        rgb = _colour_image(f"{location}: {self.colour_topic}", messages[0])
+        depth_m = _depth_image(f"{location}: {self.depth_topic}", messages[1], self.units_per_metre)
+        image = resize_rgbd(self.cameras.join(location, rgb, depth_m), size)
         # to the precision of a float64 in seconds, as in folders: keyframes are chosen by their times
         time_ns = round(stamp_ns / 10**9 * 1e9)
         return Frame(
@@ -69,11 +69,11 @@ class FrameConverter:
         )
 
 
-def _colour_image(place: str, message: Any) -> UInt8[ndarray, "h w 3"]:
+def _colour_image(location: str, message: Any) -> UInt8[ndarray, "h w 3"]:
     compressed = isinstance(message, CompressedImageMessage)
-    return decode_compressed_colour(place, message) if compressed else decode_colour(place, message)
+    return decode_compressed_colour(location, message) if compressed else decode_colour(location, message)
 
 
-def _depth_image(place: str, message: Any, units_per_metre: float) -> Float32[ndarray, "h w"]:
+def _depth_image(location: str, message: Any, units_per_metre: float) -> Float32[ndarray, "h w"]:
     compressed = isinstance(message, CompressedImageMessage)
-    return (decode_compressed_depth if compressed else decode_depth)(place, message, units_per_metre)
+    return (decode_compressed_depth if compressed else decode_depth)(location, message, units_per_metre)

@@ -78,43 +78,43 @@ def kind_of_format(text: str) -> ImageKind:
     return ImageKind.COLOUR if known and encoding != "mono16" else ImageKind.OTHER
 
 
-def decode_colour(place: str, message: ImageMessage) -> UInt8[ndarray, "h w 3"]:
-    """Return an image message as RGB. Raises DatasetError with the place for other encodings and wrong sizes."""
+def decode_colour(location: str, message: ImageMessage) -> UInt8[ndarray, "h w 3"]:
+    """Return an image message as RGB. Raises DatasetError with the location for other encodings and wrong sizes."""
     encoding = message.encoding
     if encoding in _CHANNEL_ORDERS:
         channels, order = _CHANNEL_ORDERS[encoding]
-        return np.ascontiguousarray(_pixels(place, message, np.dtype(np.uint8), channels)[..., order])
+        return np.ascontiguousarray(_pixels(location, message, np.dtype(np.uint8), channels)[..., order])
     if encoding not in _CONVERSION_CODES:
         known = ", ".join(_COLOUR_ENCODINGS)
-        raise DatasetError(f"{place}: encoding: expected one of {known}, got {encoding[:40]!r}")
+        raise DatasetError(f"{location}: encoding: expected one of {known}, got {encoding[:40]!r}")
     channels, code = _CONVERSION_CODES[encoding]
     try:
-        rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(_pixels(place, message, np.dtype(np.uint8), channels), code)
+        rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(_pixels(location, message, np.dtype(np.uint8), channels), code)
     except cv2.error:
         size = f"{message.width}x{message.height}"
-        raise DatasetError(f"{place}: {encoding}: expected an even width and height, got {size}") from None
+        raise DatasetError(f"{location}: {encoding}: expected an even width and height, got {size}") from None
     return rgb
 
 
 def decode_depth(
-    place: str, message: ImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
+    location: str, message: ImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
 ) -> Float32[ndarray, "h w"]:
     """Return depth in metres, 0 where invalid, of 32FC1 in metres or 16-bit integers in these units.
 
-    Raises DatasetError with the place.
+    Raises DatasetError with the location.
     """
     dtype = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}.get(message.encoding)
     if dtype is None:
-        raise DatasetError(f"{place}: encoding: expected depth as 16UC1 or 32FC1, got {message.encoding[:40]!r}")
-    image = _pixels(place, message, np.dtype(dtype), 1)
+        raise DatasetError(f"{location}: encoding: expected depth as 16UC1 or 32FC1, got {message.encoding[:40]!r}")
+    image = _pixels(location, message, np.dtype(dtype), 1)
     return _in_metres(image, units_per_metre)
 
 
-def decode_compressed_colour(place: str, message: CompressedImageMessage) -> UInt8[ndarray, "h w 3"]:
-    """Return a JPEG or PNG image as RGB. Raises DatasetError with the place."""
-    image = _decode(place, bytes(message.data), cv2.IMREAD_COLOR)
+def decode_compressed_colour(location: str, message: CompressedImageMessage) -> UInt8[ndarray, "h w 3"]:
+    """Return a JPEG or PNG image as RGB. Raises DatasetError with the location."""
+    image = _decode(location, bytes(message.data), cv2.IMREAD_COLOR)
     if image.dtype != np.uint8:
-        raise DatasetError(f"{place}: expected an image of 8 bits per channel, got {image.dtype}")
+        raise DatasetError(f"{location}: expected an image of 8 bits per channel, got {image.dtype}")
     encoding = message.format.partition(";")[0].strip()
     if encoding.startswith("bayer_") and encoding in _CONVERSION_CODES:
         # the pattern is compressed as a grey image
@@ -124,21 +124,25 @@ def decode_compressed_colour(place: str, message: CompressedImageMessage) -> UIn
 
 
 def decode_compressed_depth(
-    place: str, message: CompressedImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
+    location: str, message: CompressedImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
 ) -> Float32[ndarray, "h w"]:
     """Return depth in metres, 0 where invalid, of a 16-bit PNG, with the header of compressedDepth or without.
 
-    32FC1 images are stored as quantised inverse depths: depth = A / (value - B). Raises DatasetError with the place.
+    32FC1 images are stored as quantised inverse depths: depth = A / (value - B). Raises DatasetError with the location.
     """
     data = bytes(message.data)
     if "compressedDepth" not in message.format:
-        return _in_metres(_decode_16_bit(place, data), units_per_metre)
+        return _in_metres(_decode_16_bit(location, data), units_per_metre)
     if "rvl" in message.format.lower():
-        raise DatasetError(f"{place}: expected compressedDepth with PNG, got RVL; record with format png, or raw depth")
+        raise DatasetError(
+            f"{location}: expected compressedDepth with PNG, got RVL; record with format png, or raw depth"
+        )
     if len(data) <= _DEPTH_HEADER.size:
-        raise DatasetError(f"{place}: expected a header of {_DEPTH_HEADER.size} bytes and a PNG, got {len(data)} bytes")
+        raise DatasetError(
+            f"{location}: expected a header of {_DEPTH_HEADER.size} bytes and a PNG, got {len(data)} bytes"
+        )
     _, a, b = _DEPTH_HEADER.unpack_from(data)
-    image = _decode_16_bit(place, data[_DEPTH_HEADER.size :])
+    image = _decode_16_bit(location, data[_DEPTH_HEADER.size :])
     if message.format.partition(";")[0].strip() != "32FC1":
         return _in_metres(image, units_per_metre)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -147,16 +151,16 @@ def decode_compressed_depth(
     return _valid(depth_m)
 
 
-def _pixels(place: str, message: ImageMessage, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+def _pixels(location: str, message: ImageMessage, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
     """Return the pixels of a raw image in this machine's byte order. The sizes are checked first."""
     width, height, step = int(message.width), int(message.height), int(message.step)
-    require_pixel_count(place, width, height)
+    require_pixel_count(location, width, height)
     row_bytes = width * channels * dtype.itemsize
     if step < row_bytes:
-        raise DatasetError(f"{place}: step: expected at least {row_bytes} bytes a row, got {step}")
+        raise DatasetError(f"{location}: step: expected at least {row_bytes} bytes a row, got {step}")
     data = np.frombuffer(message.data, np.uint8)
     if len(data) < step * (height - 1) + row_bytes:
-        raise DatasetError(f"{place}: data: expected {height} rows of {step} bytes, got {len(data)} bytes")
+        raise DatasetError(f"{location}: data: expected {height} rows of {step} bytes, got {len(data)} bytes")
     rows = np.lib.stride_tricks.as_strided(data, (height, row_bytes), (step, 1), writeable=False)
     pixels = np.ascontiguousarray(rows).view(dtype)
     if bool(message.is_bigendian) != (sys.byteorder == "big"):
@@ -164,17 +168,19 @@ def _pixels(place: str, message: ImageMessage, dtype: np.dtype[Any], channels: i
     return pixels.reshape((height, width, channels) if channels > 1 else (height, width))
 
 
-def _decode(place: str, data: bytes, flags: int) -> NDArray[Any]:
+def _decode(location: str, data: bytes, flags: int) -> NDArray[Any]:
     suffix = next((suffix for start, suffix in _SUFFIX_BYTES.items() if data.startswith(start)), None)
     if suffix is None:
-        raise DatasetError(f"{place}: data: expected a JPEG or a PNG, got other bytes")
-    return decode_image(place, data, suffix, flags)
+        raise DatasetError(f"{location}: data: expected a JPEG or a PNG, got other bytes")
+    return decode_image(location, data, suffix, flags)
 
 
-def _decode_16_bit(place: str, data: bytes) -> NDArray[Any]:
-    image = _decode(place, data, cv2.IMREAD_UNCHANGED)
+def _decode_16_bit(location: str, data: bytes) -> NDArray[Any]:
+    image = _decode(location, data, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
-        raise DatasetError(f"{place}: expected a 16-bit PNG of one channel, got {image.dtype} of shape {image.shape}")
+        raise DatasetError(
+            f"{location}: expected a 16-bit PNG of one channel, got {image.dtype} of shape {image.shape}"
+        )
     return image
 
 

@@ -147,7 +147,7 @@ class LiveFrames:
             self._converter = self._connect(image.time_ns)
         if self._converter is None:
             return "not_ready" if expired else None
-        if not expired and not (self._depth_has_passed(image.time_ns) and self._pose_is_settled(image.time_ns)):
+        if not expired and not (self._depth_has_passed(image.time_ns) and self._pose_is_final(image.time_ns)):
             return None
         depth = self._nearest_depth(image.time_ns)
         if depth is None:
@@ -203,7 +203,7 @@ class LiveFrames:
             return None
         return nearest[2]
 
-    def _pose_is_settled(self, time_ns: int) -> bool:
+    def _pose_is_final(self, time_ns: int) -> bool:
         """True if no later transform can change the pose at this time."""
         world, camera = self._options.frame, self._camera_frame()
         try:

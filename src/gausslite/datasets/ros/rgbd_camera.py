@@ -48,11 +48,11 @@ class RgbdCamera:
         """Lens of the joined images; None for registered ones, whose colour is undistorted."""
         return self.colour.lens if self.depth is None else None
 
-    def join(self, place: str, rgb: UInt8[ndarray, "h w 3"], depth_m: Float32[ndarray, "hd wd"]) -> RgbdImage:
-        """Return both images in the colour camera. Raises DatasetError with the place for images of other sizes."""
+    def join(self, location: str, rgb: UInt8[ndarray, "h w 3"], depth_m: Float32[ndarray, "hd wd"]) -> RgbdImage:
+        """Return both images in the colour camera. Raises DatasetError with the location for images of other sizes."""
         depth_camera = self.colour if self.depth is None else self.depth
-        _require_size(f"{place}: colour", rgb, self.camera)
-        _require_size(f"{place}: depth", depth_m, depth_camera.camera)
+        _require_size(f"{location}: colour", rgb, self.camera)
+        _require_size(f"{location}: depth", depth_m, depth_camera.camera)
         if self.depth is None:
             return RgbdImage(rgb, depth_m, self.camera)
         if self.colour.lens is not None:
@@ -62,8 +62,8 @@ class RgbdCamera:
         return RgbdImage(rgb, register_depth(depth_m, self.depth.camera, self.camera, self.T_colour_depth), self.camera)
 
 
-def _require_size(place: str, image: ndarray, camera: Camera) -> None:
+def _require_size(location: str, image: ndarray, camera: Camera) -> None:
     height, width = image.shape[:2]
     if (width, height) != (camera.width_px, camera.height_px):
         expected = f"{camera.width_px}x{camera.height_px}"
-        raise DatasetError(f"{place}: expected the size of its camera_info, {expected}, got {width}x{height}")
+        raise DatasetError(f"{location}: expected the size of its camera_info, {expected}, got {width}x{height}")

@@ -91,7 +91,7 @@ class TransformTree:
             chain.append(parents[0])
         return chain
 
-    def moves(self, ancestor: str, frame: str) -> bool:
+    def changes_over_time(self, ancestor: str, frame: str) -> bool:
         """True if a transform between a frame and one of its ancestors changes over time."""
         chain = self.ancestors(frame)
         return any(link not in self._static for link in pairwise(chain[: chain.index(ancestor) + 1]))
@@ -141,16 +141,16 @@ class TransformTree:
         return np.eye(4) if T is None else T
 
 
-def track_of(place: str, poses: Mapping[int, tuple[tuple[float, ...], tuple[float, ...]]]) -> PoseTrack:
+def track_of(location: str, poses: Mapping[int, tuple[tuple[float, ...], tuple[float, ...]]]) -> PoseTrack:
     """Return poses over time; poses: translation and quaternion (x y z w) by time in nanoseconds."""
     times_ns = sorted(poses)
     translations_m = np.array([poses[time_ns][0] for time_ns in times_ns], np.float64)
     quats_xyzw = np.array([poses[time_ns][1] for time_ns in times_ns], np.float64)
-    return PoseTrack(place, seconds(times_ns), translations_m, quats_xyzw, MAX_GAP_S, _MAX_LAG_S)
+    return PoseTrack(location, seconds(times_ns), translations_m, quats_xyzw, MAX_GAP_S, _MAX_LAG_S)
 
 
-def _track(place: str, measured: list[Transform]) -> PoseTrack:
+def _track(location: str, measured: list[Transform]) -> PoseTrack:
     if measured[0].time_ns is None:
         pose = np.array([measured[0].translation_m]), np.array([measured[0].quat_xyzw])
-        return PoseTrack(place, np.zeros(1), *pose, MAX_GAP_S, np.inf)
-    return track_of(place, {t.time_ns: (t.translation_m, t.quat_xyzw) for t in measured if t.time_ns is not None})
+        return PoseTrack(location, np.zeros(1), *pose, MAX_GAP_S, np.inf)
+    return track_of(location, {t.time_ns: (t.translation_m, t.quat_xyzw) for t in measured if t.time_ns is not None})
