@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.keyframe_selection import Coverage, KeyframeSelection, KnownKeyframe, Selected
+from gausslite.mapping.keyframe_selection import Coverage, KeyframeAddition, KeyframeSelection, SelectedKeyframe
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.convert import frame_to_message, transform_from_message
@@ -23,35 +23,35 @@ class KeyframeUpload:
     def __init__(self, uplink: Uplink, grid: VoxelGrid, max_keyframes: int, during_mission: bool) -> None:
         """max_keyframes: the most that the server has at a time. during_mission: also send while mapping."""
         self._uplink, self._during_mission = uplink, during_mission
-        self._selection = KeyframeSelection(max_keyframes, grid, _known_keyframes(uplink))
-        self._last_offered: Keyframe | None = None
+        self._selection = KeyframeSelection(max_keyframes, grid, _selected_keyframes(uplink))
+        self._last_considered: Keyframe | None = None
 
-    def offer_newest(self, keyframes: Sequence[Keyframe]) -> None:
-        """Send the newest keyframe of the mission, if it adds to the coverage and was not offered before."""
-        if not self._during_mission or not keyframes or keyframes[-1] is self._last_offered:
+    def enqueue_newest(self, keyframes: Sequence[Keyframe]) -> None:
+        """Send the newest keyframe of the mission, if it adds to the coverage and was not considered yet."""
+        if not self._during_mission or not keyframes or keyframes[-1] is self._last_considered:
             return
-        self._last_offered = keyframes[-1]
-        self._send(self._selection.offer(keyframes[-1]))
+        self._last_considered = keyframes[-1]
+        self._send(self._selection.select(keyframes[-1]))
 
-    def offer_all(self, keyframes: Sequence[Keyframe]) -> None:
+    def enqueue_all(self, keyframes: Sequence[Keyframe]) -> None:
         """Send all keyframes of the mission, as far as the limit allows; those with a corrected pose again."""
         for keyframe in keyframes:
-            self._send(self._selection.offer(keyframe, min_gain_share=0.0))
+            self._send(self._selection.select(keyframe, min_gain_share=0.0))
 
-    def _send(self, selected: Selected | None) -> None:
-        if selected is None:
+    def _send(self, addition: KeyframeAddition | None) -> None:
+        if addition is None:
             return
-        frame = selected.keyframe.frame
+        frame = addition.keyframe.frame
         data = frame_to_message(frame, compact=True).SerializeToString()
-        spooled = SpooledKeyframe(frame.index, selected.gain, selected.coverage.to_bytes(), data)
+        spooled = SpooledKeyframe(frame.index, addition.gain, addition.coverage.to_bytes(), data)
         try:
-            self._uplink.enqueue_keyframe(spooled, selected.replaced)
+            self._uplink.enqueue_keyframe(spooled, addition.replaced)
         except StorageError as error:
             # mapping does not depend on it
             _log.warning("keyframe %d is not sent: %s", frame.index, error)
 
 
-def _known_keyframes(uplink: Uplink) -> dict[int, KnownKeyframe]:
+def _selected_keyframes(uplink: Uplink) -> dict[int, SelectedKeyframe]:
     """Return the keyframes in the spool, those from before a restart."""
     known = {}
     for each in uplink.selected_keyframes():
@@ -60,5 +60,5 @@ def _known_keyframes(uplink: Uplink) -> dict[int, KnownKeyframe]:
             T_world_camera = transform_from_message("keyframe t_world_camera", message.t_world_camera)
         except InvalidInputError as error:
             raise StorageError(f"spool: keyframe {each.frame_index} is damaged: {error}") from error
-        known[each.frame_index] = KnownKeyframe(Coverage.from_bytes(each.coverage), T_world_camera)
+        known[each.frame_index] = SelectedKeyframe(Coverage.from_bytes(each.coverage), T_world_camera)
     return known

@@ -167,7 +167,7 @@ class MappingWorker:
 
     def select_keyframes(self) -> Future[None]:
         """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""
-        return self.run(self._offer_all_keyframes)
+        return self.run(self._enqueue_all_keyframes)
 
     def close(self) -> None:
         """End the worker after its current frame; waiting frames are dropped."""
@@ -273,7 +273,7 @@ class MappingWorker:
             age_s=self._clock() - queued.arrival_s,
         )
         if self._keyframe_upload is not None:
-            self._keyframe_upload.offer_newest(self._mapper.keyframes())
+            self._keyframe_upload.enqueue_newest(self._mapper.keyframes())
         self._observe_free_space(frame)
         self._status.add_outcome(outcome)
         self._timeline.add(outcome)
@@ -313,9 +313,9 @@ class MappingWorker:
         self._free_space.observe(frame)
         self.uplink.enqueue_free_space(self._free_space.collect_changes())
 
-    def _offer_all_keyframes(self, mapper: GaussianMapper) -> None:
+    def _enqueue_all_keyframes(self, mapper: GaussianMapper) -> None:
         if self._keyframe_upload is not None:
-            self._keyframe_upload.offer_all(mapper.keyframes())
+            self._keyframe_upload.enqueue_all(mapper.keyframes())
 
     def _idle_step(self) -> bool:
         if self._task_mapper is None or not self._task_mapper.idle_step():

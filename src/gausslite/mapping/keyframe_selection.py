@@ -74,8 +74,11 @@ class Coverage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Selected:
-    """A keyframe to send. gain: value of what it adds; replaced: index of the keyframe that it replaces, or None."""
+class KeyframeAddition:
+    """A keyframe to add to the selection and to send.
+
+    gain: value of what it adds; replaced: index of the keyframe that it replaces, or None.
+    """
 
     keyframe: Keyframe
     coverage: Coverage
@@ -84,7 +87,7 @@ class Selected:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KnownKeyframe:
+class SelectedKeyframe:
     """A keyframe selected earlier, and the pose with which it was sent."""
 
     coverage: Coverage
@@ -95,35 +98,35 @@ class KeyframeSelection:
     """At most `max_keyframes` keyframes and how often each code is covered. Not thread-safe."""
 
     def __init__(
-        self, max_keyframes: int, grid: VoxelGrid, selected: Mapping[int, KnownKeyframe] | None = None
+        self, max_keyframes: int, grid: VoxelGrid, selected: Mapping[int, SelectedKeyframe] | None = None
     ) -> None:
-        """Selected: the keyframes that were selected before a restart, by frame index."""
+        """selected: the keyframes that were selected before a restart, by frame index."""
         self._max_keyframes, self._grid = max_keyframes, grid
-        self._selected: dict[int, KnownKeyframe] = {}
+        self._selected: dict[int, SelectedKeyframe] = {}
         self._roi: Counter[int] = Counter()
         self._background: Counter[int] = Counter()
-        for index, known in (selected or {}).items():
-            self._add(index, known)
+        for index, earlier in (selected or {}).items():
+            self._add(index, earlier)
 
-    def offer(self, keyframe: Keyframe, min_gain_share: float = MIN_GAIN_SHARE) -> Selected | None:
+    def select(self, keyframe: Keyframe, min_gain_share: float = MIN_GAIN_SHARE) -> KeyframeAddition | None:
         """Select the keyframe if it adds enough, or if its pose has been corrected since it was selected."""
         index = keyframe.frame.index
-        known = self._selected.get(index)
-        if known is not None and not _has_moved(known.T_world_camera, keyframe.frame.T_world_camera):
+        earlier = self._selected.get(index)
+        if earlier is not None and not _has_moved(earlier.T_world_camera, keyframe.frame.T_world_camera):
             return None
-        if known is not None:
+        if earlier is not None:
             self._remove(index)
         coverage = Coverage.of_keyframe(keyframe, self._grid)
         gain, replaced = self._gain(coverage), None
-        if known is None and gain < min_gain_share * coverage.value:
+        if earlier is None and gain < min_gain_share * coverage.value:
             return None
         if len(self._selected) >= self._max_keyframes:
             replaced = min(self._selected, key=lambda each: self._loss(self._selected[each].coverage))
             if gain <= _EXCHANGE_FACTOR * self._loss(self._selected[replaced].coverage):
                 return None
             self._remove(replaced)
-        self._add(index, KnownKeyframe(coverage, keyframe.frame.T_world_camera))
-        return Selected(keyframe, coverage, gain, replaced)
+        self._add(index, SelectedKeyframe(coverage, keyframe.frame.T_world_camera))
+        return KeyframeAddition(keyframe, coverage, gain, replaced)
 
     def _gain(self, coverage: Coverage) -> float:
         """Return the value of the codes that no selected keyframe covers."""
@@ -137,10 +140,10 @@ class KeyframeSelection:
         background = sum(self._background[code] == 1 for code in coverage.background.tolist())
         return _ROI_VALUE * roi + _BACKGROUND_VALUE * background
 
-    def _add(self, index: int, known: KnownKeyframe) -> None:
-        self._selected[index] = known
-        self._roi.update(known.coverage.roi.tolist())
-        self._background.update(known.coverage.background.tolist())
+    def _add(self, index: int, earlier: SelectedKeyframe) -> None:
+        self._selected[index] = earlier
+        self._roi.update(earlier.coverage.roi.tolist())
+        self._background.update(earlier.coverage.background.tolist())
 
     def _remove(self, index: int) -> None:
         coverage = self._selected.pop(index).coverage

@@ -125,7 +125,7 @@ def _select_keyframes(keyframes: Sequence[Keyframe], grid: VoxelGrid) -> list[Fr
     selection = KeyframeSelection(_MAX_KEYFRAMES, grid)
     frames: dict[int | None, Frame] = {}
     for keyframe in keyframes:
-        selected = selection.offer(keyframe, min_gain_share=0.0)
+        selected = selection.select(keyframe, min_gain_share=0.0)
         if selected is not None:
             frames[keyframe.frame.index] = keyframe.frame
             frames.pop(selected.replaced, None)
