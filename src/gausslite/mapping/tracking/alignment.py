@@ -34,7 +34,7 @@ _CONVERGED = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class PyramidLevel:
     """One level of the pyramid: the blur of both images, the largest depth difference of a pair, and its steps.
 
     max_depth_error: as a share of the depth.
@@ -45,7 +45,7 @@ class Level:
     steps: int
 
 
-COARSE_TO_FINE = (Level(5.0, 0.15, 4), Level(2.0, 0.08, 4), Level(0.8, 0.05, 4))
+COARSE_TO_FINE = (PyramidLevel(5.0, 0.15, 4), PyramidLevel(2.0, 0.08, 4), PyramidLevel(0.8, 0.05, 4))
 FINE = COARSE_TO_FINE[1:]
 
 
@@ -77,7 +77,7 @@ def align(
     T_world_rendered: Float64[ndarray, "4 4"],
     frame: Frame,
     prior_std: Float64[ndarray, "6"],
-    levels: tuple[Level, ...] = COARSE_TO_FINE,
+    levels: tuple[PyramidLevel, ...] = COARSE_TO_FINE,
 ) -> Alignment | None:
     """Return the frame's pose near the rendered pose; None if too few of the rendered points agree with the frame.
 
@@ -139,7 +139,7 @@ class _Model:
     share: float
 
     @classmethod
-    def of(cls, rendering: Rendering, camera: Camera, levels: tuple[Level, ...]) -> _Model | None:
+    def of(cls, rendering: Rendering, camera: Camera, levels: tuple[PyramidLevel, ...]) -> _Model | None:
         """Return the model, or None if the map covers too little of the view."""
         height, width = rendering.alpha.shape
         stride = int(np.ceil(np.sqrt(height * width / _MAX_POINTS)))

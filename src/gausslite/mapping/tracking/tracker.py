@@ -18,7 +18,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose import inverse, orthonormal, require_rigid, transform_of, twist_of
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
-from gausslite.mapping.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, Level, align
+from gausslite.mapping.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
 from gausslite.mapping.tracking.features import FeatureView, detect_features, relative_pose
 from gausslite.mapping.tracking.relocalisation import KeyframeIndex
 from gausslite.render.rasterizer import Rendering
@@ -36,7 +36,7 @@ _PRIOR_STD = np.array([0.1] * 3 + [np.radians(5.0)] * 3)
 """Error of a predicted pose: translation (m) and rotation (rad)."""
 
 
-class TrackedBy(StrEnum):
+class TrackingMethod(StrEnum):
     """How a frame's pose was found."""
 
     START = "start"
@@ -79,8 +79,8 @@ class CameraTracker:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of frames by `TrackedBy`, and of lost frames ("lost")."""
-        return {name: self._counts[name] for name in (*TrackedBy, "lost")}
+        """Number of frames by `TrackingMethod`, and of lost frames ("lost")."""
+        return {name: self._counts[name] for name in (*TrackingMethod, "lost")}
 
     def track(self, frame: Frame) -> Float64[ndarray, "4 4"] | None:
         """Return the frame's T_world_camera; None if the camera is lost."""
@@ -113,23 +113,23 @@ class CameraTracker:
         self._keyframes.add(current.features, current.T_world_camera)
         self._last, self._pending = current, None
 
-    def _find(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackedBy] | None:
+    def _find(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackingMethod] | None:
         last = self._last
         if last is None:
-            return frame.T_world_camera, TrackedBy.START
+            return frame.T_world_camera, TrackingMethod.START
         if self._lost_frames > 0:
             return self._relocalise(frame, features)
         by_features = relative_pose(last.features, features, frame.camera)
-        predictions: list[tuple[Float64[ndarray, "4 4"], tuple[Level, ...]]]
+        predictions: list[tuple[Float64[ndarray, "4 4"], tuple[PyramidLevel, ...]]]
         predictions = [(self._predict(frame, last), COARSE_TO_FINE)]
         if by_features is not None and by_features.inliers >= _MIN_FEATURE_INLIERS:
             predictions.insert(0, (last.T_world_camera @ inverse(by_features.T_current_reference), FINE))
         for T_world_predicted, levels in predictions:
             alignment = self._align(frame, T_world_predicted, levels)
             if alignment is not None:
-                return alignment.T_world_camera, TrackedBy.MAP
+                return alignment.T_world_camera, TrackingMethod.MAP
         if by_features is not None and by_features.inliers >= _RELIABLE_FEATURE_INLIERS:
-            return predictions[0][0], TrackedBy.FEATURES
+            return predictions[0][0], TrackingMethod.FEATURES
         return self._relocalise(frame, features)
 
     def _predict(self, frame: Frame, last: _LastFrame) -> Float64[ndarray, "4 4"]:
@@ -140,15 +140,15 @@ class CameraTracker:
         T_world_camera: Float64[ndarray, "4 4"] = last.T_world_camera @ T_last_frame
         return T_world_camera
 
-    def _relocalise(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackedBy] | None:
+    def _relocalise(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackingMethod] | None:
         for T_world_camera in self._keyframes.candidates(features, frame.camera):
             alignment = self._align(frame, T_world_camera, COARSE_TO_FINE)
             if alignment is not None:
-                return alignment.T_world_camera, TrackedBy.RELOCALISATION
+                return alignment.T_world_camera, TrackingMethod.RELOCALISATION
         return None
 
     def _align(
-        self, frame: Frame, T_world_predicted: Float64[ndarray, "4 4"], levels: tuple[Level, ...]
+        self, frame: Frame, T_world_predicted: Float64[ndarray, "4 4"], levels: tuple[PyramidLevel, ...]
     ) -> Alignment | None:
         """Return the pose aligned to the map near a prediction; None if map and frame do not agree there."""
         rendering = self._render(frame.camera, T_world_predicted, frame.motion)
@@ -187,7 +187,7 @@ class CameraTracker:
         self._velocity = get_array(state, "velocity", (6,), np.float64).copy()
         if not np.isfinite(self._velocity).all():
             raise MapFileError("state velocity: expected finite numbers, got NaN or infinity")
-        names = (*TrackedBy, "lost")
+        names = (*TrackingMethod, "lost")
         self._lost_frames, *counts = get_counts(state, "counts", 1 + len(names))
         self._counts = Counter(dict(zip(map(str, names), counts, strict=True)))
         last = select_prefix(state, "last")
