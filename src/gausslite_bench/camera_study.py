@@ -33,8 +33,8 @@ _TRAINING_TRAJECTORY, _HELD_OUT_TRAJECTORY = 0, 2
 _MS_PER_S = 1e3
 
 
-class Handling(StrEnum):
-    """The camera of a walk, and what corrects its images."""
+class CameraCondition(StrEnum):
+    """The camera of a walk, and the correction of its images."""
 
     IDEAL = "ideal camera"
     UNCORRECTED = "uncorrected"
@@ -71,28 +71,30 @@ class CameraStudy:
             raise InvalidInputError("camera study: expected no time offset: simulated poses are exact")
 
     def run(self, speed_deg_s: int, on_scored: Callable[[CameraScore], None]) -> list[CameraScore]:
-        """Return the scores of every handling at one angular speed; on_scored gets each. Raises GaussLiteError."""
+        """Return the scores in every condition at one angular speed; on_scored gets each. Raises GaussLiteError."""
         scores = []
         views = self._held_out()
-        for handling, source, correction, evidence in self._sources(speed_deg_s):
+        for condition, source, correction, evidence in self._sources(speed_deg_s):
             scene = self._scene(source, views)
             score = average([score_view(*each) for each in self._renderings(scene)])
             result = CameraScore(
-                speed_deg_s, handling, score.roi_psnr, score.full_psnr, str(correction or ""), tuple(evidence)
+                speed_deg_s, condition, score.roi_psnr, score.full_psnr, str(correction or ""), tuple(evidence)
             )
             scores.append(result)
             on_scored(result)
         return scores
 
-    def _sources(self, speed_deg_s: int) -> Iterator[tuple[Handling, Source, CameraCorrection | None, Sequence[str]]]:
+    def _sources(
+        self, speed_deg_s: int
+    ) -> Iterator[tuple[CameraCondition, Source, CameraCorrection | None, Sequence[str]]]:
         walk = f"{self._spec(_TRAINING_TRAJECTORY, self.frames * self.stride)}&speed={speed_deg_s}"
-        yield Handling.IDEAL, open_source(walk), None, ()
+        yield CameraCondition.IDEAL, open_source(walk), None, ()
         recorded = _CachedSource(open_source(walk + self._camera_options()))
-        yield Handling.UNCORRECTED, recorded, None, ()
-        yield Handling.TRUTH, CorrectedSource(recorded, self.truth), self.truth, ()
+        yield CameraCondition.UNCORRECTED, recorded, None, ()
+        yield CameraCondition.TRUTH, CorrectedSource(recorded, self.truth), self.truth, ()
         estimate = estimate_camera(recorded, CameraCorrection())
         corrected = recorded if estimate.correction.is_identity else CorrectedSource(recorded, estimate.correction)
-        yield Handling.ESTIMATE, corrected, estimate.correction, estimate.evidence
+        yield CameraCondition.ESTIMATE, corrected, estimate.correction, estimate.evidence
 
     def _camera_options(self) -> str:
         options = f"&shutter={_MS_PER_S * self.truth.readout_s:g}ms&blur={_MS_PER_S * self.truth.exposure_s:g}ms"
@@ -130,7 +132,7 @@ class CameraScore:
     """PSNR in dB of one walk: in the region (None if no view shows it) and over the image; the correction's text."""
 
     speed_deg_s: int
-    handling: Handling
+    condition: CameraCondition
     roi_psnr: float | None
     full_psnr: float
     correction: str
@@ -160,8 +162,8 @@ class _CachedSource(WrappedSource):
 
 
 def camera_table(scores: Sequence[CameraScore]) -> str:
-    """Return one row per speed: ROI PSNR with each handling, the loss to the ideal camera, and the estimates."""
-    names = list(Handling)
+    """Return one row per speed: ROI PSNR with each condition, the loss to the ideal camera, and the estimates."""
+    names = list(CameraCondition)
     lines = [
         "ROI PSNR in dB (full image) on held-out views of an ideal camera; in brackets the difference to the first.",
         "",
@@ -169,9 +171,9 @@ def camera_table(scores: Sequence[CameraScore]) -> str:
         f"|---|{'---|' * (len(names) + 1)}",
     ]
     for speed in dict.fromkeys(score.speed_deg_s for score in scores):
-        row = {score.handling: score for score in scores if score.speed_deg_s == speed}
-        cells = [_cell(row.get(name), row.get(Handling.IDEAL)) for name in names]
-        estimate = row[Handling.ESTIMATE].correction if Handling.ESTIMATE in row else ""
+        row = {score.condition: score for score in scores if score.speed_deg_s == speed}
+        cells = [_cell(row.get(name), row.get(CameraCondition.IDEAL)) for name in names]
+        estimate = row[CameraCondition.ESTIMATE].correction if CameraCondition.ESTIMATE in row else ""
         lines.append(f"| {speed} | {' | '.join(cells)} | {estimate.replace('|', ' ')} |")
     return "\n".join(lines) + "\n"
 

@@ -12,7 +12,7 @@ from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.lens import Lens
 from gausslite.mission.settings import MissionSettings
-from gausslite_bench.camera_study import CameraScore, CameraStudy, Handling, camera_table, read_truth
+from gausslite_bench.camera_study import CameraCondition, CameraScore, CameraStudy, camera_table, read_truth
 from gausslite_bench.quality.home_tasks import HOME_TASKS
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
@@ -23,7 +23,7 @@ SMALL = ["--size", "96x72", "--frames", "6", "--views", "3", "--iterations", "2"
 def test_the_study_scores_all_handlings_and_writes_its_files(tmp_path: Path) -> None:
     assert main(["bench", "camera", "--out", str(tmp_path), *SMALL]) == 0
     stored = json.loads((tmp_path / "camera.json").read_text())["scores"]
-    assert [score["handling"] for score in stored] == [str(each) for each in Handling]
+    assert [score["condition"] for score in stored] == [str(each) for each in CameraCondition]
     assert all(score["full_psnr"] > 10 for score in stored)
     assert stored[2]["correction"] == "lens=radtan:-0.2,0.03,0,0;readout=0.03;exposure=0.01"
     assert "| 60 |" in (tmp_path / "camera.md").read_text()
@@ -31,9 +31,9 @@ def test_the_study_scores_all_handlings_and_writes_its_files(tmp_path: Path) -> 
 
 def test_the_table_states_the_difference_to_the_ideal_camera() -> None:
     scores = [
-        CameraScore(30, Handling.IDEAL, 25.0, 20.0, ""),
-        CameraScore(30, Handling.UNCORRECTED, 23.5, 19.0, ""),
-        CameraScore(30, Handling.TRUTH, None, 19.5, "readout=0.03"),
+        CameraScore(30, CameraCondition.IDEAL, 25.0, 20.0, ""),
+        CameraScore(30, CameraCondition.UNCORRECTED, 23.5, 19.0, ""),
+        CameraScore(30, CameraCondition.TRUTH, None, 19.5, "readout=0.03"),
     ]
     row = camera_table(scores).splitlines()[-1]
     assert row == "| 30 | 25.00 (20.00) | 23.50 (19.00) [-1.50] | no view (19.50) |  |  |"

@@ -11,11 +11,11 @@ from gausslite.cli.main import main
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import ChecksumError
 from gausslite.wire.raw_calls import service_methods
+from gausslite_bench.fuzz.checksummed_messages import change_body, with_checksum
 from gausslite_bench.fuzz.corpus import CORPUS, read_corpus
 from gausslite_bench.fuzz.decoders import DECODERS, Outcomes, decode_one
 from gausslite_bench.fuzz.mutations import Mutator
 from gausslite_bench.fuzz.protobuf_fields import change_field, encode_fields, parse_fields
-from gausslite_bench.fuzz.sealed_messages import change_body, with_checksum
 
 
 def test_no_mutated_message_crashes_or_blocks_a_program(capsys: pytest.CaptureFixture[str]) -> None:

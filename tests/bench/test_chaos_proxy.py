@@ -54,7 +54,7 @@ def test_a_stalled_connection_gets_everything_when_it_is_healed(proxy: FaultProx
         ant.settimeout(0.2)
         with pytest.raises(TimeoutError):
             ant.recv(1)
-        proxy.heal("ant")
+        proxy.clear_faults("ant")
         ant.settimeout(WAIT_S)
         assert ant.recv(1) == b"2"
 
@@ -69,7 +69,7 @@ def test_a_cut_connection_is_reset_and_the_others_stay(proxy: FaultProxy) -> Non
         assert bee.recv(1) == b"3"
     with connect(proxy, "ant") as refused:
         assert refused.recv(1) == b""
-    proxy.heal("ant")
+    proxy.clear_faults("ant")
     with connect(proxy, "ant") as again:
         again.sendall(b"4")
         assert again.recv(1) == b"4"

@@ -87,7 +87,7 @@ class FaultProxy:
         """Forward every chunk late."""
         self._set(agent_id, delay_s=delay_s)
 
-    def heal(self, agent_id: str) -> None:
+    def clear_faults(self, agent_id: str) -> None:
         """End all faults of the agent's connections."""
         self._set(agent_id)
 

@@ -27,7 +27,7 @@ class MapWatcher:
         self._thread = threading.Thread(target=self._run, name="map-watcher", daemon=True)
         self._thread.start()
 
-    def reaches(self, expected: VoxelBatch, timeout_s: float) -> bool:
+    def wait_for(self, expected: VoxelBatch, timeout_s: float) -> bool:
         """Return whether the watched map gets the voxels, Σkappa and counts of `expected` within this time."""
         limit_s = time.monotonic() + timeout_s
         while not self._has(expected):

@@ -170,7 +170,7 @@ class _ChaosRun:
         else:
             self.proxy.delay(agent_id, self._random.uniform(0.01, _MAX_DELAY_S))
         self._pause()
-        self.proxy.heal(agent_id)
+        self.proxy.clear_faults(agent_id)
 
     def _kill_server(self) -> None:
         self._peak_mib = max(self._peak_mib, self.server.rss_mib())
@@ -239,7 +239,7 @@ class _ChaosRun:
         offline = offline_map(self.team.acknowledged)
         with FusionClient(self.server.address, deadline_s=60.0) as client:
             exported = client.export(Export())
-        same_watch = self.watcher.reaches(offline.batch, _WATCH_S)
+        same_watch = self.watcher.wait_for(offline.batch, _WATCH_S)
         rss_mib = self.server.rss_mib()
         self._kill_server()
         parts, last = list(self.team.acknowledged.values()), self.comparisons[-1]

@@ -13,7 +13,7 @@ from gausslite.codec.files import write_atomic
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
-from gausslite_bench.camera_study import CameraScore, CameraStudy, Handling, camera_table, read_truth
+from gausslite_bench.camera_study import CameraCondition, CameraScore, CameraStudy, camera_table, read_truth
 from gausslite_bench.cli.argument_types import read_counts, read_image_size
 from gausslite_bench.quality.home_tasks import choose_home_tasks
 
@@ -67,11 +67,11 @@ def run_camera(options: argparse.Namespace) -> int:
     study = CameraStudy(tasks[0], truth, settings, options.frames, views=options.views, size=options.size)
     prepare_folder(options.out)
     scores: list[CameraScore] = []
-    with progress_bar(len(options.speeds) * len(Handling), "camera", "map") as bar:
+    with progress_bar(len(options.speeds) * len(CameraCondition), "camera", "map") as bar:
 
         def show(score: CameraScore) -> None:
             roi = "no view shows the region" if score.roi_psnr is None else f"ROI {score.roi_psnr:.2f} dB"
-            line = f"{score.speed_deg_s} deg/s {score.handling}: {roi}, full {score.full_psnr:.2f} dB"
+            line = f"{score.speed_deg_s} deg/s {score.condition}: {roi}, full {score.full_psnr:.2f} dB"
             print_above_bar("; ".join((line, *score.evidence)))
             bar.update()
 

@@ -12,7 +12,7 @@ from gausslite.cli.progress import progress_bar
 from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.server.agent_load import LoadResult
-from gausslite_bench.server.bench import P99_LIMIT_MS, HeldResult, ServerBenchSettings, measure
+from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
 from gausslite_bench.server.running_server import DEFAULT_COMMAND
 
 
@@ -65,11 +65,11 @@ def _numbers(name: str, text: str, least: int) -> list[int]:
     return numbers
 
 
-def _values(result: HeldResult) -> dict[str, object]:
+def _values(result: StoredSizeResult) -> dict[str, object]:
     return asdict(result) | {"largest_team": result.largest_team}
 
 
-def _lines(result: HeldResult) -> Iterator[str]:
+def _lines(result: StoredSizeResult) -> Iterator[str]:
     yield f"{result.held} Gaussians held (filled in {result.fill_s:.1f} s)"
     yield f"  largest team with p99 < {P99_LIMIT_MS:g} ms: {result.largest_team} agents"
     for load in result.loads:

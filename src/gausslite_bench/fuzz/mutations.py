@@ -6,8 +6,8 @@ import random
 import struct
 from collections.abc import Sequence
 
+from gausslite_bench.fuzz.checksummed_messages import change_body, with_checksum
 from gausslite_bench.fuzz.protobuf_fields import change_field, encode_fields, parse_fields
-from gausslite_bench.fuzz.sealed_messages import change_body, with_checksum
 
 _NUMBERS = (
     *(struct.pack(code, value) for code, value in (("<B", 0), ("<B", 255), ("<H", 65535), ("<h", -32768))),

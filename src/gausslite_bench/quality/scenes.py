@@ -74,7 +74,7 @@ class ScenePlan(Protocol):
 
     @property
     def pose_policy(self) -> PosePolicy:
-        """Handling of pose and exposure errors, the same for every policy."""
+        """How pose and exposure errors are handled, the same for every policy."""
         ...
 
     def settings(self) -> Mapping[str, object]:

@@ -36,7 +36,7 @@ class ServerBenchSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldResult:
+class StoredSizeResult:
     """The figures of a server that holds this many Gaussians."""
 
     held: int
@@ -60,7 +60,7 @@ class HeldResult:
         return largest
 
 
-def measure(settings: ServerBenchSettings, held: int, note: Callable[[str], None]) -> HeldResult:
+def measure(settings: ServerBenchSettings, held: int, note: Callable[[str], None]) -> StoredSizeResult:
     """Fill a new server and measure it. `note` receives what is done now."""
     with tempfile.TemporaryDirectory() as folder:
         server = RunningServer(settings.command, Path(folder), settings.store)
@@ -72,7 +72,7 @@ def measure(settings: ServerBenchSettings, held: int, note: Callable[[str], None
 
 def _measure(
     settings: ServerBenchSettings, held: int, server: RunningServer, note: Callable[[str], None]
-) -> HeldResult:
+) -> StoredSizeResult:
     load = AgentLoad(server.address)
     note(f"{held} Gaussians: fill")
     begin_s = time.monotonic()
@@ -93,7 +93,9 @@ def _measure(
     rss_mib = server.rss_mib()
     watchers_mib = _idle_watchers_mib(server, settings.watchers)
     restart_s = server.restart()
-    return HeldResult(held, tuple(loads), hostile, fill_s, snapshot_s, status_ms, restart_s, rss_mib, watchers_mib)
+    return StoredSizeResult(
+        held, tuple(loads), hostile, fill_s, snapshot_s, status_ms, restart_s, rss_mib, watchers_mib
+    )
 
 
 def _snapshot_s(address: str) -> float:

@@ -19,7 +19,7 @@ _AXIS = np.array([0.3, 0.5, 0.81])
 
 @dataclass(frozen=True, slots=True)
 class FrameError:
-    """A shift and a turn of the whole frame, and drift as a share of the travelled distance."""
+    """A shift and a rotation of the whole frame, and drift as a share of the travelled distance."""
 
     shift_m: float = 0.0
     rotation_deg: float = 0.0
@@ -37,7 +37,7 @@ class FrameError:
         return self == FrameError()
 
     def apply(self, frames: Sequence[Frame]) -> list[Frame]:
-        """Return the frames with wrong poses; the turn is about the first camera."""
+        """Return the frames with wrong poses; the rotation is about the first camera."""
         if self.is_zero or not frames:
             return list(frames)
         centres = np.array([frame.T_world_camera[:3, 3] for frame in frames])
@@ -48,11 +48,11 @@ class FrameError:
         ]
 
     def _motion(self, centre: Float64[ndarray, "3"], travelled_m: float) -> Float64[ndarray, "4 4"]:
-        turn = transform_of(
+        rotation = transform_of(
             np.concatenate([np.zeros(3), np.radians(self.rotation_deg) * _AXIS / np.linalg.norm(_AXIS)])
         )
         shift = (self.shift_m + self.drift * travelled_m) * _DIRECTION / np.linalg.norm(_DIRECTION)
         motion = np.eye(4)
-        motion[:3, :3] = turn[:3, :3]
-        motion[:3, 3] = centre - turn[:3, :3] @ centre + shift
+        motion[:3, :3] = rotation[:3, :3]
+        motion[:3, 3] = centre - rotation[:3, :3] @ centre + shift
         return motion

@@ -67,7 +67,7 @@ class TeamPlan(Protocol):
 
     @property
     def pose_policy(self) -> PosePolicy:
-        """Handling of pose and exposure errors, the same for every policy."""
+        """How pose and exposure errors are handled, the same for every policy."""
         ...
 
     def load(self, size: tuple[int, int]) -> TeamScene:
