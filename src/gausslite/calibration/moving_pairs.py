@@ -33,7 +33,7 @@ MIN_COMPARABLE_SHARE = 0.08
 _MIN_SPEED_RAD_S = math.radians(8.0)
 """Slower cameras move rows by less than a pixel in a readout of 30 ms."""
 _MIN_HALVED_PIXELS = 160 * 120
-_PAIR_TURN_RAD = math.radians(8.0)
+_PAIR_ROTATION_RAD = math.radians(8.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class MovingPairs:
 
 
 def fastest_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
-    """Return positions of frame pairs on the fastest stretches; the second is turned by about 8 degrees."""
+    """Return positions of frame pairs on the fastest stretches; the second is rotated by about 8 degrees."""
     speeds = trajectory.angular_speeds_rad_s()
     separation = max(1, len(speeds) // (2 * _MAX_PAIRS))
     pairs: list[tuple[int, int]] = []
@@ -114,7 +114,7 @@ def fastest_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
         if len(pairs) == _MAX_PAIRS or speeds[i] < _MIN_SPEED_RAD_S:
             break
         if all(abs(i - first) >= separation for first, _ in pairs):
-            second = _first_turned(trajectory, i)
+            second = _first_rotated(trajectory, i)
             if second is not None:
                 pairs.append((i, second))
     return pairs
@@ -129,10 +129,11 @@ def read_frames(source: Source, positions: Sequence[int], size: tuple[int, int])
     return frames
 
 
-def _first_turned(trajectory: Trajectory, i: int) -> int | None:
+def _first_rotated(trajectory: Trajectory, i: int) -> int | None:
+    """Return the first later position that is rotated enough; the last one if none is; None without a later one."""
     R_world_first = trajectory.T_world_camera[i][:3, :3]
     for j in range(i + 1, len(trajectory.times_s)):
-        turn = cv2.Rodrigues(R_world_first.T @ trajectory.T_world_camera[j][:3, :3])[0]
-        if np.linalg.norm(turn) >= _PAIR_TURN_RAD:
+        rotation = cv2.Rodrigues(R_world_first.T @ trajectory.T_world_camera[j][:3, :3])[0]
+        if np.linalg.norm(rotation) >= _PAIR_ROTATION_RAD:
             return j
     return len(trajectory.times_s) - 1 if i + 1 < len(trajectory.times_s) else None

@@ -114,7 +114,7 @@ class FrameScheduler:
             if stage not in self._stages_s:
                 # without this, a stage with a long forecast would never run again
                 fade = _ITERATION_FADE_PER_FRAME if stage in ITERATION_STAGES else _FADE_PER_FRAME
-                self._forecasts[stage].fade(fade)
+                self._forecasts[stage].decay(fade)
         self._cheapest_iteration = Stage.ACTIVE if Stage.ACTIVE in self._stages_s else Stage.WARM_UP
         self._begin_s = self._clock()
         self._stages_s, self._iterations = {}, 0
@@ -142,7 +142,7 @@ class FrameScheduler:
         if self._settings is None:
             return True
         missing = max(0, self._settings.min_iterations - self._iterations - (stage in ITERATION_STAGES))
-        needed_s = self._forecasts[stage].cautious_s + missing * self._forecasts[self._cheapest_iteration].mean_s
+        needed_s = self._forecasts[stage].upper_s + missing * self._forecasts[self._cheapest_iteration].mean_s
         return self._clock() + needed_s < self._training_deadline_s
 
     def trains_on(self, stage: Stage, iterations_per_frame: int) -> bool:
@@ -156,7 +156,7 @@ class FrameScheduler:
         if below_minimum and self._iterations == 0:
             return True
         deadline_s = self._min_iterations_deadline_s if below_minimum else self._training_deadline_s
-        return self._clock() + self._forecasts[stage].cautious_s < deadline_s
+        return self._clock() + self._forecasts[stage].upper_s < deadline_s
 
     def timing(self, stage: Stage) -> AbstractContextManager[None]:
         """Return a context that measures one execution of the stage and updates its forecast."""
@@ -186,7 +186,7 @@ class FrameScheduler:
         """Set the deadlines of all training and of the min_iterations, reserving time for the fixed stages to come."""
         skipped = {stage for skippable in self._skipped for stage in _STAGES_SKIPPED[skippable]}
         remaining = _FIXED_STAGES - skipped - self._stages_s.keys()
-        training_s = settings.seconds_per_frame - sum(self._forecasts[stage].cautious_s for stage in remaining)
+        training_s = settings.seconds_per_frame - sum(self._forecasts[stage].upper_s for stage in remaining)
         self._training_deadline_s = self._begin_s + training_s - max(self._behind_s, self._waited_s)
         self._min_iterations_deadline_s = self._begin_s + training_s - self._behind_s + settings.deadline_slack_s
 
@@ -249,7 +249,7 @@ class _Forecast:
         return self._mean_s or 0.0
 
     @property
-    def cautious_s(self) -> float:
+    def upper_s(self) -> float:
         """The mean plus the mean deviation."""
         return self.mean_s + self._deviation_s
 
@@ -257,11 +257,11 @@ class _Forecast:
         if self._mean_s is None:
             self._mean_s = seconds
             return
-        error_s = min(seconds, max(_OUTLIER_FACTOR * self.cautious_s, self._outlier_s)) - self._mean_s
+        error_s = min(seconds, max(_OUTLIER_FACTOR * self.upper_s, self._outlier_s)) - self._mean_s
         self._mean_s += _EMA_WEIGHT * error_s
         self._deviation_s += _EMA_WEIGHT * (abs(error_s) - self._deviation_s)
 
-    def fade(self, share: float) -> None:
+    def decay(self, share: float) -> None:
         """Lower the forecast of a stage that did not run, so that it runs again some time after a slow run."""
         self._mean_s = None if self._mean_s is None else share * self._mean_s
         self._deviation_s *= share
