@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from agent_running import TASK, Agent, agent
 from robot_bag import COLOUR, COLOUR_INFO, DELAYS_NS, DEPTH, DEPTH_INFO, arrivals, write_robot_bag
+from waiting import wait_until
 
 from gausslite.datasets.ros.address import BagAddress
 from gausslite.datasets.ros.bag_source import BagSource
@@ -36,15 +36,6 @@ MUG = ObjectLandmark(
     "1", "mug", ObjectRole.TARGET, (1.0, 2.0, 0.5), AxisAlignedBox((0.9, 1.9, 0.4), (1.1, 2.1, 0.6)), 0.8, 0, 1
 )
 SNAPSHOT = AgentSnapshot("husky", "mapping", TASK, 10, 3, 0, 0, 0, 4.0, 0.1, 0.2, "", (), np.eye(4), (MUG,))
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    turn = threading.Event()
-    for _ in range(3000):
-        if condition():
-            return
-        turn.wait(0.01)
-    raise AssertionError("the condition did not become true")
 
 
 @contextmanager

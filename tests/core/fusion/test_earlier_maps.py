@@ -74,8 +74,8 @@ def test_a_tombstone_of_the_new_map_leaves_the_earlier_one() -> None:
 
 def test_of_many_maps_two_are_stored_and_the_best_of_each_voxel_stays() -> None:
     engine = engine_on()
-    for life in range(5):
-        send(engine, reboot(engine), 1, {0: [10 - life], life + 1: [7]})
+    for start in range(5):
+        send(engine, reboot(engine), 1, {0: [10 - start], start + 1: [7]})
         # an answer that was lost: the robot joins again before it has sent anything
         reboot(engine)
         reboot(engine)

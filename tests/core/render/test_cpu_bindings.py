@@ -6,28 +6,16 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
+from cpu_scenes import CAMERA, random_rows
 
-from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Subset, UpdateCounter
 
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
-CAMERA = Camera(75.0, 74.0, 50.3, 39.7, 101, 83)
 FAST = AdamSettings(means=5e-2, log_scales=2e-1, quats=1e-1, opacity_logits=2e-1, rgb=1e-1)
-"""Rates so high that Gaussians become visible or invisible within a subset_ids steps."""
-
-
-def random_rows(n: int = 5000) -> np.ndarray:
-    rng = np.random.default_rng(0)
-    rows = np.zeros((n, 16), np.float32)
-    rows[:, :3] = rng.uniform((-2, -2, -0.5), (2, 2, 4), (n, 3))
-    rows[:, 3:6] = np.log(rng.uniform(0.005, 0.1, (n, 3)))
-    rows[:, 6:10] = rng.normal(size=(n, 4))
-    rows[:, 10] = rng.normal(0.0, 2.0, n)
-    rows[:, 11:14] = rng.random((n, 3))
-    return rows
+"""Rates so high that Gaussians become visible or invisible within a few steps."""
 
 
 def pose(turned_rad: float) -> np.ndarray:
@@ -51,7 +39,7 @@ def train(rasterizer: CpuRasterizer, bind: bool, loss: LossWeights) -> list[np.n
         CAMERA,
         (rng.random(size) < 0.5).astype(np.float32),
     )
-    rows = random_rows()
+    rows = random_rows(5000)
     bound = rows, np.zeros_like(rows), np.zeros_like(rows)
     subset_ids = np.arange(0, len(rows), 3, dtype=np.uint32)
     trainable = rng.random(len(rows)) < 0.5
@@ -139,7 +127,7 @@ def test_invalid_arguments_are_rejected_repeatedly() -> None:
 def test_tile_subset_matches_the_whole_image(seed: int, simd: str) -> None:
     rasterizer, tiles = CpuRasterizer(2, simd), scattered_tiles(seed)
     pixels = tiles.repeat(16, 0).repeat(16, 1)[: CAMERA.height_px, : CAMERA.width_px]
-    whole = rasterizer.forward(random_rows(), CAMERA, pose(0.1 * seed))
-    part = rasterizer.forward(random_rows(), CAMERA, pose(0.1 * seed), Subset(tiles))
+    whole = rasterizer.forward(random_rows(5000), CAMERA, pose(0.1 * seed))
+    part = rasterizer.forward(random_rows(5000), CAMERA, pose(0.1 * seed), Subset(tiles))
     np.testing.assert_array_equal(part.rgb, np.where(pixels[..., None], whole.rgb, 0))
     np.testing.assert_array_equal(part.depth_m, np.where(pixels, whole.depth_m, 0))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from agent_running import TASK, Agent, agent
 from exported_recordings import home_frames
+from waiting import wait_until
 
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.lens import Lens, LensModel
@@ -17,15 +16,6 @@ from gausslite.wire.agent_link import AgentLink, LinkSettings
 from gausslite.wire.clients import AgentClient
 
 SETTINGS = LinkSettings(poll_s=0.02, queue_frames=2, lossless=True)
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    turn = threading.Event()
-    for _ in range(3000):
-        if condition():
-            return
-        turn.wait(0.01)
-    raise AssertionError("the condition did not become true")
 
 
 def mapping(link: AgentLink) -> bool:

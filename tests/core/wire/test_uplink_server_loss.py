@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sqlite3
-import threading
 from pathlib import Path
 
 from fusion_running import GRID, fusion_server, make_batch
+from waiting import wait_until
 
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -18,13 +18,6 @@ from gausslite.wire.uplink import Uplink
 from gausslite.wire.uplink_values import UplinkSettings
 
 QUICK = UplinkSettings(interval_s=0.02, first_backoff_s=0.05, check_interval_s=0.1)
-
-
-def wait_until(condition) -> None:
-    """Wait for a change that another thread makes; the test's own timeout limits it."""
-    pause = threading.Event()
-    while not condition():
-        pause.wait(0.02)
 
 
 def send_then_replace(first: FusionStore, second: FusionStore, tmp_path: Path) -> None:
