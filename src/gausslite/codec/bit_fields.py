@@ -8,19 +8,18 @@ from numpy import ndarray
 
 from gausslite.domain.errors import CodecError
 
-MAX_WIDTH_BITS = 17
 _WINDOW_BYTES = 3
 
 
 def pack_bits(values: Int64[ndarray, " n"], widths: Int64[ndarray, " n"]) -> bytes:
     """Return the low widths[i] bits of values[i], one value after the other; the last byte is filled with zeros."""
-    places = np.arange(int(widths.max(initial=0)))
-    bits = (values[:, None] >> places & 1).astype(np.uint8)
-    return np.packbits(bits[places < widths[:, None]], bitorder="little").tobytes()
+    bit_indices = np.arange(int(widths.max(initial=0)))
+    bits = (values[:, None] >> bit_indices & 1).astype(np.uint8)
+    return np.packbits(bits[bit_indices < widths[:, None]], bitorder="little").tobytes()
 
 
 def unpack_bits(data: bytes, widths: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
-    """Return the values of these widths of at most MAX_WIDTH_BITS.
+    """Return the values of these widths, each at most 17 bits.
 
     Raises CodecError if the data has another size or a bit after the last.
     """
@@ -32,7 +31,7 @@ def unpack_bits(data: bytes, widths: Int64[ndarray, " n"]) -> Int64[ndarray, " n
         raise CodecError("subset: expected zeros after the last bit field, got other bits")
     starts = ends - widths
     first, padded = starts >> 3, np.frombuffer(data + bytes(_WINDOW_BYTES), np.uint8).astype(np.int64)
-    # a field of MAX_WIDTH_BITS that begins at the last bit of a byte ends in the second byte after it
+    # a field of 17 bits that begins at the last bit of a byte ends in the second byte after it
     window = padded[first] | padded[first + 1] << 8 | padded[first + 2] << 16
     values: Int64[ndarray, " n"] = window >> (starts & 7) & (np.int64(1) << widths) - 1
     return values
