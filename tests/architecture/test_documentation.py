@@ -124,8 +124,8 @@ def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
     # of pip, docker and our own scripts
     others = {"--check", "--editable", "--no-index", "--build", "--python"}
     others |= {"--masks", "--homes", "--gains", "--pose-noise"}
-    # of cibuildwheel, mkdocs, pytest-xdist and cmake
-    others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel"}
+    # of cibuildwheel, mkdocs, pytest-xdist, cmake and ray
+    others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel", "--head"}
     unknown = []
     for page in pages():
         text = page.read_text()

@@ -6,6 +6,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -24,7 +25,10 @@ _WATCH_PAUSE_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class ServerBenchSettings:
-    """What to measure; command: starts the server. watchers: number that stop reading after the first block."""
+    """What to measure; command: starts the server. watchers: number that stop reading after the first block.
+
+    servers: number of servers on the store, which must be one that they can share.
+    """
 
     held: Sequence[int]
     agents: Sequence[int]
@@ -33,6 +37,7 @@ class ServerBenchSettings:
     store: str
     watchers: int
     hostile: bool
+    servers: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,18 +67,19 @@ class StoredSizeResult:
 
 def measure(settings: ServerBenchSettings, held: int, note: Callable[[str], None]) -> StoredSizeResult:
     """Fill a new server and measure it. `note` receives what is done now."""
-    with tempfile.TemporaryDirectory() as folder:
-        server = RunningServer(settings.command, Path(folder), settings.store)
-        try:
-            return _measure(settings, held, server, note)
-        finally:
-            server.close()
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
+        servers = []
+        for number in range(settings.servers):
+            servers.append(RunningServer(settings.command, Path(folder), settings.store, f"fusion-{number}"))
+            opened.callback(servers[-1].close)
+        return _measure(settings, held, servers, note)
 
 
 def _measure(
-    settings: ServerBenchSettings, held: int, server: RunningServer, note: Callable[[str], None]
+    settings: ServerBenchSettings, held: int, servers: Sequence[RunningServer], note: Callable[[str], None]
 ) -> StoredSizeResult:
-    load = AgentLoad(server.address)
+    server = servers[0]
+    load = AgentLoad([each.address for each in servers])
     note(f"{held} Gaussians: fill")
     begin_s = time.monotonic()
     load.fill(held, GAUSSIANS_PER_VOXEL)
@@ -81,9 +87,11 @@ def _measure(
     loads: list[LoadResult] = []
     for agents in settings.agents:
         note(f"{held} Gaussians: {agents} agents")
-        cpu_s = server.cpu_s()
+        cpu_s = sum(each.cpu_s() for each in servers)
         result = load.run(agents, settings.seconds)
-        loads.append(replace(result, server_cpu_ms=1000 * (server.cpu_s() - cpu_s) / result.messages))
+        loads.append(
+            replace(result, server_cpu_ms=1000 * (sum(each.cpu_s() for each in servers) - cpu_s) / result.messages)
+        )
     hostile = None
     if settings.hostile:
         note(f"{held} Gaussians: hostile agent")
