@@ -9,7 +9,7 @@ from gausslite_sim.lighting import Lighting
 from gausslite_sim.scene_objects import Item
 from gausslite_sim.sensor_noise import SensorNoise
 from gausslite_sim.textures import Texture
-from gausslite_sim.trajectory import Trajectory
+from gausslite_sim.trajectory import TrajectorySampler
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,6 +23,6 @@ class HomePlan:
     items: Sequence[Item]
     textures: dict[str, Texture]
     lighting: Lighting
-    trajectories: tuple[Trajectory, ...]
+    trajectories: tuple[TrajectorySampler, ...]
     exposure_drift: float = 0.0
     sensor: SensorNoise = field(default_factory=SensorNoise)

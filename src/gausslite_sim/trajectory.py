@@ -14,8 +14,8 @@ from gausslite_sim.mesh import Vector
 
 @runtime_checkable
 @runtime_checkable
-class Trajectory(Protocol):
-    """T_world_camera along a path (z up; OpenCV camera axes, no roll)."""
+class TrajectorySampler(Protocol):
+    """Returns poses T_world_camera along a path (z up; OpenCV camera axes, no roll)."""
 
     def __call__(self, frames: int, numbers: Float64[ndarray, " n"] | None = None) -> Float64[ndarray, "n 4 4"]:
         """Return the poses of `frames` frames, evenly spaced along the path.
@@ -29,7 +29,7 @@ Waypoint = tuple[Vector, Vector]
 """(eye position, look-at target) in metres."""
 
 
-def spline_trajectory(keys: Sequence[Waypoint]) -> Trajectory:
+def spline_trajectory(keys: Sequence[Waypoint]) -> TrajectorySampler:
     """Return the trajectory from the first waypoint to the last."""
     waypoints = np.array(keys)
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite_sim.trajectory import Trajectory, look_at_poses, spline_trajectory
+from gausslite_sim.trajectory import TrajectorySampler, look_at_poses, spline_trajectory
 from gausslite_sim.two_room_layout import TABLE_CENTRE_M
 
 _CX, _CY = TABLE_CENTRE_M
@@ -52,7 +52,7 @@ def _around_the_table(frames: int, numbers: Float64[ndarray, " n"] | None = None
     return look_at_poses(eyes, targets)
 
 
-TRAJECTORIES: tuple[Trajectory, ...] = (
+TRAJECTORIES: tuple[TrajectorySampler, ...] = (
     _around_the_table,
     spline_trajectory(_KITCHEN_TO_LIVING),
     spline_trajectory(_HELD_OUT),

@@ -31,7 +31,7 @@ from gausslite_agent.mission_checkpoint import SavedMission
 from gausslite_agent.parser_wait import WaitingParser
 from gausslite_agent.periodic_save import PeriodicSave
 from gausslite_agent.servicer import AgentServicer
-from gausslite_agent.settings import NO_TEAM_MAP, AgentSettings, LinkSettings, parse_arguments
+from gausslite_agent.settings import NO_TEAM_MAP, AgentSettings, ConnectionSettings, parse_arguments
 from gausslite_agent.team_map import TeamMapFollower
 
 _log = logging.getLogger(__name__)
@@ -173,7 +173,7 @@ def _open_uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bo
 
 
 def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: ExitStack) -> None:
-    """Insert teammates' voxels of the task's region into the map, if the options ask for it."""
+    """Insert teammates' voxels of the task's region into the map, if --team-map is set."""
     link = settings.link
     if link.fusion is None or link.team_map == NO_TEAM_MAP:
         return
@@ -188,7 +188,7 @@ def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: Exit
     stack.callback(follower.close)
 
 
-def _keyframe_upload(link: LinkSettings, uplink: Uplink | None) -> KeyframeUpload | None:
+def _keyframe_upload(link: ConnectionSettings, uplink: Uplink | None) -> KeyframeUpload | None:
     if uplink is None or link.keyframes == 0:
         return None
     return KeyframeUpload(uplink, link.grid, link.keyframes, link.keyframes_during_mission)

@@ -47,7 +47,7 @@ _IDLE_ITERATIONS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class LinkSettings:
+class ConnectionSettings:
     """Connections to the other services.
 
     parser: its address, None to parse tasks in this process; fusion: its address, None to send nothing. spool: file of
@@ -97,7 +97,7 @@ class AgentSettings:
     out: Path | None
     exit_when_done: bool
     source: SourceSettings | None
-    link: LinkSettings
+    link: ConnectionSettings
     mission: MissionSettings
     load: LoadSettings
     tls: Tls | None = None
@@ -132,7 +132,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
             options.camera_correction,
             require_poses=options.poses != PoseMode.TRACK,
         )
-    link = LinkSettings(
+    link = ConnectionSettings(
         options.parser,
         options.fusion,
         options.mission,

@@ -1,6 +1,6 @@
 """The process of one agent: a map that changes at random, and the agent's own spool and uplink.
 
-`python -m gausslite_bench.chaos.agent_process SETTINGS`, with AgentSettings as JSON. The process sends until its
+`python -m gausslite_bench.chaos.agent_process SETTINGS`, with ChaosAgentSettings as JSON. The process sends until its
 standard input ends. Then it drains the uplink and prints one line of JSON.
 """
 
@@ -31,7 +31,7 @@ _UPLINK = UplinkSettings(interval_s=0.05, deadline_s=20.0, first_backoff_s=0.05,
 
 
 @dataclass(frozen=True, slots=True)
-class AgentSettings:
+class ChaosAgentSettings:
     """What one process needs; seed: of its changes, another one after each restart."""
 
     agent_id: str
@@ -49,7 +49,7 @@ def changed_voxels(rng: np.random.Generator) -> VoxelBatch:
     return merge_batches(select_voxels(batch, ~removed), tombstones(batch.keys[removed]))
 
 
-def run(settings: AgentSettings) -> dict[str, object]:
+def run(settings: ChaosAgentSettings) -> dict[str, object]:
     """Send changes until the standard input ends; returns whether everything was acknowledged, and the counters."""
     spool = Spool(Path(settings.spool), settings.agent_id, GRID)
     client = JournalingClient(settings.address, spool.token, Journal(Path(settings.journal)))
@@ -71,4 +71,4 @@ def _set_at_end_of_input(stopping: threading.Event) -> None:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(run(AgentSettings(**json.loads(sys.argv[1])))) + "\n")
+    sys.stdout.write(json.dumps(run(ChaosAgentSettings(**json.loads(sys.argv[1])))) + "\n")

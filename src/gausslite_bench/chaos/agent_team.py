@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gausslite.domain.errors import UnavailableError
 from gausslite_bench.chaos.acknowledged import AgentAcknowledgements
-from gausslite_bench.chaos.agent_process import DRAIN_S, AgentSettings
+from gausslite_bench.chaos.agent_process import DRAIN_S, ChaosAgentSettings
 
 _END_S = DRAIN_S + 60.0
 
@@ -33,7 +33,7 @@ class AgentTeam:
         return sum(each.messages for each in self.acknowledged.values())
 
     def read(self) -> None:
-        """Take in what all journals have gained."""
+        """Read the new records of all journals."""
         for each in self.acknowledged.values():
             each.read()
 
@@ -41,7 +41,7 @@ class AgentTeam:
         """Start an agent on its spool."""
         journal = self._folder / f"{agent_id}-{next(self._lives[agent_id])}.journal"
         spool = self._folder / f"{agent_id}.spool"
-        settings = AgentSettings(agent_id, self._address_of(agent_id), str(spool), str(journal), seed)
+        settings = ChaosAgentSettings(agent_id, self._address_of(agent_id), str(spool), str(journal), seed)
         self.acknowledged[agent_id].add_journal(journal)
         command = [sys.executable, "-m", "gausslite_bench.chaos.shifted_clock", str(clock_offset_s)]
         command += ["gausslite_bench.chaos.agent_process", json.dumps(asdict(settings))]

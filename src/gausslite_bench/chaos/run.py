@@ -26,7 +26,7 @@ from gausslite_bench.chaos.acknowledged import StoreComparison, compare_store, o
 from gausslite_bench.chaos.agent_team import AgentTeam
 from gausslite_bench.chaos.fault_proxy import FaultProxy
 from gausslite_bench.chaos.map_watcher import MapWatcher
-from gausslite_bench.server.running_server import RunningServer
+from gausslite_bench.server.server_process import ServerProcess
 
 _STORE = "store.sqlite"
 _DAY_S = 86_400.0
@@ -101,14 +101,14 @@ class ChaosResult:
         return self.same_map and self.same_watch and not has_faults
 
 
-def run_chaos(settings: ChaosSettings, note: Callable[[], object]) -> ChaosResult:
-    """Run the faults; `note` is called after each kill or partition. Raises UnavailableError."""
+def run_chaos(settings: ChaosSettings, on_fault: Callable[[], object]) -> ChaosResult:
+    """Run the faults; `on_fault` is called after each kill or partition. Raises UnavailableError."""
     with tempfile.TemporaryDirectory() as name, ExitStack() as opened:
         folder = Path(name)
         if settings.out is not None:
             opened.callback(shutil.copytree, folder, settings.out, dirs_exist_ok=True, ignore=_ignore_sockets)
         agents = [f"agent-{number}" for number in range(settings.agents)]
-        server = RunningServer(_server_command(0.0), folder, "sqlite")
+        server = ServerProcess(_server_command(0.0), folder, "sqlite")
         opened.callback(server.kill)
         proxy = FaultProxy(folder, Path(server.address.removeprefix("unix:")), agents)
         opened.callback(proxy.close)
@@ -116,7 +116,7 @@ def run_chaos(settings: ChaosSettings, note: Callable[[], object]) -> ChaosResul
         opened.callback(team.close)
         watcher = MapWatcher(server.address)
         opened.callback(watcher.close)
-        return _ChaosRun(settings, folder, server, proxy, team, watcher).run(note)
+        return _ChaosRun(settings, folder, server, proxy, team, watcher).run(on_fault)
 
 
 @dataclass(slots=True)
@@ -125,7 +125,7 @@ class _ChaosRun:
 
     settings: ChaosSettings
     folder: Path
-    server: RunningServer
+    server: ServerProcess
     proxy: FaultProxy
     team: AgentTeam
     watcher: MapWatcher
@@ -134,7 +134,7 @@ class _ChaosRun:
     _random: random.Random = field(init=False)
     _peak_mib: float = 0.0
 
-    def run(self, note: Callable[[], object]) -> ChaosResult:
+    def run(self, on_fault: Callable[[], object]) -> ChaosResult:
         begin_s = time.monotonic()
         self._random = random.Random(self.settings.seed)  # noqa: S311 - reproducible faults
         for agent_id in self.team.acknowledged:
@@ -146,7 +146,7 @@ class _ChaosRun:
             if self._random.random() < _RESEND_SHARE:
                 self._resend()
             self._inject(self._random.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0])
-            note()
+            on_fault()
         return self._finish(begin_s)
 
     def _inject(self, fault: Fault) -> None:

@@ -9,7 +9,7 @@ from gausslite.config.switches import add_switch
 from gausslite.domain.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.cli.argument_types import read_counts
-from gausslite_bench.raster.gpu_rates import GPU_GAUSSIANS, PAPER_FRAME_MS, FrameCost, GpuBench, StepRate
+from gausslite_bench.raster.gpu_rates import GPU_GAUSSIANS, PAPER_FRAME_MS, GpuBench, GpuFrameCost, StepRate
 
 
 def configure_gpu(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +46,7 @@ def run_gpu(options: argparse.Namespace) -> int:
     return 0
 
 
-def gpu_record(device: str, rates: list[StepRate], frame: FrameCost) -> dict[str, object]:
+def gpu_record(device: str, rates: list[StepRate], frame: GpuFrameCost) -> dict[str, object]:
     """Return all measurements as one JSON object."""
     return {"device": device, "rates": [rate.as_json() for rate in rates], "frame": frame.as_json()}
 
@@ -65,7 +65,7 @@ def rate_line(rate: StepRate) -> str:
     return f"{rate.gaussians:>10}" + "".join(f"{cell:>20}" for cell in cells) + f"  {ratio:.2f}"
 
 
-def frame_lines(cost: FrameCost) -> str:
+def frame_lines(cost: GpuFrameCost) -> str:
     """Return the time of one mapped frame, in total and per stage."""
     stages = "  ".join(f"{name} {ms:.1f}" for name, ms in cost.stages_ms.items())
     return (

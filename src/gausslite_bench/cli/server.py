@@ -14,7 +14,7 @@ from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.server.agent_load import LoadResult
 from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
-from gausslite_bench.server.running_server import DEFAULT_COMMAND
+from gausslite_bench.server.server_process import DEFAULT_COMMAND
 
 _MAX_SERVERS = 64
 

@@ -1,4 +1,4 @@
-"""Start a service as its own process, with small limits, and watch whether it lives and how much memory it has."""
+"""Start a service as its own process, with small limits, and watch whether it runs and how much memory it uses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.domain.errors import NameInUseError, NotPermittedError, Unavailab
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.health import require_serving
 from gausslite_bench.fuzz.corpus import AGENT_ID
-from gausslite_bench.server.running_server import resident_mib_of
+from gausslite_bench.server.server_process import resident_mib_of
 from gausslite_bench.server.synthetic_updates import GRID
 
 FUSION, AGENT = "FusionService", "AgentService"

@@ -62,7 +62,7 @@ class StepRate:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameCost:
+class GpuFrameCost:
     """Time of one mapped frame: seeding, training iterations, density control and all transfers."""
 
     gaussians: int
@@ -107,7 +107,7 @@ class GpuBench:
                 median={name: 1.0 / float(np.median(times)) for name, times in seconds.items()},
             )
 
-    def frame(self) -> FrameCost:
+    def frame(self) -> GpuFrameCost:
         """Map the same view repeatedly, with density control in every frame. Raises KernelError."""
         view = held_out_view(*self.size)
         settings = MapperSettings(
@@ -125,7 +125,7 @@ class GpuBench:
             timings.append(scheduler.end())
         measured = timings[_FRAME_WARM_UP:]
         stages = sorted({stage for timing in measured for stage in timing.stages_s})
-        return FrameCost(
+        return GpuFrameCost(
             mapper.count,
             iterations,
             Duration.of([timing.seconds for timing in measured]),

@@ -14,7 +14,7 @@ from statistics import median
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import FusionClient
 from gausslite_bench.server.agent_load import AgentLoad, LoadResult
-from gausslite_bench.server.running_server import RunningServer
+from gausslite_bench.server.server_process import ServerProcess
 from gausslite_bench.server.synthetic_updates import GAUSSIANS_PER_VOXEL
 
 P99_LIMIT_MS = 100.0
@@ -65,28 +65,28 @@ class StoredSizeResult:
         return largest
 
 
-def measure(settings: ServerBenchSettings, held: int, note: Callable[[str], None]) -> StoredSizeResult:
-    """Fill a new server and measure it. `note` receives what is done now."""
+def measure(settings: ServerBenchSettings, held: int, on_progress: Callable[[str], None]) -> StoredSizeResult:
+    """Fill a new server and measure it. `on_progress` receives a description of each step."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
         servers = []
         for number in range(settings.servers):
-            servers.append(RunningServer(settings.command, Path(folder), settings.store, f"fusion-{number}"))
+            servers.append(ServerProcess(settings.command, Path(folder), settings.store, f"fusion-{number}"))
             opened.callback(servers[-1].close)
-        return _measure(settings, held, servers, note)
+        return _measure(settings, held, servers, on_progress)
 
 
 def _measure(
-    settings: ServerBenchSettings, held: int, servers: Sequence[RunningServer], note: Callable[[str], None]
+    settings: ServerBenchSettings, held: int, servers: Sequence[ServerProcess], on_progress: Callable[[str], None]
 ) -> StoredSizeResult:
     server = servers[0]
     load = AgentLoad([each.address for each in servers])
-    note(f"{held} Gaussians: fill")
+    on_progress(f"{held} Gaussians: fill")
     begin_s = time.monotonic()
     load.fill(held, GAUSSIANS_PER_VOXEL)
     fill_s = time.monotonic() - begin_s
     loads: list[LoadResult] = []
     for agents in settings.agents:
-        note(f"{held} Gaussians: {agents} agents")
+        on_progress(f"{held} Gaussians: {agents} agents")
         cpu_s = sum(each.cpu_s() for each in servers)
         result = load.run(agents, settings.seconds)
         loads.append(
@@ -94,9 +94,9 @@ def _measure(
         )
     hostile = None
     if settings.hostile:
-        note(f"{held} Gaussians: hostile agent")
+        on_progress(f"{held} Gaussians: hostile agent")
         hostile = load.run(_HOSTILE_AGENTS, settings.seconds, hostile=True)
-    note(f"{held} Gaussians: snapshot, status, restart")
+    on_progress(f"{held} Gaussians: snapshot, status, restart")
     snapshot_s, status_ms = _snapshot_s(server.address), _status_ms(server.address)
     rss_mib = server.rss_mib()
     watchers_mib = _idle_watchers_mib(server, settings.watchers)
@@ -127,7 +127,7 @@ def _status_ms(address: str) -> float:
         return 1000 * median(times_s)
 
 
-def _idle_watchers_mib(server: RunningServer, watchers: int) -> float:
+def _idle_watchers_mib(server: ServerProcess, watchers: int) -> float:
     """Return how much memory of the server watchers take that stop reading after the first block."""
     if not watchers:
         return 0.0

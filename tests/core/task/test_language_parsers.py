@@ -14,7 +14,7 @@ from gausslite.domain.task import Predicate, Relation, TargetRole
 from gausslite.domain.task_limits import require_graph
 from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.answer import parse_answer
-from gausslite.task.language.model import Message, Role
+from gausslite.task.language.model import Message, MessageRole
 from gausslite.task.language.parsers import CachedParser, FallbackParser, LanguageParser
 from gausslite.task.language.prompt import MAX_PHRASES, MAX_RELATIONS, messages_for
 from gausslite.task.rules import RuleParser
@@ -201,8 +201,8 @@ def test_answers_are_cached_failures_are_not_and_the_cache_is_bounded():
 
 def test_the_prompts_own_examples_are_graphs_by_its_own_schema():
     messages = messages_for("Find the mug")
-    assert messages[0].role is Role.SYSTEM
-    assert messages[-1] == Message(Role.USER, "Find the mug")
+    assert messages[0].role is MessageRole.SYSTEM
+    assert messages[-1] == Message(MessageRole.USER, "Find the mug")
     shots = list(zip(messages[1:-1:2], messages[2:-1:2], strict=True))
     assert len(shots) >= 4
     for request, response in shots:

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 MAX_ANSWER_BYTES = 64 * 1024
 
 
-class Role(StrEnum):
+class MessageRole(StrEnum):
     """Author of a chat message."""
 
     SYSTEM = "system"
@@ -22,7 +22,7 @@ class Role(StrEnum):
 class Message:
     """One message of a chat."""
 
-    role: Role
+    role: MessageRole
     text: str
 
 

@@ -6,7 +6,7 @@ import json
 from typing import Any, Final
 
 from gausslite.domain.task import Predicate, TargetRole
-from gausslite.task.language.model import Message, Role
+from gausslite.task.language.model import Message, MessageRole
 
 MAX_PHRASES: Final = 8
 MAX_RELATIONS: Final = 16
@@ -108,6 +108,6 @@ def messages_for(task: str) -> tuple[Message, ...]:
     examples = [
         message
         for question, answer in _EXAMPLES
-        for message in (Message(Role.USER, question), Message(Role.ASSISTANT, answer))
+        for message in (Message(MessageRole.USER, question), Message(MessageRole.ASSISTANT, answer))
     ]
-    return (Message(Role.SYSTEM, _RULES), *examples, Message(Role.USER, " ".join(task.split())))
+    return (Message(MessageRole.SYSTEM, _RULES), *examples, Message(MessageRole.USER, " ".join(task.split())))

@@ -23,7 +23,7 @@ _QUOTAS = (
 )
 
 
-class RunningServer:
+class ServerProcess:
     """Owns the process of a server on a store, and appends what it logs to a file.
 
     name: of its socket and log, for several servers on one store.
