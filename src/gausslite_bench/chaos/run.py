@@ -204,8 +204,11 @@ class _ChaosRun:
         agent_id = self._random.choice(list(self.team.acknowledged))
         acknowledged = self.team.acknowledged[agent_id]
         acknowledged.read()
-        if acknowledged.sent:
-            messages = self._random.choices(list(acknowledged.sent), k=_RESENT_MESSAGES)
+        # drawn also before the agent's first message, so that the seed alone decides the order of faults
+        shares = [self._random.random() for _ in range(_RESENT_MESSAGES)]
+        sent = list(acknowledged.sent)
+        if sent:
+            messages = [sent[int(share * len(sent))] for share in shares]
             limit_s, resent = time.monotonic() + _RESEND_LIMIT_S, 0
             while resent == 0 and time.monotonic() < limit_s:
                 # an agent that joins again has another session, which its journal shows with its next message
