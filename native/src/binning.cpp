@@ -13,11 +13,11 @@ namespace {
 
 // A pair of a splat and a tile column of its bounding box. The pairs are first collected and then tested, both without
 // branches: the number of tiles and blocks of a splat is unpredictable.
-struct Touch {
+struct SplatColumn {
   uint32_t slot, x;
 };
 
-constexpr int kTouches = 256;  // batch size of the test
+constexpr int kMaxPairs = 256;  // batch size of the test
 
 alignas(64) constexpr float kBlockX[16] = {.5f, 4.5f, 8.5f, 12.5f, .5f, 4.5f, 8.5f, 12.5f,
                                            .5f, 4.5f, 8.5f, 12.5f, .5f, 4.5f, 8.5f, 12.5f};
@@ -28,7 +28,7 @@ alignas(64) constexpr float kBlockY[16] = {.5f,  .5f,  .5f,  .5f,  4.5f,  4.5f, 
 // minimum over the rectangle of a block's pixel centres is at the mean if that is inside, else on one of the two sides
 // that face the mean. (dx, dy) is the point of the rectangle nearest to the mean, axis by axis. On the facing vertical
 // side the minimum is at slope_y dx, clamped to the side; on the horizontal side likewise.
-GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float tile_y) {
+GAUSSLITE_INLINE uint32_t overlapped_blocks(const Splat& s, float tile_x, float tile_y) {
   const Pack16 zero(0.0f);
   const Pack16 left = load(kBlockX) + (tile_x - s.mean_x), top = load(kBlockY) + (tile_y - s.mean_y);
   const Pack16 right = left + 3.0f, bottom = top + 3.0f;
@@ -41,16 +41,16 @@ GAUSSLITE_INLINE uint32_t touched_blocks(const Splat& s, float tile_x, float til
 }
 
 // Appends the splats to the lists of the tiles where they touch a needed block (Workspace::needed_blocks).
-GAUSSLITE_INLINE void list_touches(const Workspace& ws, int tile_row, const Touch* touches, int n,
+GAUSSLITE_INLINE void list_overlaps(const Workspace& ws, int tile_row, const SplatColumn* pairs, int n,
                                    const uint16_t* needed, TileList* tiles) {
   for (int x = 0; x < ws.tiles_x; ++x) {
-    tiles[x].slots.ensure_capacity(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
-    tiles[x].blocks.ensure_capacity(tiles[x].count + kTouches + 1 + kChunk, tiles[x].count);
+    tiles[x].slots.ensure_capacity(tiles[x].count + kMaxPairs + 1 + kChunk, tiles[x].count);
+    tiles[x].blocks.ensure_capacity(tiles[x].count + kMaxPairs + 1 + kChunk, tiles[x].count);
   }
   for (int i = 0; i < n; ++i) {
-    const auto [slot, x] = touches[i];
+    const auto [slot, x] = pairs[i];
     const uint32_t blocks =
-        needed[x] & touched_blocks(ws.splats[slot], float(x * kTileSide), float(tile_row * kTileSide));
+        needed[x] & overlapped_blocks(ws.splats[slot], float(x * kTileSide), float(tile_row * kTileSide));
     // Each splat is written, but counted only if it touches a needed block: no branch to mispredict.
     TileList& tile = tiles[x];
     tile.slots[tile.count] = slot;
@@ -64,7 +64,7 @@ GAUSSLITE_INLINE void list_touches(const Workspace& ws, int tile_row, const Touc
 void bin_tile_row(const Workspace& ws, int tile_row, const DepthKey* keys, int count, TileList* tiles) {
   const uint16_t* needed = &ws.needed_blocks[size_t(tile_row) * size_t(ws.tiles_x)];
   for (int x = 0; x < ws.tiles_x; ++x) tiles[x].count = 0;
-  Touch touches[kTouches + 2];
+  SplatColumn pairs[kMaxPairs + 2];
   int n = 0;
   for (int i = 0; i < count; ++i) {
     prefetch(&ws.splats[keys[i + kPrefetchAhead].slot]);
@@ -72,17 +72,17 @@ void bin_tile_row(const Workspace& ws, int tile_row, const DepthKey* keys, int c
     const uint32_t x0 = uint32_t(ws.splats[slot].tile_x0), x1 = uint32_t(ws.splats[slot].tile_x1);
     // Two columns at a time: most splats touch one or two.
     for (uint32_t x = x0; x <= x1; x += 2) {
-      touches[n] = {slot, x};
+      pairs[n] = {slot, x};
       n += needed[x] != 0;
-      touches[n] = {slot, x + 1};
+      pairs[n] = {slot, x + 1};
       n += (x < x1) & (needed[x + 1] != 0);
-      if (n >= kTouches) {
-        list_touches(ws, tile_row, touches, n, needed, tiles);
+      if (n >= kMaxPairs) {
+        list_overlaps(ws, tile_row, pairs, n, needed, tiles);
         n = 0;
       }
     }
   }
-  list_touches(ws, tile_row, touches, n, needed, tiles);
+  list_overlaps(ws, tile_row, pairs, n, needed, tiles);
   // The tile stages prefetch one chunk ahead: pad the list with slot 0.
   for (int x = 0; x < ws.tiles_x; ++x) {
     tiles[x].slots.ensure_capacity(tiles[x].count + kChunk, tiles[x].count);

@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _page(options: argparse.Namespace, fusion_address: str) -> Iterator[None]:
-    """Show the fusion server on a page, if the options ask for it."""
+    """Show the fusion server on a page, if --view is set."""
     if options.view is None:
         yield
         return

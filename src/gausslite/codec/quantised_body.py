@@ -1,8 +1,8 @@
 """The body of a quantised message: about 8 bytes a Gaussian.
 
 One zstd frame with the columns of `_columns`, its size (u32) before it, then the bit fields of `positions.py`. The
-Gaussians of a voxel are sorted by position and, in one coarse cell, by kappa; neighbours are then alike, so that the
-first scale, the colours and kappa are stored as differences to the Gaussian before. The other two scales are stored as
+Gaussians of a voxel are sorted by position and, in one coarse cell, by kappa. Neighbours are then alike, so the first
+scale, the colours and kappa are stored as differences to the Gaussian before. The other two scales are stored as
 differences to the first. All differences wrap at the range of their type.
 """
 

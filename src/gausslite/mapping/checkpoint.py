@@ -81,7 +81,7 @@ def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
 
 
 def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:
-    """Return the state of a PCG64 generator: state and increment as 64-bit halves, flag and value of a spare draw."""
+    """Return a PCG64 generator: state and increment as 64-bit halves, flag and value of a stored 32-bit draw."""
     state = rng.bit_generator.state
     numbers = state["state"]["state"], state["state"]["inc"]
     halves = [half for number in numbers for half in (number >> 64, number & _LOW_64_BITS)]

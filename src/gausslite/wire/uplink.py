@@ -91,7 +91,7 @@ class Uplink:
     def spooled_voxels(self, purpose: Purpose | None = None) -> Int64[ndarray, " v"]:
         """Return the keys of the voxels that the server has or will have, ascending; purpose: only those sent for it.
 
-        Without a file for the spool, it knows only the voxels of this process. Raises StorageError.
+        Without a file, the spool has only the voxels of this process. Raises StorageError.
         """
         return self._spool.voxels(purpose)
 

@@ -65,7 +65,7 @@ class AgentAcknowledgements:
         self.readers = [JournalReader(path)]
 
     def read(self) -> None:
-        """Take in what the journal has gained."""
+        """Read the new records of the journal."""
         for reader in self.readers:
             for record in reader.new_records():
                 match record.kind:

@@ -49,7 +49,7 @@ def configure_perception(parser: argparse.ArgumentParser) -> None:
         metavar="A,B|N",
         type=read_absent,
         default=(),
-        help="also search for these nouns, which must be absent, or for N nouns that the detector knows",
+        help="also search for these nouns, which must be absent, or for N nouns of the detector's vocabulary",
     )
     add(
         "--present",
@@ -175,7 +175,7 @@ def read_absent(text: str) -> tuple[str, ...] | int:
 
 
 def _absent_queries(options: argparse.Namespace, detector: Detector, regions: Mapping[str, Region]) -> list[TaskQuery]:
-    """Return a search for each noun of --absent, or for as many nouns that the detector knows."""
+    """Return a search for each noun of --absent, or for as many nouns of the detector's vocabulary."""
     if isinstance(options.absent, int):
         from gausslite.perception.text_embeddings import TextEmbeddings
 

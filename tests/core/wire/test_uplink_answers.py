@@ -136,7 +136,7 @@ def test_the_server_refuses_another_grid() -> None:
 
 
 class FlakyServer(ScriptedServer):
-    """Stores what comes, but now and then loses the message, the ack, or everything."""
+    """Stores what comes, but sometimes loses the message, the ack, or everything."""
 
     def __init__(self, faults: list[str]) -> None:
         super().__init__(self._store_or_fail)

@@ -82,8 +82,8 @@ def read_tree(bag: BagFile) -> TransformTree:
 def choose_poses(bag: BagFile, tree: TransformTree, camera: str, options: BagOptions) -> CameraPoses | None:
     """Return the poses of the camera; None if the bag has none.
 
-    Poses come from odom=, else from tf to frame=, else from tf to the first of odom, map, world and the root that the
-    camera moves in, else from the only odometry topic. Raises DatasetError if the choice is not clear, and for frames
+    The first source that the bag has is used: odom=; tf to frame=; tf to the first of odom, map, world and the root
+    that the camera moves in; the only odometry topic. Raises DatasetError if the choice is not clear, and for frames
     that are not connected.
     """
     if options.odom:

@@ -149,8 +149,8 @@ class GsplatKernels:
 class TorchKernels:
     """The same operations on the CPU, slow, for tests of the code around the kernels.
 
-    They compute in double precision: gsplat's functions use matrix products, which round by the number of rows and by
-    the processor, so that in single precision the image of a subset would differ from that of the whole map.
+    They compute in double precision. gsplat's functions use matrix products, whose rounding depends on the number of
+    rows and on the processor. In single precision the image of a subset would differ from that of the whole map.
     """
 
     def __init__(self) -> None:
