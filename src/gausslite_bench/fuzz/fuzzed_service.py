@@ -13,7 +13,7 @@ from gausslite.domain.errors import NameInUseError, NotPermittedError, Unavailab
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.health import require_serving
 from gausslite_bench.fuzz.corpus import AGENT_ID
-from gausslite_bench.server.server_process import resident_mib_of
+from gausslite_bench.loop.memory import resident_mib
 from gausslite_bench.server.synthetic_updates import GRID
 
 FUSION, AGENT = "FusionService", "AgentService"
@@ -76,7 +76,7 @@ class FuzzedService:
 
     def rss_mib(self) -> float:
         """Return the resident memory of the process."""
-        return resident_mib_of(self._process.pid)
+        return resident_mib(self._process.pid)
 
     def open_session(self) -> bytes:
         """Return a session id of the corpus's agent; empty for a service without sessions."""

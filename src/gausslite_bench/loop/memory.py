@@ -9,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.domain.errors import InvalidInputError
-
-_STATM = Path("/proc/self/statm")
+from gausslite.domain.errors import InvalidInputError, UnavailableError
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +35,15 @@ class MemoryTrend:
         return cls(samples_mib[0], samples_mib[middle], samples_mib[-1], 1000.0 * slope)
 
 
-def resident_mib() -> float:
-    """Return the resident memory of the process in MiB. Raises InvalidInputError on systems without /proc."""
-    try:
-        pages = int(_STATM.read_text().split()[1])
-    except OSError as error:
-        raise InvalidInputError(f"memory: expected a Linux system with {_STATM}, got {error.strerror}") from error
+def resident_mib(process_id: int | None = None) -> float:
+    """Return the resident memory of a process in MiB, by default of this one.
+
+    Raises UnavailableError if the process has ended, and on systems without /proc.
+    """
+    path = Path("/proc", "self" if process_id is None else str(process_id), "statm")
+    pages = int(path.read_text().split()[1]) if path.exists() else 0
+    if pages == 0:
+        raise UnavailableError(f"memory: expected a running process and a Linux system with {path}")
     return pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from gausslite.domain.errors import UnavailableError
 from gausslite.wire.clients import FusionClient
+from gausslite_bench.loop.memory import resident_mib
 
 DEFAULT_COMMAND = f"{shlex.quote(sys.executable)} -m gausslite_fusion_server"
 _START_LIMIT_S = 300.0
@@ -59,7 +60,7 @@ class ServerProcess:
 
     def rss_mib(self) -> float:
         """Return the resident memory of the process."""
-        return resident_mib_of(self._process.pid)
+        return resident_mib(self._process.pid)
 
     def cpu_s(self) -> float:
         """Return the processor time that the process has used."""
@@ -99,12 +100,3 @@ class ServerProcess:
             time.sleep(_POLL_S)
         self.close()
         raise UnavailableError(f"server: expected it to start within {_START_LIMIT_S:g} s ({self._command})")
-
-
-def resident_mib_of(process_id: int) -> float:
-    """Return the resident memory of a process. Raises UnavailableError if it has ended."""
-    status = Path(f"/proc/{process_id}/status")
-    for line in status.read_text().splitlines() if status.exists() else ():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) / 1024
-    raise UnavailableError("server: its process has ended")
