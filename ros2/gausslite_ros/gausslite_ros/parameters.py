@@ -30,7 +30,7 @@ class NodeParameters:
     """Parameters by their names in ROS; docs/robots.md lists them.
 
     color_info, depth_info "": the camera_info beside the images. camera "": the frame of the colour images.
-    transform_tolerance_s: by how much the published tf is dated ahead. drain_s 0: as the agent's options. Raises
+    transform_tolerance_s: added to the time of the published tf. drain_s 0: as the agent's options. Raises
     InvalidInputError.
     """
 

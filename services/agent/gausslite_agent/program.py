@@ -48,7 +48,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Mission:
-    """The mission of this process and what can end its waits."""
+    """The mission of this process, its frames, and the wait for the parser, which a stop cancels."""
 
     mission: AgentMission
     stream: FrameStream | None
@@ -105,7 +105,7 @@ async def _serve(settings: AgentSettings) -> None:
 
 
 def _require_usable(settings: AgentSettings) -> None:
-    """Raise now for settings that would fail hours into the mission or with its first task."""
+    """Raise at the start for settings that would otherwise fail with the first task or at the end of the mission."""
     if settings.up_axis is not None:
         unit_up_axis(settings.up_axis)
     if settings.out is not None:

@@ -1,4 +1,4 @@
-"""Follow the fused map in the region of the agent's task, and insert what teammates trained more."""
+"""Follow the fused map in the region of the agent's task, and insert voxels that teammates trained more."""
 
 from __future__ import annotations
 

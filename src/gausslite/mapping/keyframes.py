@@ -72,8 +72,10 @@ def motion_blur_px(frame: Frame) -> float:
         return 0.0
     depths_m = frame.depth_m[::_DEPTH_STEP_PX, ::_DEPTH_STEP_PX]
     distance_m = float(np.median(depths_m[depths_m > 0])) if (depths_m > 0).any() else np.inf
-    turn_rad_s, speed_m_s = (float(np.linalg.norm(v)) for v in (motion.twist.angular_rad_s, motion.twist.linear_m_s))
-    return frame.camera.fx_px * (turn_rad_s + speed_m_s / distance_m) * motion.exposure_s / 12**0.5
+    rotation_rad_s, speed_m_s = (
+        float(np.linalg.norm(v)) for v in (motion.twist.angular_rad_s, motion.twist.linear_m_s)
+    )
+    return frame.camera.fx_px * (rotation_rad_s + speed_m_s / distance_m) * motion.exposure_s / 12**0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

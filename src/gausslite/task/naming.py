@@ -21,7 +21,7 @@ class NamedObjects:
 def name_objects(phrases: Iterable[str], excluded: Iterable[str] = ()) -> NamedObjects:
     """Return names for the phrases in their order of mention.
 
-    A phrase without attributes names the latest object of its noun; an excluded phrase never names another's object.
+    A phrase without attributes names the latest object of its noun. An excluded phrase always names a new object.
     """
     names: dict[str, str] = {}
     described: dict[str, DescribedNoun] = {}

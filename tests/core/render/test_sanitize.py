@@ -1,4 +1,4 @@
-"""The sanitizer script names a missing part in one line."""
+"""The sanitizer script reports a wrong argument or a missing Python in one line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ SCRIPT = Path(__file__).resolve().parents[3] / "tools" / "sanitize.sh"
         (["thread", "snake"], "sanitize: no such Python: snake"),
     ],
 )
-def test_missing_part_is_named_in_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
+def test_a_wrong_argument_or_missing_python_is_reported_in_one_line(
+    arguments: list[str], message: str, tmp_path: Path
+) -> None:
     bash, dirname = shutil.which("bash"), shutil.which("dirname")
     assert bash is not None
     assert dirname is not None

@@ -118,7 +118,7 @@ def restored_map(options: AgentSettings) -> Gaussians:
 
 @pytest.mark.parametrize("keeps_spool", [True, False])
 def test_the_fused_map_follows_the_agent_through_clean_and_unsaved_ends(keeps_spool: bool, tmp_path: Path) -> None:
-    """The third run ends unsaved: the server then equals the agent; without a spool's file on the agent's voxels."""
+    """The third run is not saved. With a spool file, the server has only the agent's voxels; without, also others."""
     store, options = MemoryStore(), settings(tmp_path / "robot.state")
     spool = tmp_path / "robot.spool" if keeps_spool else None
     with fusion_server(store) as fusion:
