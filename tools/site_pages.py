@@ -79,7 +79,10 @@ def on_page_content(content: str, **_: object) -> str:
     """Return a page's HTML with equations as MathML, which browsers render without a script."""
 
     def equation(match: re.Match[str]) -> str:
-        return mathml(html.unescape(match[3]), display="block" if match[2] == "[" else "inline")
+        if match[2] != "[":
+            return mathml(html.unescape(match[3]), display="inline")
+        # a block of its own, which scrolls on a narrow screen
+        return f'<div style="overflow-x:auto">{mathml(html.unescape(match[3]), display="block")}</div>'
 
     return _EQUATION.sub(equation, content)
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from browser import open_browser
 
 pytest.importorskip("mkdocs", reason="the extra docs is not installed")
 
@@ -67,3 +68,14 @@ def test_the_reference_has_the_public_names_and_all_commands(site: Path) -> None
     assert "Map a sequence for a task" in python
     for heading in ("gausslite-map", "gausslite-bench-quality", "gausslite-models-fetch", "gausslite-agent"):
         assert f'id="{heading}"' in commands
+
+
+def test_no_page_is_wider_than_a_phone(site: Path) -> None:
+    with open_browser((390, 844)) as browser:
+        tab = browser.new_page()
+        wide = []
+        for path in sorted(site.rglob("*.html")):
+            tab.goto(path.as_uri(), wait_until="domcontentloaded")
+            if tab.evaluate("document.documentElement.scrollWidth > innerWidth"):
+                wide.append(str(path.relative_to(site)))
+    assert wide == []
