@@ -60,6 +60,8 @@ def estimate_camera(source: Source, known: CameraCorrection) -> CameraEstimate:
         return CameraEstimate(known, (reason,))
     evidence = []
     correction, coarse = known, moving.halved()
+    if coarse.error(known).residual <= 0.0:
+        return CameraEstimate(known, ("the images have no contrast, nothing can be compared",))
     width_px, height_px = source.camera.width_px, source.camera.height_px
     if known.lens is None and width_px * height_px < _MIN_LENS_PIXELS:
         # noise of tiny images looks like a lens

@@ -160,8 +160,10 @@ def decode_image(location: str, data: bytes, suffix: str, flags: int) -> NDArray
 
 def _require_undamaged(location: str, data: bytes, suffix: str) -> None:
     """Raise DatasetError for an image too large for memory, or a PNG with a wrong checksum, on which libpng prints."""
-    width_px, height_px = image_size(data) or (0, 0)
-    require_pixel_count(location, width_px, height_px)
+    size_px = image_size(data)
+    if size_px is None:
+        raise DatasetError(f"{location}: expected a PNG or JPEG image, got another format")
+    require_pixel_count(location, *size_px)
     position = _PNG_START if suffix == ".png" else len(data)
     while position + 12 <= len(data):
         end = position + 8 + int.from_bytes(data[position : position + 4], "big")

@@ -8,9 +8,9 @@ from gausslite.domain.errors import DatasetError
 
 
 def read_text(path: Path) -> str:
-    """Return the whole file. Raises DatasetError if it is missing or not text."""
+    """Return the whole file without a byte-order mark. Raises DatasetError if it is missing or not text."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise DatasetError(f"{path}: expected a text file, got none") from None
     except (OSError, UnicodeDecodeError) as error:

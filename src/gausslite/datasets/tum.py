@@ -29,6 +29,8 @@ _UNITS = DepthUnits(per_metre=5000.0)
 _POSES = "groundtruth.txt"
 _MAX_DEPTH_LAG_S = 0.020
 _MAX_POSE_GAP_S = 0.100
+_MAX_TIME_S = 9e9
+"""Larger times, of the year 2255, do not fit into 64 bits as nanoseconds."""
 _MAX_POSE_LAG_S = 0.010
 _INTRINSICS = {
     "1": FileIntrinsics(517.3, 516.5, 318.6, 255.3),
@@ -122,7 +124,7 @@ def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int]:
     colour_times, colour_names = _read_stamps(folder / "rgb.txt")
     depth_times, depth_names = _read_stamps(folder / "depth.txt")
     poses = folder / _POSES
-    trajectory = _read_poses(poses) if require_poses or poses.is_file() else None
+    trajectory = _read_poses(poses, require_poses) if require_poses or poses.is_file() else None
     matches = []
     for number, (time_s, name) in enumerate(zip(colour_times, colour_names, strict=True)):
         nearest = int(np.abs(depth_times - time_s).argmin())
@@ -147,18 +149,25 @@ def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
         names.append(fields[1])
         if not np.isfinite(times[-1]) or (len(times) > 1 and times[-1] < times[-2]):
             raise DatasetError(f"{location}: expected finite times in ascending order, got {fields[0]}")
+        if abs(times[-1]) > _MAX_TIME_S:
+            raise DatasetError(f"{location}: expected a time in seconds, got {fields[0]}; are these nanoseconds?")
     if not times:
         raise DatasetError(f"{path}: expected rows of a time and a file name, got none")
     return np.array(times), names
 
 
-def _read_poses(path: Path) -> PoseTrack:
-    """Return the poses of rows of: time tx ty tz qx qy qz qw. Raises DatasetError, PoseError."""
+def _read_poses(path: Path, required: bool) -> PoseTrack | None:
+    """Return the poses of rows of: time tx ty tz qx qy qz qw. Raises DatasetError, PoseError.
+
+    Returns None for fewer than two poses that are not required.
+    """
     rows = read_rows(path)
     meaning = "time tx ty tz qx qy qz qw"
     table = np.array([parse_numbers(location, fields, 8, meaning) for location, fields in rows])
     known = np.array([not is_lost(row[1:]) for row in table], np.bool_)
     if np.count_nonzero(known) < 2:
+        if not required:
+            return None
         lost = f" and {len(rows) - np.count_nonzero(known)} rows of NaN, infinity or zeros" if rows else ""
         raise DatasetError(f"{path}: expected at least 2 poses, got {np.count_nonzero(known)}{lost}")
     for i in np.flatnonzero(known):

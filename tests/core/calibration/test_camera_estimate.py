@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from tool_modules import load_tool
 from tum_recording import write_home
@@ -74,6 +76,15 @@ def test_a_slow_camera_gives_no_estimate() -> None:
 def test_times_are_not_estimated_from_a_few_tiny_frames(tmp_path: Path) -> None:
     correction = estimate_camera(open_source(str(write_home(tmp_path / "recording"))), CameraCorrection()).correction
     assert (correction.readout_s, correction.time_offset_s, correction.exposure_s) == (0.0, 0.0, 0.0)
+
+
+def test_black_images_give_no_estimate(tmp_path: Path) -> None:
+    folder = write_home(tmp_path / "recording", frames=30)
+    for path in folder.glob("rgb-*.png"):
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))
+    estimate = estimate_camera(open_source(str(folder)), CameraCorrection())
+    assert estimate.correction.is_identity
+    assert estimate.evidence == ("the images have no contrast, nothing can be compared",)
 
 
 def test_no_lens_is_estimated_from_tiny_images() -> None:

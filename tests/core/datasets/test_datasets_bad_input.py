@@ -47,6 +47,7 @@ def replace(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
+TIFF = b"II*\0" + bytes(20) + b"IEND\xaeB`\x82"
 Damage = Callable[[Path], object]
 SEVEN_POSE = "frame-000004.pose.txt"
 
@@ -62,6 +63,8 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
     ("tum", lambda f: (f / "rgb.txt").write_text("10.0\n"), DatasetError, "rgb.txt line 1: expected a time and a file"),
     ("tum", lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), DatasetError, "rgb.txt: expected a readable text"),
     ("tum", lambda f: (f / "rgb.txt").write_text("2 a\n1 b\n"), DatasetError, "rgb.txt line 2: expected finite times"),
+    ("tum", lambda f: (f / "rgb.txt").write_text("1e18 a\n"), DatasetError, "rgb.txt line 1: .* are these nanoseconds"),
+    ("tum", lambda f: (f / "depth/1.png").write_bytes(TIFF), DatasetError, "depth/1.png: expected a PNG or JPEG image"),
     ("tum", lambda f: replace(f / "groundtruth.txt", "9.9000 9.9000", "nan 1"), DatasetError, "groundtruth.txt: exp"),
     ("tum", lambda f: (f / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1\n"), DatasetError, "at least 2 poses"),
     ("tum", lambda f: (f / "groundtruth.txt").write_text("1 0 0\n2 0 0\n"), DatasetError, "line 1: expected 8 numbers"),
@@ -235,6 +238,22 @@ def test_a_sequence_without_any_pose_is_refused(tmp_path: Path, layout: str, fil
         path.write_text(content)
     with pytest.raises(DatasetError, match=r"expected (frames with a pose, got none|at least 2 poses, got 0)"):
         open_source(str(folder))
+
+
+@pytest.mark.parametrize("rows", ["", "9.9 0 0 0 0 0 0 1\n", "9.9 nan nan nan nan nan nan nan\n" * 2])
+def test_poses_that_are_not_required_may_be_missing(tmp_path: Path, rows: str) -> None:
+    folder = write_tum(tmp_path / "fr1")
+    (folder / "groundtruth.txt").write_text(rows)
+    source = open_source(str(folder), require_poses=False)
+    assert len(source) == 3
+    assert not source.trajectory().T_world_camera[:, :3, 3].any()
+
+
+def test_text_files_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr1")
+    for path in folder.glob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(open_source(str(folder))) == 3
 
 
 def test_a_position_outside_the_sequence_is_refused(tmp_path: Path) -> None:
