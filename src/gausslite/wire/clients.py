@@ -114,7 +114,7 @@ class AgentClient(ServiceChannel):
             agent_service_pb2.IngestFramesRequest(frame=convert.live_frame_to_message(frame, lens, lossless))
             for frame in frames
         )
-        return self._stream(self._stub.IngestFrames(requests))
+        return self._exchange(self._stub.IngestFrames, requests)
 
     def end_mission(
         self, handover: bool | None = None, drain_s: float | None = None
@@ -160,7 +160,7 @@ class AgentClient(ServiceChannel):
             roi_only=roi_only,
         )
         first = True
-        for response in self._stream(self._stub.WatchMap(request)):
+        for response in self._stream(self._stub.WatchMap, request):
             yield (update := convert.map_update_from_message(response.block, _WATCH_LIMITS, first))
             first = update.last
 
@@ -233,14 +233,14 @@ class FusionClient(ServiceChannel):
     def stored_digests(self, session_id: str) -> TileDigests:
         """Return the digests of the updates that the server has of the session's agent."""
         request = fusion_service_pb2.GetUpdateDigestsRequest(session_id=session_id)
-        blocks = self._stream(self._stub.GetUpdateDigests(request, timeout=self._deadline_s))
+        blocks = self._stream(self._stub.GetUpdateDigests, request, self._deadline_s)
         return digests_from_messages(blocks)
 
     def contribute(
         self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
     ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
         """Send these subsets; yields the acknowledgements until all have arrived or `deadline_s` has passed."""
-        return self._stream(self._stub.ContributeSubsets(iter(requests), timeout=deadline_s))
+        return self._exchange(self._stub.ContributeSubsets, requests, deadline_s)
 
     def contribute_keyframes(self, session_id: str, keyframes: Iterable[Frame]) -> int:
         """Send keyframes for the refinement; returns the number stored. Raises QuotaError, SessionUnknownError."""
@@ -285,7 +285,7 @@ class FusionClient(ServiceChannel):
             exclude_agent_id=exclude_agent,
         )
         first = True
-        for response in self._stream(self._stub.WatchFusedMap(request)):
+        for response in self._stream(self._stub.WatchFusedMap, request):
             yield (update := convert.map_update_from_message(response.block, _WATCH_LIMITS, first))
             first = update.last
 
@@ -296,7 +296,7 @@ class FusionClient(ServiceChannel):
         request = fusion_service_pb2.RefineFusedMapRequest(
             mission_id=self.mission_id, iterations=iterations, max_gaussians=max_gaussians, seed=seed
         )
-        return self._stream(self._stub.RefineFusedMap(request))
+        return self._stream(self._stub.RefineFusedMap, request)
 
     def export(self, export: Export) -> bytes:
         """Return a map as the bytes of a PLY file. Raises MismatchError before the first refinement, ChecksumError."""
@@ -306,7 +306,7 @@ class FusionClient(ServiceChannel):
             agent_id=export.agent_id,
         )
         data, last = bytearray(), None
-        for last in self._stream(self._stub.ExportFusedMap(request)):
+        for last in self._stream(self._stub.ExportFusedMap, request):
             if last.offset != len(data):
                 raise CodecError(f"export: expected the chunk at byte {len(data)}, got the one at {last.offset}")
             data += last.data

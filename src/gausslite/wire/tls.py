@@ -33,18 +33,23 @@ class Tls:
     authorities: bytes | None = field(default=None, repr=False)
 
     @classmethod
-    def read(cls, certificate: Path | None, key: Path | None, authorities: Path | None) -> Tls:
+    def read(
+        cls,
+        certificate: str | os.PathLike[str] | None,
+        key: str | os.PathLike[str] | None,
+        authorities: str | os.PathLike[str] | None,
+    ) -> Tls:
         """Read PEM files. Raises InvalidInputError if one is missing or damaged, or the key does not fit."""
         identity = None
         if (certificate is None) != (key is None):
             raise InvalidInputError("--tls-cert: expected a certificate and its key, --tls-cert and --tls-key; got one")
         if certificate is not None and key is not None:
-            identity = Identity(_read("--tls-cert", certificate), _read("--tls-key", key))
-            _require_pair(certificate, key)
+            identity = Identity(_read("--tls-cert", Path(certificate)), _read("--tls-key", Path(key)))
+            _require_pair(Path(certificate), Path(key))
         if authorities is None:
             return cls(identity)
-        trusted = _read("--tls-ca", authorities)
-        _require_authorities(authorities)
+        trusted = _read("--tls-ca", Path(authorities))
+        _require_authorities(Path(authorities))
         return cls(identity, trusted)
 
     def server_credentials(self) -> grpc.ServerCredentials:

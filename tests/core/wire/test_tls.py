@@ -51,6 +51,11 @@ def test_a_client_of_the_same_authority_is_served_and_others_are_not(certs: Path
                 client.parse("Pick up the mug")
 
 
+def test_pem_files_may_be_named_by_text(certs: Path) -> None:
+    names = ("server/cert.pem", "server/key.pem", "ca.pem")
+    assert Tls.read(*(str(certs / name) for name in names)) == Tls.read(*(certs / name for name in names))
+
+
 def test_a_server_without_authorities_requires_no_client_certificate(certs: Path) -> None:
     with serving([parser_service(RuleParser())], tls=Tls(identity(certs, "server").identity)) as server:
         anyone = Tls(authorities=(certs / "ca.pem").read_bytes())
