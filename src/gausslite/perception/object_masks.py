@@ -31,8 +31,12 @@ _CLOSING: Final = np.ones((5, 5), np.uint8)
 Window = tuple[slice, slice]
 
 
-def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame) -> SurfaceVotes:
-    """Return the votes of a detected mask: inside for its pixels, outside for the other pixels around it."""
+def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame, siblings: Bool[ndarray, "h w"] | None = None) -> SurfaceVotes:
+    """Return the votes of a detected mask: inside for its pixels, outside for the other pixels around it.
+
+    siblings: pixels of the frame's detections of the same noun. They never vote outside: adjacent objects of one noun
+    may be one landmark.
+    """
     box_px = bounding_box(mask)
     if box_px is None:
         return SurfaceVotes.empty()
@@ -42,7 +46,11 @@ def mask_votes(mask: Bool[ndarray, "h w"], frame: Frame) -> SurfaceVotes:
     window = _clipped(low.astype(np.int64), high.astype(np.int64), frame)
     pixels = frame.depth_m[window].size
     points_m, is_known = window_points_m(frame, window, math.ceil(math.sqrt(pixels / _MAX_VOTING_PIXELS)))
-    return SurfaceVotes.from_points(points_m, mask[window][is_known])
+    is_inside = mask[window][is_known]
+    if siblings is not None:
+        has_vote = is_inside | ~siblings[window][is_known]
+        points_m, is_inside = points_m[has_vote], is_inside[has_vote]
+    return SurfaceVotes.from_points(points_m, is_inside)
 
 
 def mask_colours(mask: Bool[ndarray, "h w"], frame: Frame) -> Float64[ndarray, "balances ranges"]:

@@ -236,7 +236,11 @@ class RelevanceTracker:
         """Add the detections to the object map; return the masks of its landmarks in this frame."""
         kept = self._drop_excluded(self._drop_generic_anchors(detections))
         masked = [replace(each, mask=foreground_mask(each.mask, depth_m)) for each in kept]
-        lifted = [(each, lift_observation(each, depth_m, frame)) for each in masked]
+        of_noun = {
+            noun: np.logical_or.reduce([each.mask for each in masked if each.phrase == noun])
+            for noun in {each.phrase for each in masked}
+        }
+        lifted = [(each, lift_observation(each, depth_m, frame, of_noun[each.phrase])) for each in masked]
         localised = [
             (detection, self._filter.with_support(observation, detection, frame))
             for detection, observation in lifted

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import lift
@@ -36,10 +36,16 @@ def best_depth_m(
     return np.where(rendered_m > 0, rendered_m, sensor_m)
 
 
-def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Observation | None:
+def lift_observation(
+    detection: Detection,
+    depth_m: Float32[ndarray, "h w"],
+    frame: Frame,
+    siblings: Bool[ndarray, "h w"] | None = None,
+) -> Observation | None:
     """Lift a detection's mask to an observation in the world; None if too few of its pixels have depth.
 
     The paper lifts the pixel at the 2D centroid, which may lie outside the object; this lifts all pixels.
+    siblings: pixels of the frame's detections of the same noun.
     """
     rows, columns = np.nonzero(detection.mask & (depth_m > 0))
     if len(rows) < _MIN_PIXELS:
@@ -54,7 +60,7 @@ def lift_observation(detection: Detection, depth_m: Float32[ndarray, "h w"], fra
     points_m = transform_points(T_world_camera, points)
     camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
     observation = Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
-    votes, colours = mask_votes(detection.mask, frame), mask_colours(detection.mask, frame)
+    votes, colours = mask_votes(detection.mask, frame, siblings), mask_colours(detection.mask, frame)
     return replace(observation, rival=detection.rival, votes=votes, colours=colours)
 
 

@@ -79,6 +79,18 @@ def test_a_mask_that_spills_over_the_wall_is_cut_back_to_the_measured_object():
     assert iou(surface_mask(votes, frames[0]), box_mask(frames[0])) > 0.9
 
 
+def test_adjacent_objects_of_one_noun_do_not_vote_each_other_out():
+    frame = frame_at()
+    box = box_mask(frame)
+    columns = np.flatnonzero(box.any(axis=0))
+    thirds = [box & np.isin(np.arange(160), part)[None] for part in np.array_split(columns, 3)]
+    for siblings, is_whole in ((box, True), (None, False)):
+        votes = SurfaceVotes.empty()
+        for third in thirds:
+            votes = votes.add(mask_votes(third, frame, siblings))
+        assert (iou(surface_mask(votes, frame), box) > 0.95) is is_whole
+
+
 def test_a_detection_of_a_part_is_completed():
     frames = [frame_at(x_m) for x_m in (0.0, 0.1, -0.1)]
     votes = SurfaceVotes.empty()
