@@ -30,6 +30,10 @@ SURFACE: Final = frozenset(
     {"table", "desk", "counter", "countertop", "bed", "workbench", "wall", "floor", "ceiling", "door", "rug", "carpet",
      "lawn", "grass", "road", "whiteboard"}
 )  # fmt: skip
+# open vessels and boxes: what they hold belongs to them
+CONTAINER: Final = frozenset(
+    {"bowl", "basket", "box", "crate", "bin", "tray", "dish", "bucket", "tub", "basin", "pot", "pan", "carton"}
+)
 # synonyms; the first of each row is the canonical name
 _SYNONYM_ROWS: Final = (
     ("cup", "mug", "teacup", "coffee mug", "coffee cup", "tumbler", "paper cup"),
@@ -105,6 +109,11 @@ def is_medium(phrase: str) -> bool:
 def is_furniture(phrase: str) -> bool:
     """Return True for furniture and other objects that may fill much of an image."""
     return head_of(phrase) in FURNITURE
+
+
+def is_container(phrase: str) -> bool:
+    """Return True for bowls, baskets, boxes and the like."""
+    return head_of(phrase) in CONTAINER
 
 
 def same_kind(phrase: str, name: str) -> bool:

@@ -23,13 +23,17 @@ class Rival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
-    """One detected object in one image. box_px is (left, top, right, bottom). rival: None without another class."""
+    """One detected object in one image. box_px is (left, top, right, bottom). rival: None without another class.
+
+    is_weak: the score is below the detector's threshold. It supports an object that other frames found, nothing else.
+    """
 
     phrase: str
     score: float
     box_px: tuple[float, float, float, float]
     mask: Bool[ndarray, "h w"]
     rival: Rival | None = None
+    is_weak: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

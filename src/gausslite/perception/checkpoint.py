@@ -24,6 +24,7 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "cells": landmark.cells,
         "counts": landmark.counts,
         "seen_missed": int_array(landmark.seen_count, landmark.missed_count, landmark.missed_in_a_row),
+        "weak_count": int_array(landmark.weak_count),
         "seen_ns_number": np.array([landmark.first_seen_ns, landmark.last_seen_ns, landmark.number], np.int64),
         "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
         "rival_names": encode_text("\n".join(landmark.rival_scores)),
@@ -44,6 +45,7 @@ def decode_landmark(state: State) -> Landmark:
     if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
         raise MapFileError("state landmark: expected ascending cells with positive counts, got others")
     seen_count, missed_count, missed_in_a_row = get_counts(state, "seen_missed", 3)
+    (weak_count,) = get_counts(state, "weak_count", 1)
     best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
     extent = (get_text(state, "phrase"), np.array([x_m, y_m, z_m]), radius_m, cells, counts)
     first_ns, last_ns, number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
@@ -67,7 +69,7 @@ def decode_landmark(state: State) -> Landmark:
     landmark = Landmark(*extent, seen_count, missed_count, best_score, farthest_m, first_ns, last_ns, number)
     scored = replace(landmark, score_sum=score_sum, rival_scores=rivals)
     seen = replace(scored, votes=votes, colours=colours, supports_m=supports_m)
-    return replace(seen, missed_in_a_row=missed_in_a_row)
+    return replace(seen, missed_in_a_row=missed_in_a_row, weak_count=weak_count)
 
 
 def decode_floor(state: State) -> FloorLevel:

@@ -30,12 +30,16 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DetectedBox:
-    """A detection without a mask; box_px is (left, top, right, bottom). rival: the class detected in the same box."""
+    """A detection without a mask; box_px is (left, top, right, bottom). rival: the class detected in the same box.
+
+    is_weak: the score is below the detector's threshold.
+    """
 
     phrase: str
     score: float
     box_px: tuple[float, float, float, float]
     rival: Rival | None = None
+    is_weak: bool = False
 
 
 @runtime_checkable
@@ -83,7 +87,7 @@ class SegmentedDetector:
             for row, mask in zip(rows, segmenter.segment(frame, boxes_px), strict=True):
                 masks[row] = mask
         return [
-            Detection(box.phrase, box.score, box.box_px, mask, box.rival)
+            Detection(box.phrase, box.score, box.box_px, mask, box.rival, box.is_weak)
             for box, mask in zip(boxes, masks, strict=True)
             if mask is not None
         ]

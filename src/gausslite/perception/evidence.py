@@ -81,11 +81,12 @@ class EvidenceSettings:
         return landmark.seen_count >= self.min_seen_known and self.is_confirmed(landmark)
 
     def is_present(self, landmark: Landmark) -> bool:
-        """Return True if the latest frame with detections found the landmark, or few frames missed a reliable one."""
+        """Return True if the latest frame with detections found the landmark, or few frames missed a known one."""
         if landmark.missed_in_a_row == 0:
             return True
-        is_often_seen = landmark.seen_count >= _MIN_PRESENT_SHARE * (landmark.seen_count + landmark.missed_count)
-        return is_often_seen and self.is_reliable(landmark)
+        found = landmark.seen_count + landmark.weak_count
+        is_often_found = found >= _MIN_PRESENT_SHARE * (found + landmark.missed_count)
+        return is_often_found and (self.is_known(landmark) or self.is_reliable(landmark))
 
     def needs_observation(self, landmark: Landmark) -> bool:
         """Return True if one more observation could confirm the landmark."""

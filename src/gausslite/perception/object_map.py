@@ -34,7 +34,7 @@ class Observation:
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
     capture time. rival: a different thing detected in the same place. votes: which voxels the mask
     shows inside and outside the object. colours: `colour_counts` of the mask's pixels.
-    supports_m: the levels of planes seen under it, along up in the world.
+    supports_m: the levels of planes seen under it, along up in the world. is_weak: of a weak detection.
     """
 
     phrase: str
@@ -48,6 +48,7 @@ class Observation:
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
     supports_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
+    is_weak: bool = False
 
     @classmethod
     def from_points(
@@ -81,6 +82,7 @@ class Landmark:
     capture times of its observations. number: assigned by the object map, in the order of first observations.
     score_sum: sum of its scores; rival_scores: sums of the scores of different things in its place. votes: of its
     masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
+    weak_count: frames with a weak detection only, whose score is in score_sum.
     colours: sums over its observations. supports_m: the latest levels of planes seen under it.
     """
 
@@ -102,6 +104,7 @@ class Landmark:
     missed_in_a_row: int = 0
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
     supports_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
+    weak_count: int = 0
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -139,16 +142,30 @@ class Landmark:
     def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
         """Return the whole object as an observation by a camera, to evaluate relations."""
         place = self.phrase, self.centroid_m, self.radius_m, self.cells, camera_m
-        return Observation(*place, colours=self.colours, supports_m=self.supports_m)
+        return Observation(*place, votes=self.votes, colours=self.colours, supports_m=self.supports_m)
 
     def matches(self, other: Observation) -> bool:
         """Return True if an observation of the same phrase shows this object, in whole or in part."""
         shared = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
         return self.is_colocated_with(other) or shared >= _MIN_SHARED * max(1, min(len(self.cells), len(other.cells)))
 
+    def support(self, weak: Observation) -> None:
+        """Count a weak detection of this object, without its inexact mask."""
+        self.weak_count += 1
+        self.missed_in_a_row = 0
+        self.score_sum += weak.score
+        self.last_seen_ns = max(self.last_seen_ns, weak.time_ns)
+        if weak.rival is not None:
+            self._add_rivals({weak.rival.name: weak.rival.score})
+
+    def _add_rivals(self, scores: dict[str, float]) -> None:
+        for name, score in scores.items():
+            self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score
+
     def add(self, other: Landmark) -> None:
         """Merge another landmark into this one, and recompute the centroid."""
         self.seen_count += other.seen_count
+        self.weak_count += other.weak_count
         self.missed_count += other.missed_count
         self.best_score = max(self.best_score, other.best_score)
         self.farthest_m = max(self.farthest_m, other.farthest_m)
@@ -159,8 +176,7 @@ class Landmark:
         self.colours = self.colours + other.colours
         self.supports_m = np.concatenate([self.supports_m, other.supports_m])[-MAX_SUPPORTS:]
         self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
-        for name, score in other.rival_scores.items():
-            self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score
+        self._add_rivals(other.rival_scores)
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
         total = np.bincount(where, weights=np.concatenate([self.counts, other.counts])).astype(np.int64)
         if len(merged) > _MAX_CELLS:
@@ -212,7 +228,10 @@ class ObjectMap:
 
         With is_visible, the other landmarks that the frame should have shown are counted as missed.
         """
-        observed = [self._add(observation) for observation in observations]
+        observed = [self._add(observation) for observation in observations if not observation.is_weak]
+        for observation in observations:
+            if observation.is_weak:
+                self._support(observation, observed)
         if is_visible is not None:
             for each in self._objects:
                 if not any(each is other for other in observed) and is_visible(each):
@@ -233,3 +252,15 @@ class ObjectMap:
             matches[0].add(other)
             self._objects.remove(other)
         return matches[0]
+
+    def _support(self, weak: Observation, observed: list[Landmark]) -> None:
+        """Count a weak observation for the nearest landmark that it shows, unless this frame already shows one.
+
+        Its mask may cover several objects, so it merges none.
+        """
+        matches = [each for each in self.with_phrase(weak.phrase) if each.matches(weak)]
+        if not matches or any(each is other for each in matches for other in observed):
+            return
+        nearest = min(matches, key=lambda each: float(np.linalg.norm(each.centroid_m - weak.centroid_m)))
+        nearest.support(weak)
+        observed.append(nearest)

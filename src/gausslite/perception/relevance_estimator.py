@@ -16,9 +16,9 @@ from gausslite.domain.relevance import Detection, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detect import Detector, Segmenter
+from gausslite.perception.lifting import best_depth_m
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.relevance_tracker import RelevanceTracker, RelevanceTrackerSettings
-from gausslite.perception.spatial import best_depth_m
 from gausslite.perception.supporting_surface import nouns_known_by_height
 
 

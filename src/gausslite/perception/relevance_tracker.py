@@ -27,12 +27,12 @@ from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.checkpoint import decode_floor, decode_landmark, encode_landmark
 from gausslite.perception.detect import Segmenter, bounding_box
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
-from gausslite.perception.foreground import foreground_mask
+from gausslite.perception.lifting import lift_detections
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.object_masks import refined_mask, surface_mask
 from gausslite.perception.object_report import describe_landmarks
 from gausslite.perception.relations import SpatialSettings
-from gausslite.perception.spatial import SpatialFilter, lift_observation
+from gausslite.perception.spatial import SpatialFilter
 
 # a detection with a smaller share of its pixels outside excluded objects shows one of them
 _MIN_SHARE_LEFT = 0.3
@@ -235,16 +235,9 @@ class RelevanceTracker:
     ) -> list[tuple[Landmark, Bool[ndarray, "h w"]]]:
         """Add the detections to the object map; return the masks of its landmarks in this frame."""
         kept = self._drop_excluded(self._drop_generic_anchors(detections))
-        masked = [replace(each, mask=foreground_mask(each.mask, depth_m)) for each in kept]
-        of_noun = {
-            noun: np.logical_or.reduce([each.mask for each in masked if each.phrase == noun])
-            for noun in {each.phrase for each in masked}
-        }
-        lifted = [(each, lift_observation(each, depth_m, frame, of_noun[each.phrase])) for each in masked]
         localised = [
             (detection, self._filter.with_support(observation, detection, frame))
-            for detection, observation in lifted
-            if observation is not None
+            for detection, observation in lift_detections(kept, depth_m, frame)
         ]
         self._filter.observe_floor(frame)
         self._filter.observe([observation for _, observation in localised], VisibilityCheck(frame, frame.depth_m))
@@ -258,7 +251,7 @@ class RelevanceTracker:
     def _drop_generic_anchors(self, detections: Sequence[Detection]) -> list[Detection]:
         """Drop detections of a generic noun that are an anchor: "the object on the desk" is not the desk."""
         nouns = {noun_of(anchor) for anchor in self._graph.anchors}
-        anchors = [each.mask for each in detections if each.phrase in nouns]
+        anchors = [each.mask for each in detections if each.phrase in nouns and not each.is_weak]
         return [
             each
             for each in detections
@@ -268,7 +261,7 @@ class RelevanceTracker:
     def _drop_excluded(self, detections: Sequence[Detection]) -> list[Detection]:
         """Remove the pixels of excluded objects from all others; drop detections that mostly show an excluded one."""
         nouns = self._graph.excluded_nouns
-        excluded = [each.mask for each in detections if each.phrase in nouns]
+        excluded = [each.mask for each in detections if each.phrase in nouns and not each.is_weak]
         if not excluded:
             return list(detections)
         left_out = np.logical_or.reduce(excluded)

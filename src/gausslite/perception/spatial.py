@@ -6,62 +6,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import lift
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import UpAxis, transform_points, unit_up_axis
+from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
 from gausslite.perception.colour_filter import ColourFilter
 from gausslite.perception.colours import ColourMatch
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
-from gausslite.perception.object_masks import mask_colours, mask_votes
 from gausslite.perception.relations import RelationGeometry, SpatialSettings, surface_distance_m
 from gausslite.perception.superlatives import select_extreme
 from gausslite.perception.supporting_surface import FloorLevel, stands_on, support_level_m
-
-_MIN_PIXELS = 8
-_MAX_PIXELS = 4000
-
-
-def best_depth_m(
-    sensor_m: Float32[ndarray, "h w"], rendered_m: Float32[ndarray, "h w"] | None
-) -> Float32[ndarray, "h w"]:
-    """Return the rendered depth where the map is not empty, the sensor's depth elsewhere."""
-    if rendered_m is None or rendered_m.shape != sensor_m.shape:
-        return sensor_m
-    return np.where(rendered_m > 0, rendered_m, sensor_m)
-
-
-def lift_observation(
-    detection: Detection,
-    depth_m: Float32[ndarray, "h w"],
-    frame: Frame,
-    siblings: Bool[ndarray, "h w"] | None = None,
-) -> Observation | None:
-    """Lift a detection's mask to an observation in the world; None if too few of its pixels have depth.
-
-    The paper lifts the pixel at the 2D centroid, which may lie outside the object; this lifts all pixels.
-    siblings: pixels of the frame's detections of the same noun.
-    """
-    rows, columns = np.nonzero(detection.mask & (depth_m > 0))
-    if len(rows) < _MIN_PIXELS:
-        return None
-    step = max(1, len(rows) // _MAX_PIXELS)
-    rows, columns = rows[::step], columns[::step]
-    centres_px = np.stack([columns, rows], axis=1) + 0.5
-    points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)
-    if frame.motion is not None:
-        points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
-    T_world_camera = frame.T_world_camera
-    points_m = transform_points(T_world_camera, points)
-    camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
-    observation = Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
-    votes, colours = mask_votes(detection.mask, frame, siblings), mask_colours(detection.mask, frame)
-    return replace(observation, rival=detection.rival, votes=votes, colours=colours)
 
 
 class SpatialFilter:
@@ -270,7 +228,8 @@ class SpatialFilter:
         """Return whether an object stands on the relation's anchor by its height; None if heights do not decide."""
         if not self._is_by_height(relation):
             return None
-        return stands_on(noun_of(relation.anchor), seen.supports_m, self._floor.level_m)
+        bottom_m = seen.votes.lowest_m(self._up)
+        return stands_on(noun_of(relation.anchor), seen.supports_m, self._floor.level_m, bottom_m)
 
     def _is_extreme(self, relation: Relation, observation: Observation) -> bool:
         """Return True for the reliable candidate with the least (or largest) distance to its nearest anchor."""

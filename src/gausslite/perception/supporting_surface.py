@@ -20,6 +20,12 @@ from gausslite.domain.object_names import head_of
 from gausslite.perception.detect import bounding_box
 from gausslite.perception.object_masks import window_points_m
 
+# furniture of any height: what reaches down to the floor does not stand on it
+_RAISED: Final = frozenset(
+    {"shelf", "bookshelf", "bookcase", "rack", "cabinet", "cupboard", "dresser", "sideboard", "wardrobe", "drawer",
+     "stand", "trolley", "cart", "ledge", "windowsill", "sill", "mantelpiece", "mantel", "piano"}
+)  # fmt: skip
+_MAX_FLOOR_BOTTOM_M: Final = 0.06
 # heights above the floor in metres: usual, and possible
 _HEIGHTS_M: Final[dict[str, tuple[tuple[float, float], tuple[float, float]]]] = {
     "floor": ((-0.05, 0.06), (-0.15, 0.12)),
@@ -140,11 +146,23 @@ def nouns_known_by_height(matches: Sequence[NounMatch]) -> frozenset[str]:
 
     A "counter" may be searched as the class "dining table"; the usual heights of both differ.
     """
-    return frozenset(each.noun for each in matches if head_of(each.noun) in _HEIGHTS_M and not _is_found(each))
+    return frozenset(
+        each.noun
+        for each in matches
+        if (head_of(each.noun) in _HEIGHTS_M and not _is_found(each))
+        or (head_of(each.noun) in _RAISED and not each.is_searched)
+    )
 
 
-def stands_on(noun: str, support_levels_m: Float64[ndarray, " n"], floor_m: float) -> bool | None:
-    """Return whether an object on planes of these levels stands on such a surface; None if this is not sure."""
+def stands_on(
+    noun: str, support_levels_m: Float64[ndarray, " n"], floor_m: float, bottom_m: float = np.nan
+) -> bool | None:
+    """Return whether an object on planes of these levels stands on such a surface; None if this is not sure.
+
+    bottom_m: the object's lowest level. It decides alone for furniture of any height, such as shelves.
+    """
+    if head_of(noun) in _RAISED:
+        return False if bottom_m - floor_m <= _MAX_FLOOR_BOTTOM_M else None
     if len(support_levels_m) == 0 or not np.isfinite(floor_m):
         return None
     height_m = float(np.median(support_levels_m)) - floor_m

@@ -20,6 +20,7 @@ _MAX_VOXELS: Final = 60_000
 _MAX_INSIDE_VOXELS: Final = 15_000
 # median distance to the middle of a disc, times this number, is its diameter
 _DIAMETERS: Final = 2.8
+_BOTTOM_PERCENTILE: Final = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,11 @@ class SurfaceVotes:
             return 0.0
         distances_m = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
         return _DIAMETERS * float(np.median(distances_m))
+
+    def lowest_m(self, up: Float64[ndarray, "3"]) -> float:
+        """Return the level of the surface's bottom, along up in the world; NaN without a surface."""
+        levels_m = self.surface_m.astype(np.float64) @ up
+        return float(np.percentile(levels_m, _BOTTOM_PERCENTILE)) if len(levels_m) else np.nan
 
     def resolved(self, min_voxel_m: float) -> SurfaceVotes:
         """Return the votes in voxels of a twelfth of the extent, and of at least min_voxel_m."""

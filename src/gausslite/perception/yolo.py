@@ -25,11 +25,13 @@ from gausslite.perception.yolo_network import YoloNetwork
 class YoloSettings:
     """Thresholds of score, overlap and size of the boxes.
 
-    accept_similar: also search classes that are only similar to a noun. rival_min_iou: lowest overlap of a box with one
+    weak_score: lowest score of weak detections, which only named objects have. accept_similar: also search classes
+    that are only similar to a noun. rival_min_iou: lowest overlap of a box with one
     of a different class that may show the same object.
     """
 
     min_score: float = 0.25
+    weak_score: float = 0.1
     nms_max_iou: float = 0.7
     max_boxes: int = 100
     accept_similar: bool = False
@@ -37,7 +39,7 @@ class YoloSettings:
     box_limits: BoxSizeLimits = field(default_factory=BoxSizeLimits)
 
     def __post_init__(self) -> None:
-        for name in ("min_score", "nms_max_iou", "rival_min_iou"):
+        for name in ("min_score", "weak_score", "nms_max_iou", "rival_min_iou"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
@@ -84,11 +86,11 @@ class YoloDetector:
         if not query_classes:
             return []
         output = self._network.run(frame)
-        every = output.candidates(self._settings.min_score)
+        every = output.candidates(self._settings.weak_score)
         candidates = self._distinct(every, query_classes)
         masks = output.masks(candidates)
         return [
-            Detection(box.phrase, box.score, box.box_px, masks[row], box.rival)
+            Detection(box.phrase, box.score, box.box_px, masks[row], box.rival, box.is_weak)
             for row, box in self._boxes(candidates, every, query_classes, frame)
             if masks[row].any()
         ]
@@ -98,7 +100,7 @@ class YoloDetector:
         query_classes = self._query_classes(queries)
         if not query_classes:
             return []
-        every = self._network.run(frame).candidates(self._settings.min_score)
+        every = self._network.run(frame).candidates(self._settings.weak_score)
         candidates = self._distinct(every, query_classes)
         return [box for _, box in self._boxes(candidates, every, query_classes, frame)]
 
@@ -123,7 +125,11 @@ class YoloDetector:
                 name = self.class_names[candidates.classes[row]]
                 left, top, right, bottom = (float(edge) for edge in candidates.boxes_px[row])
                 rival = self._rival(query, classes, every.take(np.flatnonzero(overlaps[row])))
-                box = DetectedBox(query, float(candidates.scores[row]), (left, top, right, bottom), rival)
+                score = float(candidates.scores[row])
+                is_weak = score < self._settings.min_score
+                if is_weak and is_generic(query):
+                    continue
+                box = DetectedBox(query, score, (left, top, right, bottom), rival, is_weak)
                 if self._settings.box_limits.accepts(name, box.score, box.box_px, frame):
                     yield int(row), box
 

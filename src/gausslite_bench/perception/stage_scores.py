@@ -167,10 +167,9 @@ class _TaskEvaluation:
 
     def process(self, frame: Frame, truths: Mapping[str, Bool[ndarray, "h w"]]) -> FrameMasks:
         graph = self._query.graph
-        detections = [
-            each for each in self._detector.detect(frame, graph.queries) if each.phrase in map(noun_of, graph.targets)
-        ]
         nouns = [noun_of(target) for target in graph.targets]
+        every = self._detector.detect(frame, graph.queries)
+        detections = [each for each in every if each.phrase in nouns and not each.is_weak]
         masks = {PerceptionStage.DETECTED: merge_detections(detections, nouns, frame).roi}
         relevance = {stage: estimator.estimate(frame).relevance for stage, estimator in self._estimators.items()}
         masks |= {stage: each.roi for stage, each in relevance.items()}

@@ -54,7 +54,8 @@ class ScriptedDetector:
         self.calls += 1
         mask = np.zeros(frame.depth_m.shape, np.bool_)
         mask[50:70, 70:90] = True
-        return [] if score is None else [Detection("mug", score, (70.0, 50.0, 90.0, 70.0), mask)]
+        is_weak = score is not None and score < 0.25
+        return [] if score is None else [Detection("mug", score, (70.0, 50.0, 90.0, 70.0), mask, is_weak=is_weak)]
 
 
 def target_marked(scores: Sequence[float | None], frames: int, max_frames: int = 1) -> list[bool]:
@@ -113,6 +114,17 @@ def test_a_reliable_target_survives_a_few_missed_detections():
 
 def test_an_unreliable_target_is_marked_while_no_frame_misses_it():
     assert target_marked([0.4, 0.4, None, 0.4], 4) == [False, True, False, True]
+
+
+def test_a_weak_detection_supports_an_object_but_does_not_make_one():
+    assert target_marked([0.2], 5) == [False] * 5
+    assert target_marked([0.4, 0.2, 0.2, 0.2], 4) == [False] * 4
+    assert target_marked([0.4, 0.4, 0.2, None], 4) == [False, True, True, False]
+
+
+def test_a_known_target_survives_missed_detections_without_a_high_score():
+    assert target_marked([0.4, 0.4, 0.4, None, 0.2, None, None], 7) == [False] + [True] * 6
+    assert target_marked([0.4, 0.4, 0.4, *[None] * 7], 10) == [False] + [True] * 8 + [False]
 
 
 def test_an_object_missed_by_most_frames_is_not_confirmed():

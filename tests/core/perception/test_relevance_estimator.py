@@ -16,11 +16,12 @@ from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
 from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.lifting import best_depth_m
 from gausslite.perception.object_map import Observation
 from gausslite.perception.relations import SpatialSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.spatial import SpatialFilter, best_depth_m
+from gausslite.perception.spatial import SpatialFilter
 from gausslite.perception.text_embeddings import match_noun
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)

@@ -94,6 +94,9 @@ def test_planes_and_floor_are_measured():
         # the bottle on the counter could stand on a high desk: kept, but not if it must not be on one
         ("desk", False, [True, True, False], 2),
         ("desk", True, [False, False, True], 2),
+        # a shelf may have any height, but what reaches down to the floor is not on it
+        ("shelf", False, [True, True, False], 1),
+        ("shelf", True, [False, False, True], 1),
     ],
 )
 def test_heights_decide_what_stands_on_a_surface_without_a_class(anchor, negated, expected, sure):
@@ -132,6 +135,12 @@ def test_usual_heights(noun, height_m, expected):
     assert stands_on(noun, np.zeros(0), 2.0) is None
 
 
+def test_what_reaches_the_floor_is_not_on_a_shelf():
+    assert stands_on("book shelf", np.array([2.3]), 2.0, 2.03) is False
+    assert stands_on("book shelf", np.array([2.3]), 2.0, 2.29) is None
+    assert stands_on("shelf", np.zeros(0), np.nan, 2.03) is None
+
+
 def test_only_surfaces_that_the_detector_cannot_find_as_themselves_are_decided_by_height():
     matches = (
         NounMatch("counter", MatchBasis.SYNONYM, ("dining table",)),
@@ -141,4 +150,4 @@ def test_only_surfaces_that_the_detector_cannot_find_as_themselves_are_decided_b
         NounMatch("shelf", MatchBasis.NONE),
         NounMatch("workbench", MatchBasis.PHRASE),
     )
-    assert nouns_known_by_height(matches) == {"counter", "floor"}
+    assert nouns_known_by_height(matches) == {"counter", "floor", "shelf"}

@@ -92,9 +92,17 @@ def test_suppression_is_per_class(tmp_path):
 
 
 def test_boxes_below_the_score_or_without_a_mask_are_dropped(tmp_path):
-    doubtful, black = (24.0, 32.0, 16.0, 16.0, 0, 0.2), (52.0, 32.0, 16.0, 16.0, 0, 0.9)
+    doubtful, black = (24.0, 32.0, 16.0, 16.0, 0, 0.08), (52.0, 32.0, 16.0, 16.0, 0, 0.9)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [doubtful, black]))
     assert detector.detect(frame_with_red_square(), ["cup"]) == []
+
+
+def test_boxes_below_the_threshold_are_weak_and_of_named_objects_only(tmp_path):
+    weak, sure = (24.0, 32.0, 16.0, 16.0, 0, 0.2), (22.0, 32.0, 12.0, 16.0, 1, 0.3)
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [weak, sure]))
+    found = detector.detect(frame_with_red_square(), ["cup", "chair"])
+    assert [(each.phrase, each.is_weak) for each in found] == [("cup", True), ("chair", False)]
+    assert [each.is_weak for each in detector.detect(frame_with_red_square(), ["object"])] == [False]
 
 
 def test_boxes_too_large_for_their_class_are_dropped_whatever_else_is_asked_for(tmp_path):

@@ -1,0 +1,77 @@
+"""Lift a frame's detections into the world: masks of one depth layer with what containers hold, their points, votes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from numpy import ndarray
+
+from gausslite.domain.camera import lift
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import transform_points
+from gausslite.domain.relevance import Detection
+from gausslite.perception.contents import with_contents
+from gausslite.perception.foreground import foreground_mask
+from gausslite.perception.object_map import Observation
+from gausslite.perception.object_masks import mask_colours, mask_votes
+
+_MIN_PIXELS = 8
+_MAX_PIXELS = 4000
+
+
+def best_depth_m(
+    sensor_m: Float32[ndarray, "h w"], rendered_m: Float32[ndarray, "h w"] | None
+) -> Float32[ndarray, "h w"]:
+    """Return the rendered depth where the map is not empty, the sensor's depth elsewhere."""
+    if rendered_m is None or rendered_m.shape != sensor_m.shape:
+        return sensor_m
+    return np.where(rendered_m > 0, rendered_m, sensor_m)
+
+
+def lift_observation(
+    detection: Detection,
+    depth_m: Float32[ndarray, "h w"],
+    frame: Frame,
+    siblings: Bool[ndarray, "h w"] | None = None,
+) -> Observation | None:
+    """Lift a detection's mask to an observation in the world; None if too few of its pixels have depth.
+
+    The paper lifts the pixel at the 2D centroid, which may lie outside the object; this lifts all pixels.
+    siblings: pixels of the frame's detections of the same noun. A weak detection has no votes and colours.
+    """
+    rows, columns = np.nonzero(detection.mask & (depth_m > 0))
+    if len(rows) < _MIN_PIXELS:
+        return None
+    step = max(1, len(rows) // _MAX_PIXELS)
+    rows, columns = rows[::step], columns[::step]
+    centres_px = np.stack([columns, rows], axis=1) + 0.5
+    points = lift(centres_px, depth_m[rows, columns].astype(np.float64), frame.camera)
+    if frame.motion is not None:
+        points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
+    T_world_camera = frame.T_world_camera
+    points_m = transform_points(T_world_camera, points)
+    camera_m, time_ns = T_world_camera[:3, 3], frame.capture_time_ns
+    observation = Observation.from_points(detection.phrase, points_m, camera_m, detection.score, time_ns)
+    if detection.is_weak:
+        return replace(observation, rival=detection.rival, is_weak=True)
+    votes, colours = mask_votes(detection.mask, frame, siblings), mask_colours(detection.mask, frame)
+    return replace(observation, rival=detection.rival, votes=votes, colours=colours)
+
+
+def lift_detections(
+    detections: Sequence[Detection], depth_m: Float32[ndarray, "h w"], frame: Frame
+) -> list[tuple[Detection, Observation]]:
+    """Return the detections with improved masks and their observations, without those that have too little depth."""
+    improved = [
+        replace(each, mask=with_contents(each.phrase, foreground_mask(each.mask, depth_m), depth_m))
+        for each in detections
+    ]
+    of_noun: dict[str, Bool[ndarray, "h w"]] = {}
+    for each in improved:
+        if not each.is_weak:
+            of_noun[each.phrase] = of_noun.get(each.phrase, False) | each.mask
+    lifted = [(each, lift_observation(each, depth_m, frame, of_noun.get(each.phrase))) for each in improved]
+    return [(detection, observation) for detection, observation in lifted if observation is not None]
