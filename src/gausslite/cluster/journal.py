@@ -11,6 +11,7 @@ import numpy as np
 from gausslite.cluster.store_calls import StoreCall
 from gausslite.domain.errors import StorageError
 from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.fusion import storage_probe
 from gausslite.fusion.score_index import scores_of
 from gausslite.fusion.store_changes import (
     AgentRemoved,
@@ -93,6 +94,9 @@ def changes_of(call: StoreCall, result: object) -> tuple[StoreChange, ...]:
         case "remove_agent", (agent_id,):
             assert isinstance(result, np.ndarray)
             return (AgentRemoved(agent_id, result),)
+        case "save_record", (_, storage_probe.RECORD, _):
+            # every server writes this large record often, and none reads it
+            return ()
         case "save_record", (agent_id, name, data):
             return (RecordSaved(agent_id, name, data),)
         case "save_keyframe", (agent_id, index, data):

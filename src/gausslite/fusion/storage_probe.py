@@ -7,7 +7,7 @@ from gausslite.fusion.store import FusionStore
 
 _PROBE_BYTES = 256 << 10
 # no agent can have an empty id
-_OWNER, _RECORD = "", "storage-probe"
+_OWNER, RECORD = "", "storage-probe"
 
 
 class StorageProbe:
@@ -25,9 +25,9 @@ class StorageProbe:
     def check(self) -> None:
         """Raise StorageError if the store does not take 256 KiB."""
         try:
-            self._store.save_record(_OWNER, _RECORD, bytes(_PROBE_BYTES))
+            self._store.save_record(_OWNER, RECORD, bytes(_PROBE_BYTES))
             # its pages are free again, so that the next check needs new ones if messages have taken them
-            self._store.save_record(_OWNER, _RECORD, b"")
+            self._store.save_record(_OWNER, RECORD, b"")
         except StorageError:
             self._is_writable = False
             raise

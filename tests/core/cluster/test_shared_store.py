@@ -304,6 +304,14 @@ def test_a_journal_says_if_it_does_not_reach_back() -> None:
             journal.after(position)
 
 
+def test_checks_of_the_storage_are_sent_to_no_other_server(team: Team) -> None:
+    other = team.hosts.share_store(SHARDS)
+    team.engines[0].storage.check()
+    assert other.fetch_changes()
+    assert other.take_changes() == []
+    other.close()
+
+
 def test_one_server_leads_until_it_stops_asking() -> None:
     now_s = [0.0]
     leadership = Leadership(lambda: now_s[0])
