@@ -20,7 +20,7 @@ from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.mission.results import as_text, prepare_file
+from gausslite.mission.results import CALIBRATION_FILE, as_text, prepare_file
 
 _STEPS = 3
 _KNOWN_HELP = "keep these values, and estimate what they leave out (default: the lens that the files state)"
@@ -43,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Estimate, print and write the options. Returns the exit code."""
     if options.out is not None:
-        prepare_file(options.out)
+        prepare_file(options.out, CALIBRATION_FILE)
     lens = read_camera_correction(f"lens={options.lens}").lens if options.lens else None
     source = open_recorded(options.source, options.up)
     calibration = calibrate(source, CameraCorrection(lens or source.lens))

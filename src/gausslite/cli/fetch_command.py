@@ -7,7 +7,7 @@ import argparse
 from gausslite.cli.team_options import add_address, add_mission, fusion_client
 from gausslite.codec.files import write_atomic
 from gausslite.config.paths import read_path
-from gausslite.mission.results import prepare_file
+from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.wire.clients import Export
 
 _STRATEGIES = ("vote", "refined", "concatenation")
@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Download the map. Returns the exit code. Raises MismatchError before the first refinement, UnavailableError."""
-    prepare_file(options.out)
+    prepare_file(options.out, MAP_FILE)
     with fusion_client(options) as client:
         data = client.export(Export(options.strategy, options.agent))
     write_atomic(options.out, data)

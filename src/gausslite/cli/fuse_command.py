@@ -13,7 +13,7 @@ from gausslite.config.paths import read_path
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.offline import fuse_maps
-from gausslite.mission.results import as_text, prepare_folder
+from gausslite.mission.results import MAP_FILE, as_text, prepare_file
 from gausslite.process.messages import print_message
 
 
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     _require_different_files(options.maps)
     frames = {path: read_world_frame(path) for path in options.maps}
     world_frame = _common_world_frame(frames)
-    prepare_folder(options.out.absolute().parent)
+    prepare_file(options.out.absolute(), MAP_FILE)
     # the vote's last tie-break is the lower id: number the files in the given order
     maps = {f"{i:03d} {path}": read_ply(path) for i, path in enumerate(options.maps)}
     fused = fuse_maps(maps, VoxelGrid(options.voxel_size))

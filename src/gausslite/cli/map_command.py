@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gausslite.cli.depth_check import depth_notes, require_mappable_depth
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import add_regions, add_source, report_region_file, selected_regions
@@ -16,7 +17,7 @@ from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
 from gausslite.config.values import AUTO, NONE
 from gausslite.config.view_option import add_view
-from gausslite.domain.errors import DatasetError
+from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import require_name
 from gausslite.domain.region import Region
@@ -41,10 +42,11 @@ from gausslite.mission.results import (
 from gausslite.mission.runner import MissionResult, MissionRunner
 from gausslite.mission.settings import PoseMode, SceneInfo
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.mission.task_schedule import ScheduledTaskMapper
+from gausslite.mission.task_schedule import ScheduledTaskMapper, TaskSchedule
 from gausslite.mission.timeline import Timeline
 from gausslite.process.interrupts import DeferredInterrupt
 from gausslite.process.messages import print_message
+from gausslite.render.choose import choose_rasterizer
 from gausslite.view.mission_view import mission_view
 
 _NOT_RESUMED = -1
@@ -109,6 +111,10 @@ def _map(options: argparse.Namespace) -> int:
     estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
     roi = _first_roi(options, inputs, resumed_after)
     if saved is None:
+        # an estimate takes half a minute; first refuse what cannot be mapped
+        choose_rasterizer(inputs.mission.backend, inputs.mission.threads)
+        if isinstance(roi, TaskGraph):
+            estimators.require_detector()
         inputs = inputs.calibrated(options)
     mapper = build_task_mapper(inputs.mission, estimators, roi)
     if saved is not None:
@@ -123,6 +129,7 @@ def _map(options: argparse.Namespace) -> int:
             mapping.write_results(result)
     # an early end keeps the map so far; the exit code reports it
     mapping.raise_if_stopped(result)
+    mapping.raise_if_unsaved()
     if interrupt.pending_exception is not None:
         raise type(interrupt.pending_exception)(f"all frames are mapped, and all files are in {options.out}")
     mapping.print_results(result)
@@ -141,6 +148,7 @@ class _Run:
         self._gaussians = Gaussians.empty()
         self._report: dict[str, object] = {}
         self._notes: tuple[str, ...] = ()
+        self._save_error: StorageError | None = None
 
     def map_frames(self, estimators: EstimatorFactory, resumed_after: int) -> MissionResult:
         """Map the frames after an index. Raises DatasetError if frames exist and none of them can be used."""
@@ -160,14 +168,19 @@ class _Run:
         if result.processed == 0 and self._corrupt.first_error is not None:
             raise self._corrupt.first_error
         self._gaussians = self._mapper.gaussians()
-        if len(self._gaussians) == 0 and result.totals.frames == 0 and result.processed > 0:
-            raise DatasetError(f"{options.source}: expected frames with depth, got none in {result.processed}")
+        if len(self._gaussians) == 0 and result.processed > 0:
+            require_mappable_depth(options.source, result, self._mapper.keyframes())
         return result
 
     def write_results(self, result: MissionResult) -> None:
         """Write map.ply, report.json, frames.csv, poses, the keyframes and preview.png. Raises StorageError."""
         options, mission = self._options, self._inputs.mission
-        self._notes = (*self._mapper.notes, *_unseen_notes(options, result))
+        self._notes = (
+            *self._mapper.notes,
+            *_unseen_notes(options, result),
+            *_unreached_notes(self._inputs.schedule, result.last_index),
+            *depth_notes(self._mapper.keyframes()),
+        )
         self._report = {
             **self._inputs.report(),
             "resumed_from": None if options.resume is None else str(options.resume),
@@ -198,6 +211,11 @@ class _Run:
             raise type(result.stopped_by)(_interrupted_text(self._options, result))
         result.raise_if_stopped()
 
+    def raise_if_unsaved(self) -> None:
+        """Raise the error of --save-state, after the other results were written."""
+        if self._save_error is not None:
+            raise self._save_error
+
     def print_results(self, result: MissionResult) -> None:
         """Print the figures and the notes of a complete run."""
         totals, report = result.totals, self._report
@@ -212,16 +230,18 @@ class _Run:
             print(f"  {tracking_text(report)}")
         if result.processed == 0:
             print(f"  no selected frame comes after frame {result.last_index}, the last one of the resumed run")
-        for noun in self._mapper.nouns:
-            print(f"  {noun.describe()}")
-        for note in self._notes:
-            print(f"  {note}")
+        # the notes repeat what is missing among the nouns
+        for line in dict.fromkeys((*(noun.describe() for noun in self._mapper.nouns), *self._notes)):
+            print(f"  {line}")
 
     def _save(self, last_index: int) -> None:
         prepare_folder(self._options.save_state.parent)
         extra: State = {FRAMES_KEY: encode_text(self._options.frames)}
         config = self._inputs.resume_config(last_index)
-        save_run(self._options.save_state, self._mapper, config, last_index, extra)
+        try:
+            save_run(self._options.save_state, self._mapper, config, last_index, extra)
+        except StorageError as error:
+            self._save_error = error  # the map is worth writing nevertheless
 
 
 def _first_roi(options: argparse.Namespace, inputs: MapInputs, resumed_after: int) -> TaskGraph | list[Region]:
@@ -258,3 +278,12 @@ def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[s
     if has_regions(options):
         return ("none of these frames shows the selected region; check that it belongs to this sequence, in metres",)
     return ()
+
+
+def _unreached_notes(schedule: TaskSchedule, last_index: int) -> tuple[str, ...]:
+    """Return a note for each scheduled task after the last frame."""
+    return tuple(
+        f"--task-at {frame}: not reached, the last frame was {last_index}"
+        for frame, _ in schedule.switches
+        if frame > last_index
+    )

@@ -230,6 +230,10 @@ def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSc
         return TaskSchedule(first)
     if first is None:
         raise InvalidInputError("--task-at: expected a first task, with --task TEXT, got none")
+    frames = [switch.frame for switch in switches]
+    for frame in frames:
+        if frames.count(frame) > 1:
+            raise InvalidInputError(f"--task-at: expected one task for a frame, got {frames.count(frame)} for {frame}")
     from gausslite.task.rules import RuleParser
 
     return TaskSchedule(first, tuple((switch.frame, RuleParser().parse(switch.text)) for switch in switches))

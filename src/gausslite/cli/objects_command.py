@@ -36,8 +36,12 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print(as_text({"objects": [_as_json(each) for each in objects]}))
     else:
-        print("\n".join(_describe(each) for each in objects) or f"no object {quote_name(options.noun)}".rstrip(" '"))
+        print("\n".join(_describe(each) for each in objects) or _no_object(options.noun))
     return 0 if objects else 1
+
+
+def _no_object(noun: str) -> str:
+    return f"no object {quote_name(noun)}" if noun else "no object"
 
 
 def _query(options: argparse.Namespace) -> Sequence[TeamObject]:

@@ -9,7 +9,7 @@ from gausslite.cli.team_options import add_address, add_mission, fusion_client
 from gausslite.codec.files import write_atomic
 from gausslite.config.numbers import Number
 from gausslite.config.paths import read_path
-from gausslite.mission.results import prepare_file
+from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.wire.clients import Export
 
 _MAX_ITERATIONS, _MAX_SEED = 1_000_000, (1 << 63) - 1
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
     Raises MismatchError without a map and keyframes, QuotaError while another refinement runs, UnavailableError.
     """
     if options.out is not None:
-        prepare_file(options.out)
+        prepare_file(options.out, MAP_FILE)
     gaussians = 0
     with fusion_client(options) as client:
         with progress_bar(options.iterations, "refine", "it") as bar:

@@ -19,6 +19,7 @@ from gausslite.mission.task_mapper import TaskMapper
 
 _MAX_SHOWN = 200
 _UNSET = "unset"
+_NOTHING: tuple[Any, ...] = (None, [], False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,7 @@ class ResumeConfig:
         texts = []
         for section, name in names:
             saved, given = (config.sections.get(section, {}).get(name) for config in (self, current))
-            if saved != given:
+            if saved != given and not (saved in _NOTHING and given in _NOTHING):
                 flag = flags.get((section, name), _flag_of(name))
                 texts.append(f"{flag} {_show(saved)} (got {_show(given)})")
         return tuple(sorted(texts))
@@ -155,7 +156,7 @@ def _flag_of(name: str) -> str:
 
 def _show(value: Any) -> str:
     """Return a JSON value as the user writes it on the command line."""
-    return _UNSET if value in (None, [], False) else repr(_flatten(value)[:_MAX_SHOWN])
+    return _UNSET if value in _NOTHING else repr(_flatten(value)[:_MAX_SHOWN])
 
 
 def _flatten(value: Any) -> str:

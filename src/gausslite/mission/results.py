@@ -8,6 +8,7 @@ import math
 import resource
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from numpy import ndarray
 
 from gausslite.codec.files import write_atomic
 from gausslite.codec.ply import write_ply
+from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.datasets.pose_file import format_pose_rows, read_pose_rows
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
@@ -23,9 +25,35 @@ from gausslite.domain.pose_correction import CorrectionTrack, pose_at
 from gausslite.mapping.pose_history import PoseHistory
 
 _MAP, _REPORT = "map.ply", "report.json"
+_FIRST_BYTES = 512
 PREVIEW = "preview.png"
 EVALUATION = "evaluation.json"
 MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
+
+
+@dataclass(frozen=True, slots=True)
+class FileKind:
+    """A kind of file that a command writes; mark: bytes that stand among the first ones of each such file."""
+
+    name: str
+    mark: bytes
+
+    def require_replaceable(self, path: Path) -> None:
+        """Raise StorageError if the path holds a file of another kind, which its user would lose."""
+        if not path.is_file():
+            return
+        try:
+            with path.open("rb") as file:
+                start = file.read(_FIRST_BYTES)
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        if start and self.mark not in start:
+            raise StorageError(f"{path} exists already and is not {self.name}; choose another name")
+
+
+MAP_FILE = FileKind("a map", b"ply\nformat ")
+STATE_FILE = FileKind("a saved run", STATE_FORMAT.encode())
+CALIBRATION_FILE = FileKind("a calibration", b"# gausslite calibrate")
 
 
 def prepare_folder(folder: Path) -> None:
@@ -49,21 +77,27 @@ def require_writable(folder: Path) -> None:
             each.rmdir()
 
 
-def prepare_file(path: Path) -> None:
-    """Create the folder of a file and check that files can be written there. Raises StorageError."""
+def prepare_file(path: Path, kind: FileKind | None = None) -> None:
+    """Create the folder of a file and check that files can be written there. Raises StorageError.
+
+    kind: an earlier file must be empty or of this kind.
+    """
     if path.is_dir():
         raise StorageError(f"{path}: expected the name of a file, got a folder")
+    if kind is not None:
+        kind.require_replaceable(path)
     prepare_folder(path.parent)
 
 
 def require_additional_file(path: Path, results_folder: Path) -> None:
-    """Check that a file can be written and does not replace a result in the folder. Raises StorageError."""
+    """Check that a saved run can be written and replaces no other file or result. Raises StorageError."""
     if path.resolve() in {
         (results_folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW, MAP_TO_ODOM, TRAJECTORY)
     }:
         raise StorageError(f"{path}: expected a name other than that of a result in {results_folder}")
     if path.is_dir():
         raise StorageError(f"{path}: expected the name of a file, got a folder")
+    STATE_FILE.require_replaceable(path)
     require_writable(path.parent)
 
 

@@ -50,10 +50,13 @@ def test_the_published_lens_is_kept_and_the_readout_of_a_real_clip_is_found(
 
 
 def test_wrong_arguments_give_one_line_and_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("1 0 0 0 0 0 0 1")
     for arguments, expected in (
         ([str(tmp_path / "absent")], "expected a folder"),
         (["sim:home", "--lens", "wide"], "lens"),
         (["sim:home", "--out", str(tmp_path)], str(tmp_path)),
+        (["sim:home", "--out", str(notes)], "notes.txt exists already and is not a calibration"),
     ):
         assert main(["calibrate", *arguments]) == 2
         assert expected in capsys.readouterr().err

@@ -73,3 +73,13 @@ def test_the_same_file_twice_is_refused(maps: list[Path], tmp_path: Path, capsys
         [line] = capsys.readouterr().err.splitlines()
         assert f"expected different files, got {maps[0]} and {same}" in line
     assert not (tmp_path / "fused.ply").exists()
+
+
+def test_a_file_of_another_kind_is_not_replaced(
+    maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = tmp_path / "groundtruth.txt"
+    notes.write_text("1 0 0 0 0 0 0 1")
+    assert fuse(*maps, notes) == 2
+    assert "groundtruth.txt exists already and is not a map; choose another name" in capsys.readouterr().err
+    assert notes.read_text() == "1 0 0 0 0 0 0 1"

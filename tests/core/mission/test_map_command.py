@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 from tiny_sequences import write_seven_scenes
+from tum_recording import write_home
 
 from gausslite.cli.main import main
 
@@ -71,6 +73,50 @@ def test_a_sequence_of_corrupt_frames_is_an_error(tmp_path: Path) -> None:
         corrupt(sequence, position)
     assert map_command(sequence, tmp_path / "out") == 2
     assert not (tmp_path / "out" / "map.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("scale", "code", "message"),
+    [
+        (1, 2, "expected surfaces in reach, got none in 6 frames with a median depth of"),
+        (1e6, 0, "the median depth is"),
+    ],
+)
+def test_a_wrong_depth_unit_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], scale: float, code: int, message: str
+) -> None:
+    sequence = write_home(tmp_path / "recording", units_per_metre=1000.0)
+    camera = json.loads((sequence / "cam_params.json").read_text())
+    camera["camera"]["scale"] = scale
+    (sequence / "cam_params.json").write_text(json.dumps(camera))
+    assert map_command(sequence, tmp_path / "out", "--camera-correction", "none") == code
+    printed = capsys.readouterr()
+    assert message in printed.out + printed.err
+    assert "check the depth unit, `scale` in cam_params.json" in printed.out + printed.err
+    assert (tmp_path / "out" / "map.ply").exists() == (code == 0)
+
+
+def test_a_missing_detector_is_refused_before_the_analysis(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    assert main(["map", str(sequence), "--task", "Find the mug", "--out", str(tmp_path / "out")]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "name an ONNX file with --detector" in line
+
+
+def test_two_tasks_for_one_frame_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    switches = ("--task-at", "4:Find the chair", "--task-at", "4:Find the table")
+    assert map_command(sequence, tmp_path / "out", "--task", "Find the mug", *switches) == 2
+    assert "--task-at: expected one task for a frame, got 2 for 4" in capsys.readouterr().err
+
+
+def test_a_map_is_written_although_its_state_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence, state = write_seven_scenes(tmp_path / "kitchen", FRAMES), tmp_path / "run.state"
+    os.mkfifo(state)
+    assert map_command(sequence, tmp_path / "out", "--save-state", str(state)) == 2
+    assert "run.state: expected a regular file or none" in capsys.readouterr().err
+    assert report_of(tmp_path / "out")["frames"] == 6
+    assert (tmp_path / "out" / "map.ply").exists()
 
 
 def test_without_task_and_region_mapping_is_uniform(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
