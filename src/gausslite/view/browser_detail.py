@@ -19,6 +19,8 @@ _OPTIMISM = 2.0
 """An answer takes less than in proportion to the splats: more are tried if the proportion gives twice the limit."""
 _REST_S = 0.7
 """A camera that has not moved for this long is at rest; more splats are sent only then."""
+_FIRST_PAUSE_S = 2.0
+"""A new browser keeps the small set for this long, so that a first move does not wait for the next step."""
 _RETRY_S = 30.0
 """A slow browser tries the next step again after this time, then after twice the time, and so on."""
 _ANSWERS = 5
@@ -51,6 +53,7 @@ class BrowserDetail:
         self._drawn: Splats | None = None
         self._handle: Any = None
         self._start_again()
+        self._retry_at_s = self._moved_s + _FIRST_PAUSE_S
         client.camera.on_update(lambda _: self._note_motion())
         threading.Thread(target=self._run, name="browser-detail", daemon=True).start()
 

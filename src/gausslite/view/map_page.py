@@ -30,8 +30,12 @@ class MapPage:
     def __init__(self, port: int, title: str, limit: int = DEFAULT_LIMIT) -> None:
         """Serve the page. port: 0 chooses a free one. limit: the most Gaussians drawn. Raises InvalidInputError."""
         self.server = LocalServer(port, title)
-        self.server.scene.world_axes.visible = False
-        self.server.scene.set_background_image(np.full((1, 1, 3), _BACKGROUND_GREY, np.uint8))
+        scene = self.server.scene
+        scene.world_axes.visible = False
+        scene.set_background_image(np.full((1, 1, 3), _BACKGROUND_GREY, np.uint8))
+        # nothing here is lit; viser's lights and surroundings would cost each browser time
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(hdri=None)
         self._lock = threading.RLock()
         self._contents: ViewContents | None = None
         self._viewed_count = 0
