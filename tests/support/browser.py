@@ -13,11 +13,11 @@ from gausslite_bench.browser import open_browser as open_installed_browser
 
 
 @contextmanager
-def open_browser() -> Iterator[Any]:
-    """Yield a browser context; skip the test without Playwright or Chromium."""
+def open_browser(size: tuple[int, int] = (720, 420)) -> Iterator[Any]:
+    """Yield a browser context with windows of this size in pixels; skip the test without Playwright or Chromium."""
     with ExitStack() as stack:
         try:
-            context = stack.enter_context(open_installed_browser())
+            context = stack.enter_context(open_installed_browser(size))
         except InvalidInputError as error:
             pytest.skip(str(error))
         yield context
