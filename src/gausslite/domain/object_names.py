@@ -30,6 +30,8 @@ SURFACE: Final = frozenset(
     {"table", "desk", "counter", "countertop", "bed", "workbench", "wall", "floor", "ceiling", "door", "rug", "carpet",
      "lawn", "grass", "road", "whiteboard"}
 )  # fmt: skip
+# parts of a large one look like a small one: a sofa's end like an armchair
+SEAT: Final = frozenset({"chair", "armchair", "stool", "couch", "sofa", "loveseat", "bench", "ottoman"})
 # open vessels and boxes: what they hold belongs to them
 CONTAINER: Final = frozenset(
     {"bowl", "basket", "box", "crate", "bin", "tray", "dish", "bucket", "tub", "basin", "pot", "pan", "carton"}
@@ -109,6 +111,11 @@ def is_medium(phrase: str) -> bool:
 def is_furniture(phrase: str) -> bool:
     """Return True for furniture and other objects that may fill much of an image."""
     return head_of(phrase) in FURNITURE
+
+
+def is_seat(phrase: str) -> bool:
+    """Return True for chairs, sofas, benches and the like."""
+    return head_of(phrase) in SEAT
 
 
 def is_container(phrase: str) -> bool:

@@ -6,11 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Bool, Int64
+from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.object_names import is_generic, same_kind
+from gausslite.domain.object_names import is_generic, is_seat, same_kind
 from gausslite.domain.relevance import Detection, Rival
 from gausslite.perception.box_size import BoxSizeLimits
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
@@ -18,7 +20,7 @@ from gausslite.perception.detect import DetectedBox, box_iou
 from gausslite.perception.models.model_file import OpenModel
 from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
 from gausslite.perception.yolo_decode import Candidates, suppress
-from gausslite.perception.yolo_network import YoloNetwork
+from gausslite.perception.yolo_network import NetworkOutput, YoloNetwork
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +28,8 @@ class YoloSettings:
     """Thresholds of score, overlap and size of the boxes.
 
     weak_score: lowest score of weak detections, which only named objects have. accept_similar: also search classes
-    that are only similar to a noun. rival_min_iou: lowest overlap of a box with one
-    of a different class that may show the same object.
+    that are only similar to a noun. rival_min_iou: lowest overlap of a box with one of a different class that may show
+    the same object. rival_min_cover: lowest share of a seat's mask that another seat covers.
     """
 
     min_score: float = 0.25
@@ -36,10 +38,11 @@ class YoloSettings:
     max_boxes: int = 100
     accept_similar: bool = False
     rival_min_iou: float = 0.6
+    rival_min_cover: float = 0.7
     box_limits: BoxSizeLimits = field(default_factory=BoxSizeLimits)
 
     def __post_init__(self) -> None:
-        for name in ("min_score", "weak_score", "nms_max_iou", "rival_min_iou"):
+        for name in ("min_score", "weak_score", "nms_max_iou", "rival_min_iou", "rival_min_cover"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
@@ -89,9 +92,10 @@ class YoloDetector:
         every = output.candidates(self._settings.weak_score)
         candidates = self._distinct(every, query_classes)
         masks = output.masks(candidates)
+        overlaps = self._overlaps(candidates, every) | self._covered(candidates, masks, every, output)
         return [
             Detection(box.phrase, box.score, box.box_px, masks[row], box.rival, box.is_weak)
-            for row, box in self._boxes(candidates, every, query_classes, frame)
+            for row, box in self._boxes(candidates, every, overlaps, query_classes, frame)
             if masks[row].any()
         ]
 
@@ -102,7 +106,8 @@ class YoloDetector:
             return []
         every = self._network.run(frame).candidates(self._settings.weak_score)
         candidates = self._distinct(every, query_classes)
-        return [box for _, box in self._boxes(candidates, every, query_classes, frame)]
+        overlaps = self._overlaps(candidates, every)
+        return [box for _, box in self._boxes(candidates, every, overlaps, query_classes, frame)]
 
     def _query_classes(self, queries: Sequence[str]) -> dict[str, tuple[int, ...]]:
         """Return the class indices of each query that is searched."""
@@ -112,14 +117,38 @@ class YoloDetector:
             for query, names in found.items()
         }
 
+    def _overlaps(self, candidates: Candidates, every: Candidates) -> Bool[ndarray, "n m"]:
+        """Return which candidates of all classes have nearly the same box as one of the queries' candidates."""
+        overlaps: Bool[ndarray, "n m"] = box_iou(candidates.boxes_px, every.boxes_px) >= self._settings.rival_min_iou
+        return overlaps
+
+    def _covered(
+        self, candidates: Candidates, masks: Sequence[Bool[ndarray, "h w"]], every: Candidates, output: NetworkOutput
+    ) -> Bool[ndarray, "n m"]:
+        """Return which seats cover a candidate that is a seat: a sofa's end looks like an armchair."""
+        covered = np.zeros((len(candidates.scores), len(every.scores)), np.bool_)
+        others = self._seats(every)[every.scores[self._seats(every)] >= self._settings.min_score]
+        for column, cover in zip(others.tolist(), output.masks(every.take(others)), strict=True):
+            for row in self._seats(candidates).tolist():
+                shared, size = int(np.count_nonzero(masks[row] & cover)), int(np.count_nonzero(masks[row]))
+                covered[row, column] = shared >= self._settings.rival_min_cover * max(1, size)
+        return covered
+
+    def _seats(self, candidates: Candidates) -> Int64[ndarray, " k"]:
+        return np.flatnonzero([is_seat(self.class_names[index]) for index in candidates.classes.tolist()])
+
     def _boxes(
-        self, candidates: Candidates, every: Candidates, query_classes: Mapping[str, tuple[int, ...]], frame: Frame
+        self,
+        candidates: Candidates,
+        every: Candidates,
+        overlaps: Bool[ndarray, "n m"],
+        query_classes: Mapping[str, tuple[int, ...]],
+        frame: Frame,
     ) -> Iterator[tuple[int, DetectedBox]]:
         """Yield row and box of each query's candidates, without boxes too large for their class.
 
-        every: the candidates of all classes.
+        every: the candidates of all classes. overlaps: which of them show the same object as a candidate.
         """
-        overlaps = box_iou(candidates.boxes_px, every.boxes_px) >= self._settings.rival_min_iou
         for query, classes in query_classes.items():
             for row in np.flatnonzero(np.isin(candidates.classes, classes)):
                 name = self.class_names[candidates.classes[row]]

@@ -142,6 +142,14 @@ def test_a_different_class_in_the_same_box_is_the_rival(tmp_path):
     assert (object_1.rival, object_2.rival) == (None, None)
 
 
+@pytest.mark.parametrize(("names", "rival"), [(("couch", "chair"), "couch"), (("dining table", "cup"), None)])
+def test_a_part_of_a_larger_seat_is_rather_the_larger_seat(tmp_path, names, rival):
+    whole, left_half = (24.0, 32.0, 16.0, 16.0, 0, 0.8), (20.0, 32.0, 8.0, 16.0, 1, 0.4)
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", names, [whole, left_half]))
+    (found,) = detector.detect(frame_with_red_square(), [names[1]])
+    assert (found.rival and found.rival.name) == rival
+
+
 def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     tv, laptop = (24.0, 32.0, 16.0, 16.0, 0, 0.8), (25.0, 32.0, 16.0, 16.0, 1, 0.4)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", ("tv", "laptop"), [tv, laptop]))
