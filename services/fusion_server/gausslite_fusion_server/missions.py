@@ -16,10 +16,10 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.sqlite_file import remove_store
 from gausslite.fusion.store import FusionStore
 from gausslite_fusion_server.servicer import FusionServicer
+from gausslite_fusion_server.settings import STORE_SUFFIX
 from gausslite_fusion_server.store_follower import ServerLeadership, follow_store
 
 _log = logging.getLogger(__name__)
-_SUFFIX = ".sqlite"
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,12 +163,12 @@ def stored_missions(folder: Path) -> tuple[str, ...]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"store {folder}: cannot be made ({error.strerror})") from error
-    return tuple(sorted(path.stem for path in folder.glob(f"*{_SUFFIX}") if _is_name(path.stem)))
+    return tuple(sorted(path.stem for path in folder.glob(f"*{STORE_SUFFIX}") if _is_name(path.stem)))
 
 
 def mission_file(folder: Path, mission_id: str) -> Path:
     """Return the file of a mission."""
-    return folder / f"{mission_id}{_SUFFIX}"
+    return folder / f"{mission_id}{STORE_SUFFIX}"
 
 
 def _is_name(name: str) -> bool:

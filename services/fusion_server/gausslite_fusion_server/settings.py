@@ -20,12 +20,14 @@ from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas, VoteRule
 from gausslite.process.messages import print_message
+from gausslite.wire.address import host_and_port
 from gausslite.wire.call_limits import CallLimits
 from gausslite.wire.process import LogFormat
 from gausslite.wire.tls import Tls
 
 PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"
+STORE_SUFFIX = ".sqlite"
 RAY_LOCAL = "local"
 MAX_SHARDS = 1024
 MAX_MISSIONS = 256
@@ -91,6 +93,9 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     if options.shards is not None and options.store == MEMORY:
         raise InvalidInputError("--shards: expected a folder as --store, got none")
     _require_one_mission(options)
+    _require_store(options)
+    if options.health is not None:
+        host_and_port("--health", options.health)
     if options.shards is None and options.ray_address != RAY_LOCAL:
         raise InvalidInputError("--ray-address: expected --shards beside it")
     quotas = Quotas(
@@ -125,6 +130,21 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         options.health,
         options.traces,
     )
+
+
+def _require_store(options: argparse.Namespace) -> None:
+    """Raise InvalidInputError for a --store of another kind than the other options need, or for a misspelt one."""
+    if options.store == MEMORY or options.shards is not None:
+        return
+    path = Path(options.store)
+    has_suffix = path.suffix == STORE_SUFFIX
+    if options.max_missions > 1:
+        if has_suffix and not path.is_dir():
+            raise InvalidInputError(f"--store {path}: expected a folder with --max-missions, got the name of a file")
+    elif path.is_dir():
+        raise InvalidInputError(f"--store {path}: expected a file; a folder needs --shards or --max-missions")
+    elif not has_suffix and not path.exists():
+        raise InvalidInputError(f"--store {path}: expected {MEMORY} or the name of a file that ends in {STORE_SUFFIX}")
 
 
 def _require_one_mission(options: argparse.Namespace) -> None:
