@@ -7,7 +7,7 @@ from typing import Final
 
 KNOWN_OPTIONS: Final = frozenset(
     {
-        *("agents", "corpus", "held", "hostile", "kills", "messages", "seconds", "server", "watchers"),
+        *("agents", "corpus", "held", "hostile", "kills", "messages", "seconds", "server", "servers", "watchers"),
         *("absent", "accept-similar", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps"),
         "changes",
         *("traces", "deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
