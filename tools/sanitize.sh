@@ -48,8 +48,13 @@ mkdir "$build/package"
 cp -r "$root/src/." "$build/package/"
 rm -f "$build"/package/gausslite/render/_kernels*.so
 cp "$build"/_kernels*.so "$build/package/gausslite/render/"
+# An editable install would be found before PYTHONPATH, with kernels that are not instrumented.
+echo 'import sys; sys.meta_path[:] = [each for each in sys.meta_path if not type(each).__module__.startswith("_editable")]' \
+  > "$build/package/sitecustomize.py"
 export PYTHONPATH=$build/package PYTHONDONTWRITEBYTECODE=1
 cd "$root"
+run_checked -c "import sys, gausslite.render._kernels as kernels; sys.exit(not kernels.__file__.startswith('$build/package'))" ||
+  fail "Python does not import the instrumented kernels; nothing was checked"
 [ $# -gt 0 ] || set -- tests/core/render/test_cpu_kernels.py tests/core/render/test_cpu_choices.py tests/core/render/test_cpu_bindings.py
 # Uncaptured: a sanitizer writes its report and ends the process; pytest would lose the report.
 run_checked -m pytest -q --capture=no -p no:cacheprovider "$@"
