@@ -41,7 +41,9 @@ class SessionFence:
         """Note a call that opens or ends a session."""
         match call.method, call.arguments:
             case "save_session", (session,):
-                self._end(session.agent_id)
+                # after a lost reply the same session is saved again
+                if self._session_of.get(session.agent_id) != session.session_id:
+                    self._end(session.agent_id)
                 self._session_of[session.agent_id] = session.session_id
             case "end_session", (session_id,):
                 for agent_id in [name for name, own in self._session_of.items() if own == session_id]:

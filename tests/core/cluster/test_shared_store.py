@@ -17,6 +17,7 @@ from test_sharded_store import GRID, assert_same_batch
 
 from gausslite.cluster.journal import Journal, JournalEntry, JournalGapError
 from gausslite.cluster.leadership import LEADERSHIP_S, Leadership
+from gausslite.cluster.remote_store import RemoteStore
 from gausslite.domain.errors import (
     GaussLiteError,
     MismatchError,
@@ -35,6 +36,7 @@ from gausslite.fusion.keyframes import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store_changes import RecordSaved
+from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import MissionStatus, TrafficCounters
 from gausslite.fusion.vote import fuse
 
@@ -217,6 +219,16 @@ def test_a_join_continues_above_the_numbers_that_another_server_has_stored(team:
     for _ in range(5):
         team.send("ant", 0, {0: 3})
     assert team.engines[1].join("ant", CONFIG, token="ant").highest_update_seq == 5
+
+
+def test_a_session_that_is_saved_twice_after_a_lost_reply_stays_open(team: Team) -> None:
+    team.join("ant", 0)
+    for shard in (0, 1):
+        remote = RemoteStore(shard, team.hosts.directory, team.hosts.call)  # type: ignore[arg-type]
+        remote.save_session(SessionRecord(team.sessions["ant"], "ant"))
+    session_id = team.sessions["ant"]
+    team.send("ant", 0, {0: 3, 5: 4})
+    assert team.sessions["ant"] == session_id
 
 
 def test_a_lease_renewed_at_one_server_protects_the_name_at_the_others(team: Team) -> None:
