@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gausslite.codec.map_history import read_map_history
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
 
@@ -43,6 +44,8 @@ def test_map_writes_a_map_of_the_task_and_a_report(mug_map: Path) -> None:
     assert 0 < gaussians.active.sum() < len(gaussians)
     assert gaussians.kappa[gaussians.active].max() > 0
     assert not gaussians.kappa[~gaussians.active].any()
+    first, *_, last = read_map_history(mug_map)
+    assert first.total < last.total <= len(gaussians)
 
 
 def test_the_cap_holds_and_the_same_seed_gives_the_same_map(tmp_path: Path) -> None:

@@ -255,7 +255,7 @@ class AgentMission:
         write_results(folder, gaussians, report, self._settings.link.uplink.world_frame)
         self._worker.run(lambda mapper: write_poses(folder, mapper.poses)).result()
         self._worker.run(lambda mapper: write_keyframes(folder, mapper.keyframes())).result()
-        self._worker.write_timeline(folder).result()
+        self._worker.write_history(folder).result()
 
     def _send_all(self, uplink: Uplink, request: EndRequest) -> None:
         """Send the rest of the region and the keyframes and, for a handover, the rest of the map, within one time."""

@@ -30,6 +30,7 @@ from gausslite.mapping.team_voxels import InsertedVoxels
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
+from gausslite.mission.map_recorder import MapRecorder
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.timeline import Timeline
@@ -78,7 +79,7 @@ class MappingWorker:
         self._unpublished = empty_batch()
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
-        self._timeline = Timeline()
+        self._timeline, self._recorder = Timeline(), MapRecorder()
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
@@ -123,9 +124,14 @@ class MappingWorker:
         """
         return self._submit(lambda: self._save(path, config, requested_task))
 
-    def write_timeline(self, folder: Path) -> Future[None]:
-        """Write frames.csv, with the frames since the program's start. The future raises StorageError."""
-        return self._submit(lambda: self._timeline.write(folder))
+    def write_history(self, folder: Path) -> Future[None]:
+        """Write frames.csv and map_history.safetensors, since the program's start. The future raises StorageError."""
+
+        def write() -> None:
+            self._timeline.write(folder)
+            self._recorder.write(folder)
+
+        return self._submit(write)
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame and return the future of its report.
@@ -277,6 +283,7 @@ class MappingWorker:
         self._observe_free_space(frame)
         self._status.add_outcome(outcome)
         self._timeline.add(outcome)
+        self._recorder.record(self._mapper.poses, self._mapper.gaussians)
         self._status.update(correction=self._mapper.poses.latest(), corrected_at_s=time.monotonic())
         self._count(report)
         self._on_change()

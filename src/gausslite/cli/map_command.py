@@ -30,6 +30,7 @@ from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.folder_lock import locked_folder
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.keyframe_results import write_keyframes
+from gausslite.mission.map_recorder import MapRecorder
 from gausslite.mission.results import (
     PREVIEW,
     peak_rss_mib,
@@ -82,7 +83,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         type=Path,
         required=True,
-        help="folder for map.ply, report.json, frames.csv, keyframes.json, views and preview.png",
+        help="folder for map.ply, its history, report.json, frames.csv, keyframes.json, views and preview.png",
     )
     add_switch(group, "--overwrite", "replace a map in --out (--resume does so without this option)")
     add("--world-frame", metavar="NAME", help=_WORLD_FRAME_HELP)
@@ -144,7 +145,7 @@ class _Run:
         self._inputs = inputs
         self._mapper = mapper
         self._corrupt = CorruptFrames(print_above_bar)
-        self._timeline = Timeline()
+        self._timeline, self._recorder = Timeline(), MapRecorder()
         self._gaussians = Gaussians.empty()
         self._report: dict[str, object] = {}
         self._notes: tuple[str, ...] = ()
@@ -161,6 +162,7 @@ class _Run:
             def report(outcome: FrameOutcome) -> None:
                 bar.count(outcome)
                 self._timeline.add(outcome)
+                self._recorder.record(self._mapper.poses, self._mapper.gaussians)
                 draw(outcome)
 
             checkpoint = None if options.save_state is None else self._save
@@ -173,7 +175,7 @@ class _Run:
         return result
 
     def write_results(self, result: MissionResult) -> None:
-        """Write map.ply, report.json, frames.csv, poses, the keyframes and preview.png. Raises StorageError."""
+        """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
         options, mission = self._options, self._inputs.mission
         self._notes = (
             *self._mapper.notes,
@@ -199,6 +201,7 @@ class _Run:
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
         write_poses(options.out, self._mapper.poses)
         self._timeline.write(options.out)
+        self._recorder.write(options.out)
         write_keyframes(options.out, self._mapper.keyframes())
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
         if keyframes:

@@ -15,7 +15,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.process.messages import print_message
 from gausslite.view.level_of_detail import DEFAULT_LIMIT
 from gausslite.view.open_page import open_page
-from gausslite.view.run_contents import read_contents
+from gausslite.view.run_contents import read_contents, read_past
 
 _DEFAULT_PORT = 8099
 
@@ -58,9 +58,10 @@ def _show_files(options: argparse.Namespace) -> Iterator[str]:
     if options.mission:
         raise InvalidInputError(f"--mission: expected the address of a fusion server with it, got {path}")
     contents = read_contents(path)
+    past = read_past(path, contents)
     page = open_page(options.port, f"GaussLite {path.resolve().name}", options.max_shown)
     try:
-        page.show(contents)
+        page.show_run(contents, past)
         yield page.url
     finally:
         page.close()

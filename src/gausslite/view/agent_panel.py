@@ -71,6 +71,7 @@ class AgentPanel:
             self._quality.add(time.monotonic() - self._started_s, rendered, view.rgb, view.roi)
             keyframes = [KeyframeView(i, 0, view.camera, T, 0) for i, T in enumerate(view.keyframes)]
             contents = replace(contents, times_ns=view.times_ns, T_world_camera=view.path, keyframes=keyframes)
+        self._page.remember(contents)
         self._page.show(contents)
         self._shown_revision = followed.revision
 

@@ -1,4 +1,4 @@
-"""Choose the Gaussians that a browser draws, so that large maps stay usable in software rendering."""
+"""Order and shape of the splats that a browser draws, so that large maps stay usable in software rendering."""
 
 from __future__ import annotations
 
@@ -9,23 +9,8 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians
 
 DEFAULT_LIMIT = 150_000
-_ACTIVE_SHARE = 0.5
 _GOLDEN_RATIO = 0.618033988749895
 _LEAST_OPACITY = 1e-3
-
-
-def choose_gaussians(gaussians: Gaussians, limit: int) -> Int64[ndarray, " m"]:
-    """Return the ascending indices of at most `limit` Gaussians, the most important ones.
-
-    Up to half of them belong to the task's region (active); importance within each part is opacity times area.
-    """
-    if len(gaussians) <= limit:
-        return np.arange(len(gaussians))
-    importance = _importance(gaussians)
-    active, background = np.flatnonzero(gaussians.active), np.flatnonzero(~gaussians.active)
-    active_count = min(len(active), max(int(limit * _ACTIVE_SHARE), limit - len(background)))
-    parts = [_top(active, importance, active_count), _top(background, importance, limit - active_count)]
-    return np.sort(np.concatenate(parts))
 
 
 def spread_order(gaussians: Gaussians) -> Int64[ndarray, " n"]:
@@ -59,18 +44,3 @@ def covariances_m2(gaussians: Gaussians) -> Float32[ndarray, "n 3 3"]:
     scaled = rotations * gaussians.scales_m[:, None, :]
     covariances: Float32[ndarray, "n 3 3"] = scaled @ scaled.transpose(0, 2, 1)
     return covariances
-
-
-def _importance(gaussians: Gaussians) -> Float32[ndarray, " n"]:
-    ordered = np.sort(gaussians.scales_m, axis=1)
-    area: Float32[ndarray, " n"] = gaussians.opacities * ordered[:, 1] * ordered[:, 2]
-    return area
-
-
-def _top(rows: Int64[ndarray, " k"], importance: Float32[ndarray, " n"], count: int) -> Int64[ndarray, " c"]:
-    if count >= len(rows):
-        return rows
-    if count <= 0:
-        return rows[:0]
-    chosen: Int64[ndarray, " c"] = rows[np.argpartition(importance[rows], -count)[-count:]]
-    return chosen

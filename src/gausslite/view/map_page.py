@@ -1,21 +1,24 @@
-"""The page: splats, trajectory, keyframes and objects of a map, with the controls that choose what is drawn."""
+"""The page: splats, trajectory, keyframes and objects of a map, now or earlier, and what chooses them."""
 
 from __future__ import annotations
 
 import html
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from gausslite.domain.important_gaussians import choose_gaussians
 from gausslite.view.colours import ColourMode, colours_of, legend_of
 from gausslite.view.contents import ViewContents
-from gausslite.view.level_of_detail import DEFAULT_LIMIT, choose_gaussians, covariances_m2, spread_order
+from gausslite.view.level_of_detail import DEFAULT_LIMIT, covariances_m2, spread_order
 from gausslite.view.local_server import LOOPBACK, LocalServer
 from gausslite.view.scene_markers import SceneMarkers
 from gausslite.view.splat_layer import SplatLayer, Splats
 from gausslite.view.start_view import start_view
+from gausslite.view.time_scrub import PastMap, TimeScrub
 
 _THOUSAND = 1000
 _MAX_SHOWN = 2_000_000
@@ -25,7 +28,7 @@ _GROWTH = 1.5
 
 
 class MapPage:
-    """Owns the server and the newest contents. Thread-safe."""
+    """Owns the server, the newest contents and the earlier ones. Thread-safe."""
 
     def __init__(self, port: int, title: str, limit: int = DEFAULT_LIMIT) -> None:
         """Serve the page. port: 0 chooses a free one. limit: the most Gaussians drawn. Raises InvalidInputError."""
@@ -38,6 +41,7 @@ class MapPage:
         scene.configure_environment_map(hdri=None)
         self._lock = threading.RLock()
         self._contents: ViewContents | None = None
+        self._drawn_past: PastMap | None = None
         self._viewed_count = 0
         gui = self.server.gui
         highest = _MAX_SHOWN // _THOUSAND
@@ -49,6 +53,7 @@ class MapPage:
             self._adapts = gui.add_checkbox("Adapt to browser", True)
             self._legend = gui.add_html("")
         self._layer = SplatLayer(self.server, folder)
+        self._scrub = TimeScrub(gui, self._scrub_time)
         self._markers = SceneMarkers(self.server)
         self._colour.on_update(lambda _: self._draw_splats())
         self._limit.on_update(lambda _: self._draw_splats())
@@ -60,13 +65,25 @@ class MapPage:
         return f"http://{LOOPBACK}:{self.server.get_port()}"
 
     def show(self, contents: ViewContents) -> None:
-        """Replace what the page shows."""
+        """Replace the newest contents. A page that shows an earlier time goes on showing it."""
         with self._lock:
             self._contents = contents
+            self._scrub.extend_to(contents)
             if len(contents.gaussians) > _GROWTH * self._viewed_count:
                 self._set_start_view(contents)
-            self._draw_splats()
-            self._markers.show(contents)
+            self._draw_time()
+
+    def remember(self, contents: ViewContents) -> None:
+        """Keep a coarse copy of a live map for the time slider; call it with every new state, before `show`."""
+        with self._lock:
+            self._scrub.remember(contents)
+
+    def show_run(self, contents: ViewContents, past: Sequence[PastMap]) -> None:
+        """Show a finished run and its earlier maps, oldest first."""
+        with self._lock:
+            for each in past:
+                self._scrub.add(each)
+            self.show(contents)
 
     def show_problem(self, text: str) -> None:
         """Show why the page is out of date; an empty text removes it."""
@@ -91,14 +108,42 @@ class MapPage:
             camera.position = view.position_m
             camera.look_at = view.look_at_m
 
+    def _scrub_time(self) -> None:
+        """Draw the chosen time; while the map there is the same, only the trajectory changes."""
+        with self._lock:
+            past = self._scrub.past()
+            if past is self._drawn_past:
+                self._markers.end_trajectory(self._scrub.chosen_ns)
+                self._scrub.show_note(_paragraph(self._scrub.describe(past)))
+            else:
+                self._draw_time()
+
+    def _draw_time(self) -> None:
+        """Draw the map and the markers of the chosen time."""
+        with self._lock:
+            past, newest = self._scrub.past(), self._contents
+            if newest is None:
+                return
+            is_drawn = past is not None and past is self._drawn_past
+            self._drawn_past = past
+            self._scrub.show_note(_paragraph(self._scrub.describe(past)))
+            if not is_drawn:
+                self._draw_splats()
+            shown = newest if past is None else past.load()
+            with_path = replace(shown, times_ns=newest.times_ns, T_world_camera=newest.T_world_camera)
+            self._markers.show(with_path, self._scrub.chosen_ns)
+
     def _draw_splats(self) -> None:
         with self._lock:
-            contents = self._contents
+            past, contents = self._drawn_past, self._contents
             if contents is None:
                 return
+            total = len(contents.gaussians)
+            if past is not None:
+                contents, total = past.load(), past.total
             mode = ColourMode(self._colour.value)
             rows = choose_gaussians(contents.gaussians, int(self._limit.value) * _THOUSAND)
-            self._figures.content = _paragraph(_count_text(len(rows), len(contents.gaussians)))
+            self._figures.content = _paragraph(_count_text(len(rows), total))
             self._legend.content = legend_html(legend_of(contents, mode))
             if not len(rows):
                 return

@@ -57,7 +57,9 @@ class MissionView:
         if outcome.timing.seconds > 0:
             self._rate.add(now_s - self._started_s, [1 / outcome.timing.seconds])
         self._roi.add(now_s - self._started_s, [100 * outcome.roi_share])
-        self._page.show(self._contents(outcome.index, keyframes))
+        contents = self._contents(outcome.index, keyframes)
+        self._page.remember(contents)
+        self._page.show(contents)
 
     def _contents(self, index: int, keyframes: list[Keyframe]) -> ViewContents:
         graph, trajectory = self._task_at(index), self._mapper.poses.trajectory()

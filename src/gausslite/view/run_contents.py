@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from gausslite.codec.keyframe_views import read_keyframe_views
+from gausslite.codec.map_history import MapSnapshot, read_map_history
 from gausslite.codec.object_report import object_from_json
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.pose_file import read_pose_rows
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import TRAJECTORY, read_report
-from gausslite.view.contents import ViewContents
+from gausslite.view.contents import NO_AGENT, ViewContents
+from gausslite.view.time_scrub import PastMap
 
 _MAP = "map.ply"
 
@@ -38,6 +43,29 @@ def read_contents(path: Path) -> ViewContents:
         return contents
     times_ns, T_world_camera = read_pose_rows(path / TRAJECTORY)
     return replace(contents, times_ns=times_ns, T_world_camera=T_world_camera)
+
+
+def read_past(path: Path, contents: ViewContents) -> tuple[PastMap, ...]:
+    """Return the earlier maps of a results folder with these contents; none for a PLY file. Raises MapFileError."""
+    if not path.is_dir():
+        return ()
+    return tuple(
+        PastMap(each.time_ns, each.total, partial(_contents_at, each, contents)) for each in read_map_history(path)
+    )
+
+
+def _contents_at(snapshot: MapSnapshot, newest: ViewContents) -> ViewContents:
+    """Return an earlier map with the keyframes and the objects that had been seen by then. Raises CodecError."""
+    gaussians = snapshot.gaussians()
+    index = 0 if newest.agents else NO_AGENT
+    return replace(
+        newest,
+        gaussians=gaussians,
+        agent=np.full(len(gaussians), index, np.int64),
+        objects=tuple(each for each in newest.objects if each.first_seen_ns <= snapshot.time_ns),
+        keyframes=[each for each in newest.keyframes if each.capture_time_ns <= snapshot.time_ns],
+        state_ns=snapshot.time_ns,
+    )
 
 
 def _targets(report: Mapping[str, object]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Trajectory, keyframe frusta and named objects in the scene, and a scrub over the trajectory's time."""
+"""Trajectories, keyframe frusta and named objects in the scene."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
-from gausslite.view.contents import ViewContents
+from gausslite.view.colours import category_colour
+from gausslite.view.contents import AgentPath, ViewContents
 from gausslite.view.local_server import LocalServer
 
 _MAX_FRUSTA = 60
+_MAX_TEAM_FRUSTA = 20
+"""Of each agent of a team."""
 _MAX_TRAJECTORY_POINTS = 5000
 _TRAJECTORY_RGB, _KEYFRAME_RGB, _ROBOT_RGB = (40, 90, 220), (90, 140, 230), (220, 40, 40)
 _TARGET_RGB, _ANCHOR_RGB = (20, 150, 60), (200, 130, 20)
-_NS_PER_S = 1e9
 _MIN_BOX_M = 0.01
 _UNKNOWN_CAMERA = Camera(525.0, 525.0, 320.0, 240.0, 640, 480)
 
@@ -31,29 +33,25 @@ class SceneMarkers:
         self._server = server
         self._lock = threading.RLock()
         self._contents: ViewContents | None = None
+        self._until_ns: int | None = None
         self._drawn: dict[str, list[Any]] = {}
         gui = server.gui
         with gui.add_folder("Markers"):
             self._switches = {name: gui.add_checkbox(name, True) for name in ("Trajectory", "Keyframes", "Objects")}
-        with gui.add_folder("Time", visible=False) as self._time_folder:
-            self._time: Any = gui.add_slider("Frame", 0, 1, 1, 1)
-            self._seconds: Any = gui.add_text("Seconds", "", disabled=True)
         for switch in self._switches.values():
             switch.on_update(lambda _: self._draw_all())
-        self._time.on_update(lambda _: self._draw_robot())
 
-    def show(self, contents: ViewContents) -> None:
-        """Replace the markers. The scrub stays at the newest frame if it was there."""
+    def show(self, contents: ViewContents, until_ns: int | None = None) -> None:
+        """Replace the markers. until_ns: the trajectory ends at this time; None for all of it."""
         with self._lock:
-            at_end = int(self._time.value) >= int(self._time.max)
-            self._contents = contents
-            last = len(contents.times_ns) - 1
-            self._time_folder.visible = last > 0
-            if last > 0 and last != self._time.max:
-                self._time.max = last
-                if at_end:
-                    self._time.value = last
+            self._contents, self._until_ns = contents, until_ns
             self._draw_all()
+
+    def end_trajectory(self, until_ns: int | None) -> None:
+        """Draw the trajectory up to this time only; None for all of it."""
+        with self._lock:
+            self._until_ns = until_ns
+            self._draw_robot()
 
     def _draw_all(self) -> None:
         with self._lock:
@@ -66,27 +64,44 @@ class SceneMarkers:
             views = views[:: max(1, -(-len(views) // _MAX_FRUSTA))]
             frusta = [self._frustum(f"/keyframes/{v.index}", v.camera, v.T_world_camera, _KEYFRAME_RGB) for v in views]
             self._replace("keyframes", frusta)
+            self._replace("team", [handle for path in contents.paths for handle in self._path(path)])
             self._draw_robot()
 
     def _draw_robot(self) -> None:
-        """Draw the trajectory up to the chosen frame, and the camera there."""
+        """Draw the trajectory up to the chosen time, and the camera there."""
         with self._lock:
             contents = self._contents
             if contents is None or len(contents.times_ns) < 2 or not self._switches["Trajectory"].value:
                 self._replace("trajectory", [])
                 return
-            frame = min(int(self._time.value), len(contents.times_ns) - 1)
-            self._seconds.value = f"{(contents.times_ns[frame] - contents.times_ns[0]) / _NS_PER_S:.2f}"
+            frame = len(contents.times_ns) - 1
+            if self._until_ns is not None:
+                frame = max(0, int(np.searchsorted(contents.times_ns, self._until_ns, side="right")) - 1)
             step = max(1, -(-(frame + 1) // _MAX_TRAJECTORY_POINTS))
             points_m = contents.T_world_camera[: frame + 1 : step, :3, 3].astype(np.float32)
             camera = contents.keyframes[0].camera if contents.keyframes else _UNKNOWN_CAMERA
             handles = [self._frustum("/robot", camera, contents.T_world_camera[frame], _ROBOT_RGB, 0.16)]
-            if len(points_m) > 1:
-                segments = np.stack([points_m[:-1], points_m[1:]], axis=1)
-                handles.append(
-                    self._server.scene.add_line_segments("/trajectory", segments, _TRAJECTORY_RGB, thickness=0.008)
-                )
-            self._replace("trajectory", handles)
+            self._replace("trajectory", [*handles, *self._line("/trajectory", points_m, _TRAJECTORY_RGB)])
+
+    def _path(self, path: AgentPath) -> list[Any]:
+        """Draw an agent's keyframes, the line through them, and the agent's name at the newest one."""
+        colour, name, views = category_colour(path.colour_index), f"/team/{path.agent}", path.keyframes
+        handles: list[Any] = []
+        if views and self._switches["Keyframes"].value:
+            shown = views[:: max(1, -(-len(views) // _MAX_TEAM_FRUSTA))]
+            handles += [self._frustum(f"{name}/{v.index}", v.camera, v.T_world_camera, colour) for v in shown]
+        if views and self._switches["Trajectory"].value:
+            points_m = np.array([view.T_world_camera[:3, 3] for view in views], np.float32)
+            handles += self._line(f"{name}/line", points_m, colour)
+            handles.append(self._frustum(f"{name}/newest", views[-1].camera, views[-1].T_world_camera, colour, 0.16))
+            handles.append(self._server.scene.add_label(f"{name}/label", path.agent, position=points_m[-1]))
+        return handles
+
+    def _line(self, name: str, points_m: Float32[ndarray, "n 3"], colour: tuple[int, int, int]) -> list[Any]:
+        if len(points_m) < 2:
+            return []
+        segments = np.stack([points_m[:-1], points_m[1:]], axis=1)
+        return [self._server.scene.add_line_segments(name, segments, colour, thickness=0.008)]
 
     def _object(self, index: int, landmark: ObjectLandmark) -> list[Any]:
         colour = _TARGET_RGB if landmark.role is ObjectRole.TARGET else _ANCHOR_RGB

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from dataclasses import replace
 from urllib.parse import urlsplit
 
 import cv2
@@ -14,10 +15,12 @@ from browser import open_browser
 from sample_gaussians import plain_gaussians
 
 from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
+from gausslite.codec.map_history import MapSnapshot, write_map_history
 from gausslite.codec.ply import write_ply
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MapFileError
-from gausslite.view.run_contents import read_contents
+from gausslite.view.contents import ViewContents
+from gausslite.view.run_contents import read_contents, read_past
 
 pytest.importorskip("viser")
 from gausslite.view.open_page import open_page
@@ -29,21 +32,24 @@ WAIT_S = 120.0
 
 @pytest.fixture
 def run_folder(tmp_path):
-    """A run with a red wall to the left, of target 0, and a green one to the right, seen by one keyframe."""
+    """A run with a red wall to the left, of target 0, and a green one to the right, seen by one keyframe.
+
+    In the first two seconds it had the red wall only.
+    """
     y, x = np.mgrid[-1:1:0.1, -2:2:0.1]
     means_m = np.stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)], axis=1)
     left = means_m[:, 0] < 0
-    write_ply(
-        tmp_path / "map.ply",
-        plain_gaussians(
-            means_m,
-            opacities=0.99,
-            scales_m=0.06,
-            rgb=np.where(left[:, None], RED, GREEN) / 255.0,
-            kappa=np.where(left, 500, 0),
-            target=np.where(left, 0, -1),
-        ),
+    walls = plain_gaussians(
+        means_m,
+        opacities=0.99,
+        scales_m=0.06,
+        rgb=np.where(left[:, None], RED, GREEN) / 255.0,
+        kappa=np.where(left, 500, 0),
+        target=np.where(left, 0, -1),
     )
+    write_ply(tmp_path / "map.ply", walls)
+    history = [(0, walls.take(left)), (1_000_000_000, walls.take(left)), (2_000_000_000, walls)]
+    write_map_history(tmp_path, [MapSnapshot.of(time_ns, gaussians) for time_ns, gaussians in history])
     camera = Camera(300.0, 300.0, 320.0, 240.0, 640, 480)
     write_keyframe_views(tmp_path, [KeyframeView(0, 0, camera, np.eye(4), 10)])
     mug = {
@@ -58,7 +64,8 @@ def run_folder(tmp_path):
 @pytest.fixture
 def page(run_folder):
     page = open_page(0, "test")
-    page.show(read_contents(run_folder))
+    contents = read_contents(run_folder)
+    page.show_run(contents, read_past(run_folder, contents))
     yield page
     page.close()
 
@@ -86,9 +93,66 @@ def test_a_browser_draws_the_map_and_asks_no_other_machine(page):
         assert hosts == {urlsplit(page.url).netloc}
 
 
-def test_the_scrub_shortens_the_trajectory(page):
-    page._markers._time.value = 1
-    assert page._markers._seconds.value == "1.00"
+def test_the_time_slider_shows_the_earlier_map_in_a_browser(page):
+    with open_browser() as browser:
+        tab = browser.new_page()
+        tab.goto(page.url)
+        wait_until(lambda: min(len(columns_near(tab, RED)), len(columns_near(tab, GREEN))) > 2000)
+        slider = tab.get_by_role("slider").last
+        slider.press("Home")
+        tab.get_by_text("the map as it was after 0.0 s").wait_for()
+        wait_until(lambda: len(columns_near(tab, GREEN)) < 200)
+        assert len(columns_near(tab, RED)) > 2000
+        slider.press("End")
+        tab.get_by_text("the newest map, after 2.0 s").wait_for()
+        wait_until(lambda: len(columns_near(tab, GREEN)) > 2000)
+
+
+def wait_until(condition):
+    deadline_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+
+
+def test_the_time_slider_ends_the_trajectory_and_leaves_out_later_objects(page):
+    page._scrub._seconds.value = 1.0
+    points = [handle for handle in page._markers._drawn["trajectory"] if handle.name == "/trajectory"]
+    assert points[0].points.shape[0] == 1
+    assert "after 1.0 s" in page._scrub._note.content
+    assert len(page._drawn_past.load().gaussians) == len(page._contents.gaussians) // 2
+
+
+def test_a_live_page_set_back_keeps_the_earlier_map_and_follows_again_at_the_end():
+    page = open_page(0, "test")
+    try:
+        for second in range(1, 101):
+            means_m = np.stack([np.arange(second), np.zeros(second), np.ones(second)], axis=1)
+            contents = replace(ViewContents.of_one_agent(plain_gaussians(means_m)), state_ns=second * 1_000_000_000)
+            page.remember(contents)
+            page.show(contents)
+            if second == 50:
+                page._scrub._seconds.value = 20.0
+        assert page._scrub._seconds.max == pytest.approx(99.0)
+        # the state after 20 s, or the one kept before it
+        assert len(page._drawn_past.load().gaussians) in (20, 21)
+        assert len(page._scrub._history) == 64
+        page._scrub._seconds.value = 99.0
+        assert page._drawn_past is None
+        assert "newest map" in page._scrub._note.content
+    finally:
+        page.close()
+
+
+def test_a_run_without_a_history_says_so(run_folder):
+    (run_folder / "map_history.safetensors").unlink()
+    contents = read_contents(run_folder)
+    page = open_page(0, "test")
+    try:
+        page.show_run(contents, read_past(run_folder, contents))
+        page._scrub._seconds.value = 1.0
+        assert "no earlier map is known" in page._scrub._note.content
+    finally:
+        page.close()
 
 
 def test_share_links_are_disabled(page):

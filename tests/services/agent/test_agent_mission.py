@@ -18,6 +18,7 @@ import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server
 from tiny_yolo import write_tiny_yolo
 
+from gausslite.codec.map_history import read_map_history
 from gausslite.codec.ply import read_ply
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError, StorageError, TaskError
@@ -132,6 +133,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
     assert report["handover_bytes"] == agent.handover_bytes == agent.keyframes == 0
     timeline = read_timeline(tmp_path)
     assert len(timeline["frame"]) == report["frames"]
+    assert 0 < read_map_history(tmp_path)[0].total <= count
     assert timeline["roi_share"].mean() == pytest.approx(report["roi_share"], rel=1e-4)
     assert report["map_shared_percent"] == pytest.approx(100 * written.active.mean())
     assert agent.gaussians == written.active.sum()
