@@ -11,6 +11,7 @@ from gausslite.mapping.keyframe_selection import Coverage, KeyframeAddition, Key
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.convert import frame_to_message, transform_from_message
+from gausslite.wire.images import KEYFRAME_PNG_COMPRESSION, encode_mask
 from gausslite.wire.spooled_keyframes import SpooledKeyframe
 from gausslite.wire.uplink import Uplink
 
@@ -42,7 +43,9 @@ class KeyframeUpload:
         if addition is None:
             return
         frame = addition.keyframe.frame
-        data = frame_to_message(frame, compact=True).SerializeToString()
+        message = frame_to_message(frame, compact=True)
+        message.region_png = encode_mask(addition.keyframe.relevance.roi, KEYFRAME_PNG_COMPRESSION)
+        data = message.SerializeToString()
         spooled = SpooledKeyframe(frame.index, addition.gain, addition.coverage.to_bytes(), data)
         try:
             self._uplink.enqueue_keyframe(spooled, addition.replaced)

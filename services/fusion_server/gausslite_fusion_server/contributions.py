@@ -23,6 +23,7 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.caller import Caller
 from gausslite.wire.convert import frame_from_message
 from gausslite.wire.status import code_and_reason
+from gausslite.wire.stored_keyframe import region_from_png
 
 _MAX_SELECTED_KEYFRAMES = 10_000
 _STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)
@@ -101,6 +102,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     engine.settings.quotas.keyframe_limits.require_within(message.index, pixels, message.ByteSize())
     # decoded here to refuse invalid images; stored as received, which needs less space
     frame = frame_from_message(message)
+    region_from_png(message.region_png, frame.camera)
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.depth_m.size, data)
     engine.add_keyframe(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])

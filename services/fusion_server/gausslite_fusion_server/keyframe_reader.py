@@ -24,4 +24,5 @@ def read_keyframe(engine: FusionEngine, request: pb.GetKeyframeRequest) -> pb.Ge
         camera=message.camera,
         t_world_camera=transform_to_message(in_fused_frame[0].frame.T_world_camera) if in_fused_frame else None,
         indices=indices,
+        region_png=message.region_png,
     )

@@ -559,10 +559,13 @@ class GetKeyframeResponse(_message.Message):
     CAMERA_FIELD_NUMBER: _builtins.int
     T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
     INDICES_FIELD_NUMBER: _builtins.int
+    REGION_PNG_FIELD_NUMBER: _builtins.int
     index: _builtins.int
     capture_time_ns: _builtins.int
     colour: _builtins.bytes
     """JPEG or PNG, 8 bits a channel, as received."""
+    region_png: _builtins.bytes
+    """As received; empty if the agent did not send it."""
     @_builtins.property
     def camera(self) -> _geometry_pb2.Camera: ...
     @_builtins.property
@@ -582,10 +585,11 @@ class GetKeyframeResponse(_message.Message):
         camera: _geometry_pb2.Camera | None = ...,
         t_world_camera: _geometry_pb2.RigidTransform | None = ...,
         indices: _abc.Iterable[_builtins.int] | None = ...,
+        region_png: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_t_world_camera", b"_t_world_camera", "camera", b"camera", "t_world_camera", b"t_world_camera"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_t_world_camera", b"_t_world_camera", "camera", b"camera", "capture_time_ns", b"capture_time_ns", "colour", b"colour", "index", b"index", "indices", b"indices", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_t_world_camera", b"_t_world_camera", "camera", b"camera", "capture_time_ns", b"capture_time_ns", "colour", b"colour", "index", b"index", "indices", b"indices", "region_png", b"region_png", "t_world_camera", b"t_world_camera"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__t_world_camera: _TypeAlias = _typing.Literal["t_world_camera"]  # noqa: Y015
     _WhichOneofArgType__t_world_camera: _TypeAlias = _typing.Literal["_t_world_camera", b"_t_world_camera"]  # noqa: Y015

@@ -9,14 +9,15 @@ from typing import Any
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import GaussLiteError
 from gausslite.view.contents import ViewContents
-from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.map_follower import MapFollower
 from gausslite.view.map_page import MapPage, text_html
 from gausslite.view.team_cameras import TeamCameras
+from gausslite.view.team_keyframes import TeamKeyframes
+from gausslite.view.team_plots import TeamPlots
 from gausslite.wire.clients import Export, FusionClient
 
 _FUSED, _REFINED = "fused map", "refined map"
-_KB = 1e3
+_NS_PER_S = 1e9
 
 
 class FusionPanel:
@@ -25,8 +26,7 @@ class FusionPanel:
     def __init__(self, page: MapPage, client: FusionClient) -> None:
         self._page, self._client = page, client
         self._follower = MapFollower(client.watch)
-        self._started_s = self._polled_s = time.monotonic()
-        self._bytes = 0
+        self._started_s = time.monotonic()
         self._shown: tuple[object, ...] | None = None
         gui = page.server.gui
         with gui.add_folder("Fusion server", order=0):
@@ -34,16 +34,16 @@ class FusionPanel:
             self._status = gui.add_html("")
             self._refine = gui.add_button("Start refinement")
             self._message = gui.add_html("")
-        self._cameras = TeamCameras(page.server, client)
+        self._keyframes, self._cameras = TeamKeyframes(client), TeamCameras(page.server, client)
         with gui.add_folder("History", expand_by_default=False):
-            self._traffic = HistoryPlot(gui, "received (kB/s)", ["kB/s"])
-            self._size = HistoryPlot(gui, "fused Gaussians (1000)", ["thousand"])
+            self._plots = TeamPlots(gui, client)
         self._refine.on_click(lambda _: self._run_refinement())
 
     def poll(self) -> None:
         """Read the server's status and draw what changed. Raises GaussLiteError."""
-        status = self._client.status()
+        status, time_s = self._client.status(), time.monotonic() - self._started_s
         self._show_status(status)
+        self._plots.add_status(time_s, status)
         agents = [each.agent_id for each in status.agents]
         layers = (_FUSED, *([_REFINED] if status.refined else []), *agents)
         if layers != tuple(self._layer.options):
@@ -54,13 +54,24 @@ class FusionPanel:
         # an agent that replaces keyframes also sends updates, so that the revision changes
         keyframes = tuple((each.agent_id, each.keyframes) for each in status.agents if each.keyframes)
         shown = (layer, revision, keyframes, self._cameras.keyframes_back)
-        if followed is None or shown == self._shown:
+        if followed is None or (shown == self._shown and self._keyframes.is_complete):
+            self._plots.add_keyframes(time_s, self._keyframes.newest, revision)
             return
+        self._keyframes.read(status.agents)
+        self._cameras.read(self._keyframes.newest)
+        self._plots.add_keyframes(time_s, self._keyframes.newest, revision)
         targets = {each.agent_id: tuple(each.targets) for each in status.agents}
-        contents = followed.contents(targets) if layer == _FUSED else self._download(layer, targets)
         objects = tuple(each.landmark for each in self._client.query_objects())
-        self._cameras.read([agent_id for agent_id, _ in keyframes])
-        self._page.show(replace(contents, objects=objects, keyframes=self._cameras.draw(objects)))
+        fused = replace(
+            followed.contents(targets),
+            objects=objects,
+            keyframes=self._cameras.draw(objects),
+            paths=self._keyframes.paths(),
+            state_ns=round(time_s * _NS_PER_S),
+        )
+        # the slider goes back in the fused map, whichever map is shown now
+        self._page.remember(fused)
+        self._page.show(fused if layer == _FUSED else self._download(layer, targets, fused))
         self._shown = shown
 
     def close(self) -> None:
@@ -68,21 +79,16 @@ class FusionPanel:
         self._client.close()
         self._follower.close()
 
-    def _download(self, layer: str, targets: dict[str, tuple[str, ...]]) -> ViewContents:
-        """Return the refined map, or all that one agent has sent."""
+    def _download(self, layer: str, targets: dict[str, tuple[str, ...]], fused: ViewContents) -> ViewContents:
+        """Return the refined map, or all that one agent has sent, in place of the fused one."""
         export = Export("refined") if layer == _REFINED else Export("concatenation", layer)
         agent_id = "" if layer == _REFINED else layer
-        contents = ViewContents.of_one_agent(gaussians_from_ply(self._client.export(export)), agent_id)
-        return replace(contents, targets=targets.get(agent_id, ()))
+        own = ViewContents.of_one_agent(gaussians_from_ply(self._client.export(export)), agent_id)
+        return replace(
+            fused, gaussians=own.gaussians, agent=own.agent, agents=own.agents, targets=targets.get(agent_id, ())
+        )
 
     def _show_status(self, status: Any) -> None:
-        now_s = time.monotonic()
-        received = sum(each.roi_bytes + each.handover_bytes for each in status.agents)
-        rate = max(0, received - self._bytes) / max(now_s - self._polled_s, 1e-3) / _KB
-        if self._bytes:
-            self._traffic.add(now_s - self._started_s, [rate])
-        self._size.add(now_s - self._started_s, [status.fused_gaussians / 1e3])
-        self._bytes, self._polled_s = received, now_s
         lines = [
             f"mission {status.mission_id or '(unnamed)'}: {status.fused_gaussians:,} Gaussians in "
             f"{status.fused_voxels:,} voxels, {status.keyframes} keyframes",

@@ -26,11 +26,11 @@ class FollowedMap:
     winners: dict[int, str]
 
     def contents(self, targets: dict[str, tuple[str, ...]]) -> ViewContents:
-        """Return the map for the page. targets: the target nouns of each agent's task.
+        """Return the map for the page. targets: the target nouns of the task of each agent of the mission.
 
         The `target` of a Gaussian counts within its agent's task; here it gets an index into the nouns of all tasks.
         """
-        agents = tuple(sorted(set(self.winners.values())))
+        agents = tuple(sorted({*self.winners.values(), *targets}))
         nouns = tuple(dict.fromkeys(noun for agent in agents for noun in targets.get(agent, ())))
         by_voxel = [
             agents.index(self.winners[key]) if key in self.winners else NO_AGENT for key in self.batch.keys.tolist()

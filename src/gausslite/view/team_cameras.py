@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.view.camera_image import with_objects
+from gausslite.view.camera_image import with_objects, with_region
 from gausslite.view.local_server import LocalServer
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.stored_keyframe import StoredKeyframe
@@ -22,9 +22,8 @@ class TeamCameras:
     def __init__(self, server: LocalServer, client: FusionClient) -> None:
         self._server, self._client = server, client
         with server.gui.add_folder("Cameras", order=0, visible=False) as self._folder:
-            self._age: Any = server.gui.add_slider("Keyframes back", 0, 1, 1, 0)
+            self._age: Any = server.gui.add_slider("Keyframes back", 0, 1, 1, 0, order=0)
         self._images: dict[str, Any] = {}
-        self._newest: dict[str, StoredKeyframe] = {}
         self._chosen: dict[str, StoredKeyframe] = {}
 
     @property
@@ -32,17 +31,15 @@ class TeamCameras:
         """How many keyframes before the newest one the page shows."""
         return int(self._age.value)
 
-    def read(self, agents: Sequence[str]) -> None:
-        """Read the chosen keyframe of each of these agents. Raises GaussLiteError."""
-        self._newest, self._chosen = {}, {}
-        for agent_id in sorted(agents)[:MAX_IMAGES]:
-            newest = self._client.keyframe(agent_id)
-            if newest is None:
-                continue
-            back = min(self.keyframes_back, len(newest.indices) - 1)
-            chosen = self._client.keyframe(agent_id, newest.indices[-1 - back]) if back else newest
-            self._newest[agent_id], self._chosen[agent_id] = newest, chosen or newest
-        most = max((len(each.indices) for each in self._newest.values()), default=0)
+    def read(self, newest: Mapping[str, StoredKeyframe]) -> None:
+        """Read the chosen keyframe of each agent; newest: its newest one. Raises GaussLiteError."""
+        self._chosen = {}
+        for agent_id in sorted(newest)[:MAX_IMAGES]:
+            indices = newest[agent_id].indices
+            back = min(self.keyframes_back, len(indices) - 1)
+            chosen = self._client.keyframe(agent_id, indices[-1 - back]) if back else None
+            self._chosen[agent_id] = chosen or newest[agent_id]
+        most = max((len(each.indices) for each in newest.values()), default=0)
         self._folder.visible = most > 0
         self._age.max = max(1, most - 1)
 
@@ -52,12 +49,14 @@ class TeamCameras:
             self._images.pop(agent_id).remove()
         views = []
         for number, (agent_id, keyframe) in enumerate(self._chosen.items()):
-            image = keyframe.rgb
+            image, note = keyframe.rgb, "objects in green"
+            if keyframe.roi is not None:
+                image, note = with_region(image, keyframe.roi), f"region in red, {note}"
             if keyframe.T_world_camera is not None:
                 image = with_objects(image, objects, keyframe.camera, keyframe.T_world_camera)
                 time_ns = keyframe.capture_time_ns
                 views.append(KeyframeView(number, time_ns, keyframe.camera, keyframe.T_world_camera, 0))
-            self._show(agent_id, image, f"{agent_id}: keyframe {keyframe.index}, objects in green")
+            self._show(agent_id, image, f"{agent_id}: keyframe {keyframe.index}, {note}")
         return tuple(views)
 
     def _show(self, agent_id: str, image: Any, label: str) -> None:
@@ -66,3 +65,6 @@ class TeamCameras:
         else:
             with self._folder:
                 self._images[agent_id] = self._server.gui.add_image(image, label=label, format="jpeg")
+            # an agent whose first keyframe came late keeps its place in the order of the names
+            for number, name in enumerate(sorted(self._images)):
+                self._images[name].order = number + 1

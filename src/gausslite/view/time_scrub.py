@@ -34,7 +34,7 @@ class TimeScrub:
     def __init__(self, gui: Any, on_change: Callable[[], None]) -> None:
         self._history: EvenHistory[PastMap] = EvenHistory(_MAX_STATES)
         self._start_ns = self._end_ns = 0
-        with gui.add_folder("Time", visible=False) as self._folder:
+        with gui.add_folder("Time", order=-0.5, visible=False) as self._folder:
             self._seconds: Any = gui.add_slider("Seconds", 0.0, 1.0, _STEP_S, 1.0)
             self._note = gui.add_html("")
         self._seconds.on_update(lambda _: on_change())
@@ -60,7 +60,7 @@ class TimeScrub:
         is_live = self.chosen_ns is None
         starts = (*self._history.times_ns[:1], *contents.times_ns[:1].tolist(), end_ns)
         self._start_ns, self._end_ns = min(starts), end_ns
-        span_s = (self._end_ns - self._start_ns) / _NS_PER_S
+        span_s = round((self._end_ns - self._start_ns) / _NS_PER_S, 2)
         self._folder.visible = span_s >= 2 * _STEP_S
         if self._folder.visible and span_s != self._seconds.max:
             self._seconds.max = span_s
@@ -88,7 +88,8 @@ class TimeScrub:
         if past is None:
             return "no earlier map is known: the splats are those of the newest map"
         earliest = " (the first one that is known)" if past.time_ns > time_ns else ""
-        return f"the map as it was after {self._seconds_of(past.time_ns):.1f} s{earliest}, coarse"
+        coarse = ", coarse" if past.total > _MAX_GAUSSIANS else ""
+        return f"the map as it was after {self._seconds_of(past.time_ns):.1f} s{earliest}{coarse}"
 
     def show_note(self, content: str) -> None:
         """Show HTML under the slider."""

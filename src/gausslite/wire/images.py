@@ -37,11 +37,11 @@ def encode_depth(depth_m: Float32[ndarray, "h w"], compression: int = PNG_COMPRE
     return bytes(cv2.imencode(".png", depth_mm.astype(np.uint16), options)[1].tobytes())
 
 
-def encode_mask(mask: Bool[ndarray, "h w"]) -> bytes:
-    """Encode as 8-bit PNG: 255 where True, otherwise 0."""
+def encode_mask(mask: Bool[ndarray, "h w"], compression: int = PNG_COMPRESSION) -> bytes:
+    """Encode as PNG with one bit a pixel: white where True, otherwise black."""
     import cv2
 
-    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
+    options = [cv2.IMWRITE_PNG_COMPRESSION, compression, cv2.IMWRITE_PNG_BILEVEL, 1]
     return bytes(cv2.imencode(".png", mask.astype(np.uint8) * np.uint8(255), options)[1].tobytes())
 
 
@@ -52,7 +52,7 @@ def decode_mask(data: bytes, width_px: int, height_px: int) -> Bool[ndarray, "h 
     _require_size("mask", data, width_px, height_px)
     image = _decode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.shape != (height_px, width_px) or image.dtype != np.uint8:
-        raise InvalidInputError("mask: expected a one-channel 8-bit PNG, got something else")
+        raise InvalidInputError("mask: expected a one-channel PNG of up to 8 bits, got something else")
     return image > 0
 
 

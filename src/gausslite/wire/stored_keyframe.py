@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_from_message, transform_from_message
-from gausslite.wire.images import decode_colour
+from gausslite.wire.images import decode_colour, decode_mask
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredKeyframe:
     """A keyframe with its frame index. T_world_camera: in the fused map's frame, None if the agent's does not fit.
 
-    indices: of all keyframes that the server has of the agent, ascending.
+    indices: of all keyframes that the server has of the agent, ascending. roi: True in the task's region, None if the
+    agent did not send it.
     """
 
     index: int
@@ -26,6 +27,12 @@ class StoredKeyframe:
     camera: Camera
     T_world_camera: Float64[ndarray, "4 4"] | None
     indices: tuple[int, ...]
+    roi: Bool[ndarray, "h w"] | None = None
+
+
+def region_from_png(data: bytes, camera: Camera) -> Bool[ndarray, "h w"] | None:
+    """Decode the region of a keyframe; None for empty bytes. Raises InvalidInputError."""
+    return decode_mask(data, camera.width_px, camera.height_px) if data else None
 
 
 def stored_keyframe_from_message(message: pb.GetKeyframeResponse) -> StoredKeyframe | None:
@@ -41,4 +48,5 @@ def stored_keyframe_from_message(message: pb.GetKeyframeResponse) -> StoredKeyfr
         camera,
         transform_from_message("keyframe t_world_camera", message.t_world_camera) if has_pose else None,
         tuple(message.indices),
+        region_from_png(message.region_png, camera),
     )

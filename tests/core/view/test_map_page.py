@@ -19,6 +19,7 @@ from gausslite.codec.map_history import MapSnapshot, write_map_history
 from gausslite.codec.ply import write_ply
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.view.colours import ColourMode, colours_of
 from gausslite.view.contents import ViewContents
 from gausslite.view.run_contents import read_contents, read_past
 
@@ -93,12 +94,28 @@ def test_a_browser_draws_the_map_and_asks_no_other_machine(page):
         assert hosts == {urlsplit(page.url).netloc}
 
 
+def test_each_choice_of_colour_is_drawn_in_a_browser(page):
+    with open_browser() as browser:
+        tab = browser.new_page()
+        tab.goto(page.url)
+        wait_until(lambda: min(len(columns_near(tab, RED)), len(columns_near(tab, GREEN))) > 2000)
+        contents = page._contents
+        left, right = (int(np.argmax(contents.gaussians.target == target)) for target in (0, -1))
+        for mode in (ColourMode.KAPPA, ColourMode.OBJECT, ColourMode.AGENT, ColourMode.RGB):
+            tab.get_by_label("Colour").first.click()
+            tab.get_by_role("option", name=str(mode), exact=True).click()
+            colours = colours_of(contents, mode)
+            # a run has one agent, so both walls have its colour
+            for rgb in {tuple(colours[row].tolist()) for row in (left, right)}:
+                wait_until(lambda rgb=rgb: len(columns_near(tab, rgb, 40)) > 2000)
+
+
 def test_the_time_slider_shows_the_earlier_map_in_a_browser(page):
     with open_browser() as browser:
         tab = browser.new_page()
         tab.goto(page.url)
         wait_until(lambda: min(len(columns_near(tab, RED)), len(columns_near(tab, GREEN))) > 2000)
-        slider = tab.get_by_role("slider").last
+        slider = tab.get_by_role("slider").first
         slider.press("Home")
         tab.get_by_text("the map as it was after 0.0 s").wait_for()
         wait_until(lambda: len(columns_near(tab, GREEN)) < 200)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import grpc
+import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server
 from tiny_yolo import write_tiny_yolo
@@ -145,6 +146,10 @@ def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
         keyframes = worker.run(lambda mapper: mapper.keyframes()).result(20)
+        stored = fusion.client.keyframe(agent.agent_id)
+    assert stored is not None
+    assert stored.roi is not None
+    np.testing.assert_array_equal(stored.roi, keyframes[-1].relevance.roi)
     report = json.loads((tmp_path / "report.json").read_text())
     assert agent.gaussians == report["gaussians"]
     assert agent.handover_bytes == report["handover_bytes"] > 0

@@ -28,6 +28,8 @@ pytest.importorskip("viser")
 from gausslite.view.fusion_panel import FusionPanel
 from gausslite.view.open_page import open_page
 from gausslite.wire.clients import FusionClient
+from gausslite.wire.convert import frame_to_message
+from gausslite.wire.images import encode_mask
 
 WAIT_S = 60.0
 
@@ -98,6 +100,88 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one():
         finally:
             panel.close()
             page.close()
+
+
+def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality():
+    with fusion_server() as running:
+        session = running.client.join("a", GRID, T_fused_agent=moved_x(2.0)).session_id
+        running.contribute_subsets(session, RoiSubset("a", session, 1, 1, wall()))
+        running.client.contribute_encoded_keyframes(session, [with_region(index) for index in range(20)])
+        contribute(running, "b", "Find the chair", [1.0], kappa=9)
+        session_b = running.client.join("b", GRID).session_id
+        running.client.contribute_keyframes(session_b, [coloured_frame(5, 90)])
+        page, client = open_page(0, "test"), FusionClient(running.client.address)
+        panel = FusionPanel(page, client)
+        try:
+            wait_for_map(panel._follower)
+            panel.poll()
+            assert not panel._keyframes.is_complete
+            panel.poll()
+            assert panel._keyframes.is_complete
+            a, b = page._contents.paths
+            assert (a.agent, [view.index for view in a.keyframes]) == ("a", list(range(20)))
+            np.testing.assert_allclose(a.keyframes[-1].T_world_camera[:3, 3], [3.9, 0.0, 0.0])
+            assert (b.agent, b.colour_index, len(b.keyframes)) == ("b", 1, 1)
+            names = {handle.name for handle in page._markers._drawn["team"]}
+            assert {"/team/a/line", "/team/a/newest", "/team/a/label", "/team/b/newest"} <= names
+            share_percent = panel._plots._roi.columns()[1]
+            assert share_percent[-1] == pytest.approx(25.0)
+            panel._plots._rendered_s = -1e9
+            panel.poll()
+            # one agent each time: a has a region, b has none
+            assert set(panel._plots._rendered) == {"a", "b"}
+            assert len(panel._plots._full._names) == 2
+            assert panel._plots._region._names == ["a"]
+            assert panel._plots._traffic._names == ["a", "b"]
+            page._markers._switches["Trajectory"].value = False
+            assert "/team/a/line" not in {handle.name for handle in page._markers._drawn["team"]}
+        finally:
+            panel.close()
+            page.close()
+
+
+def test_the_time_slider_shows_the_earlier_fused_map():
+    with fusion_server() as running:
+        contribute(running, "a", "Pick up the mug", [0.0], kappa=5)
+        page, client = open_page(0, "test"), FusionClient(running.client.address)
+        panel = FusionPanel(page, client)
+        try:
+            wait_for_map(panel._follower)
+            panel.poll()
+            contribute(running, "b", "Find the chair", [1.0, 2.0], kappa=9)
+            for _ in range(int(WAIT_S / 0.05)):
+                if len(panel._follower.newest().batch) == 3:
+                    break
+                threading.Event().wait(0.05)
+            panel.poll()
+            assert len(page._contents.gaussians) == 3
+            page._scrub._seconds.value = 0.0
+            past = page._drawn_past.load()
+            assert (len(past.gaussians), [past.agents[i] for i in past.agent]) == (1, ["a"])
+            assert [each.noun for each in past.objects] == []
+        finally:
+            panel.close()
+            page.close()
+
+
+def test_a_region_of_another_size_is_refused():
+    with fusion_server() as running:
+        session = running.client.join("a", GRID).session_id
+        good, bad = with_region(0), with_region(1)
+        bad.region_png = encode_mask(np.zeros((7, 9), np.bool_))
+        response = running.client.contribute_encoded_keyframes(session, [good, bad])
+        assert (response.accepted, [each.index for each in response.rejected]) == (1, [1])
+        keyframe = running.client.keyframe("a")
+        assert (keyframe.index, float(keyframe.roi.mean())) == (0, 0.25)
+
+
+def with_region(index: int) -> Any:
+    """Return an encoded keyframe whose region is the left quarter of the image."""
+    message = frame_to_message(coloured_frame(index, 90))
+    roi = np.zeros((message.camera.height_px, message.camera.width_px), np.bool_)
+    roi[:, : roi.shape[1] // 4] = True
+    message.region_png = encode_mask(roi)
+    return message
 
 
 def test_a_refinement_is_started_in_a_browser_which_then_shows_its_map():
