@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from gausslite.domain.relevance import DetectedImage
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.wire.camera_view import CameraView
 
 _NS_PER_S = 1e9
 
 
-def newest_camera_view(mapper: GaussianMapper) -> CameraView | None:
-    """Return the newest keyframe and the camera's path; None before the first keyframe."""
+def newest_camera_view(mapper: GaussianMapper, detected: DetectedImage | None) -> CameraView | None:
+    """Return the newest keyframe, the camera's path and the newest detection; None before the first keyframe."""
     keyframes = mapper.keyframes()
     if not keyframes:
         return None
@@ -25,4 +26,5 @@ def newest_camera_view(mapper: GaussianMapper) -> CameraView | None:
         times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
         path=trajectory.T_world_camera,
         keyframes=np.stack([each.frame.T_world_camera for each in keyframes]),
+        detected=detected,
     )

@@ -19,6 +19,7 @@ from gausslite.domain.errors import InvalidInputError, MismatchError, StorageErr
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
+from gausslite.domain.relevance import DetectedImage
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, replace_voxels
@@ -34,8 +35,10 @@ from gausslite.mission.map_recorder import MapRecorder
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.mission.timeline import Timeline
+from gausslite.wire.camera_view import CameraView
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
+from gausslite_agent.camera_view import newest_camera_view
 from gausslite_agent.frame_queue import FrameQueue, QueuedFrame
 from gausslite_agent.idle_training import IdleTraining
 from gausslite_agent.keyframe_upload import KeyframeUpload
@@ -80,6 +83,7 @@ class MappingWorker:
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
         self._timeline, self._recorder = Timeline(), MapRecorder()
+        self._detected: DetectedImage | None = None
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
@@ -132,6 +136,10 @@ class MappingWorker:
             self._recorder.write(folder)
 
         return self._submit(write)
+
+    def camera_view(self) -> Future[CameraView | None]:
+        """Return what the camera sees, for a person; None before the first keyframe."""
+        return self._submit(lambda: newest_camera_view(self._mapper, self._detected))
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame and return the future of its report.
@@ -262,7 +270,7 @@ class MappingWorker:
         assert self._task_mapper is not None
         frame = queued.frame
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
-        self._last_index = frame.index
+        self._last_index, self._detected = frame.index, outcome.detected or self._detected
         self._update_notes(self._task_mapper.notes)
         self._update_objects(self._task_mapper.objects)
         if outcome.skipped is not None:

@@ -29,7 +29,6 @@ from gausslite.wire.map_blocks import map_blocks
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.agent_mission import AgentMission
-from gausslite_agent.camera_view import newest_camera_view
 from gausslite_agent.map_changes import MapChangeLog
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import (
@@ -121,8 +120,8 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     async def GetCameraView(  # noqa: N802
         self, _request: pb.GetCameraViewRequest, _context: Any
     ) -> pb.GetCameraViewResponse:
-        """Return the newest keyframe and the camera's path."""
-        view = await asyncio.wrap_future(self._worker.run(newest_camera_view))
+        """Return the newest keyframe, the camera's path and the newest detection."""
+        view = await asyncio.wrap_future(self._worker.camera_view())
         return await asyncio.to_thread(camera_view_to_message, view)
 
     async def WatchMap(  # noqa: N802

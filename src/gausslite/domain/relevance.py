@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int16
+from jaxtyping import Bool, Float32, Int16, UInt8
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
+from gausslite.domain.frame import Frame
 
 NO_TARGET = -1
 
@@ -34,6 +36,34 @@ class Detection:
     mask: Bool[ndarray, "h w"]
     rival: Rival | None = None
     is_weak: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DetectedBox:
+    """A detection without its mask, for a person; see Detection."""
+
+    phrase: str
+    score: float
+    box_px: tuple[float, float, float, float]
+    is_weak: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedImage:
+    """What the detector has found in one image, objects that the task leaves out included. index: of the frame."""
+
+    index: int
+    rgb: UInt8[ndarray, "h w 3"]
+    boxes: tuple[DetectedBox, ...]
+
+    @classmethod
+    def of(cls, frame: Frame, detections: Sequence[Detection]) -> DetectedImage:
+        """Return the frame's image with the boxes of its detections."""
+        return cls(
+            frame.index,
+            frame.rgb,
+            tuple(DetectedBox(each.phrase, each.score, each.box_px, each.is_weak) for each in detections),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

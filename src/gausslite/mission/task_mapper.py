@@ -12,7 +12,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.noun_match import NounReport
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.relevance import DetectedImage, RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxels import VoxelGrid
@@ -35,7 +35,8 @@ class FrameOutcome:
 
     skipped: why the frame was not mapped, else None. changed_roi: the changed voxels of the task's region; None
     without a tracker, for a skipped frame, and if publishing waits for the next frame. detection_lag_frames: age of
-    the detection that finished during this frame. reevaluation: the earlier keyframes evaluated for a new task.
+    the detection that finished during this frame; detected: what it found. reevaluation: the earlier keyframes
+    evaluated for a new task.
     """
 
     index: int
@@ -47,6 +48,7 @@ class FrameOutcome:
     changed_roi: VoxelBatch | None
     detection_lag_frames: int | None
     reevaluation: Reevaluation
+    detected: DetectedImage | None = None
 
 
 class TaskMapper:
@@ -181,6 +183,7 @@ class TaskMapper:
             changed_roi=changed_roi,
             detection_lag_frames=lag_frames,
             reevaluation=reevaluation,
+            detected=estimate.detected,
         )
 
     def idle_step(self) -> bool:

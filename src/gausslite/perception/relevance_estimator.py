@@ -12,7 +12,7 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounReport, match_warnings
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.relevance import Detection, RelevanceMap
+from gausslite.domain.relevance import DetectedImage, Detection, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detect import Detector, Segmenter
@@ -33,10 +33,14 @@ class DelayedRelevance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelevanceEstimate:
-    """The relevance of a frame, and that of an earlier frame if its detection has finished since the last call."""
+    """The relevance of a frame, and that of an earlier frame if its detection has finished since the last call.
+
+    detected: what that detection found, or one on this frame; None if none has finished.
+    """
 
     relevance: RelevanceMap
     delayed: DelayedRelevance | None = None
+    detected: DetectedImage | None = None
 
 
 @runtime_checkable
@@ -129,7 +133,8 @@ class TaskRelevanceEstimator:
             return RelevanceEstimate(self._tracker.propagate(frame))
         detections = self._detector.detect(frame, self._graph.queries)
         depth_m = best_depth_m(frame.depth_m, rendered_depth_m)
-        return RelevanceEstimate(self._tracker.integrate(frame, depth_m, detections))
+        relevance = self._tracker.integrate(frame, depth_m, detections)
+        return RelevanceEstimate(relevance, detected=DetectedImage.of(frame, detections))
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap:
         """Return the relevance of an earlier frame after a detection on it."""
@@ -218,7 +223,7 @@ class AsyncRelevanceEstimator:
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return weight 1 on the pixels of the targets detected so far. Raises the detector's exceptions."""
-        delayed = self._collect()
+        delayed, detected = self._collect()
         if self._tracker.update_keyframe(frame):
             self._skipped_keyframes += self._queued is not None
             self._queued = _Keyframe(frame, best_depth_m(frame.depth_m, rendered_depth_m), self._frames)
@@ -226,7 +231,7 @@ class AsyncRelevanceEstimator:
             future = self._executor.submit(self._detector.detect, self._queued.frame, self._graph.queries)
             self._running, self._queued = (self._queued, future), None
         self._frames += 1
-        return RelevanceEstimate(self._tracker.propagate(frame), delayed)
+        return RelevanceEstimate(self._tracker.propagate(frame), delayed, detected)
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
         """Return the relevance of an earlier frame once its detection has finished; the first call starts it.
@@ -241,13 +246,15 @@ class AsyncRelevanceEstimator:
         self._past_detection = None
         return self._tracker.integrate(frame, frame.depth_m, future.result())
 
-    def _collect(self) -> DelayedRelevance | None:
+    def _collect(self) -> tuple[DelayedRelevance | None, DetectedImage | None]:
         """Integrate the running detection if it has finished."""
         if self._running is None or not self._running[1].done():
-            return None
+            return None, None
         (keyframe, future), self._running = self._running, None
-        relevance = self._tracker.integrate(keyframe.frame, keyframe.depth_m, future.result())
-        return DelayedRelevance(keyframe.frame, relevance, self._frames - keyframe.number)
+        detections = future.result()
+        relevance = self._tracker.integrate(keyframe.frame, keyframe.depth_m, detections)
+        delayed = DelayedRelevance(keyframe.frame, relevance, self._frames - keyframe.number)
+        return delayed, DetectedImage.of(keyframe.frame, detections)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -531,6 +531,7 @@ class GetCameraViewResponse(_message.Message):
     T_WORLD_CAMERA_FIELD_NUMBER: _builtins.int
     PATH_FIELD_NUMBER: _builtins.int
     KEYFRAMES_FIELD_NUMBER: _builtins.int
+    DETECTED_FIELD_NUMBER: _builtins.int
     colour_jpeg: _builtins.bytes
     region_png: _builtins.bytes
     """One channel, 8 bits, the size of the colour: 255 in the task's region, otherwise 0."""
@@ -547,6 +548,10 @@ class GetCameraViewResponse(_message.Message):
     def keyframes(self) -> _containers.RepeatedCompositeFieldContainer[_geometry_pb2.RigidTransform]:
         """Poses of kept keyframes; at most 60, evenly spaced."""
 
+    @_builtins.property
+    def detected(self) -> Global___DetectedImage:
+        """The image on which the detector ran last; empty without a detector."""
+
     def __init__(
         self,
         *,
@@ -557,14 +562,88 @@ class GetCameraViewResponse(_message.Message):
         t_world_camera: _geometry_pb2.RigidTransform | None = ...,
         path: _abc.Iterable[Global___StampedPose] | None = ...,
         keyframes: _abc.Iterable[_geometry_pb2.RigidTransform] | None = ...,
+        detected: Global___DetectedImage | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "detected", b"detected", "t_world_camera", b"t_world_camera"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "colour_jpeg", b"colour_jpeg", "frame_index", b"frame_index", "keyframes", b"keyframes", "path", b"path", "region_png", b"region_png", "t_world_camera", b"t_world_camera"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "colour_jpeg", b"colour_jpeg", "detected", b"detected", "frame_index", b"frame_index", "keyframes", b"keyframes", "path", b"path", "region_png", b"region_png", "t_world_camera", b"t_world_camera"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___GetCameraViewResponse: _TypeAlias = GetCameraViewResponse  # noqa: Y015
+
+@_typing.final
+class DetectedImage(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FRAME_INDEX_FIELD_NUMBER: _builtins.int
+    COLOUR_JPEG_FIELD_NUMBER: _builtins.int
+    WIDTH_PX_FIELD_NUMBER: _builtins.int
+    HEIGHT_PX_FIELD_NUMBER: _builtins.int
+    BOXES_FIELD_NUMBER: _builtins.int
+    frame_index: _builtins.int
+    colour_jpeg: _builtins.bytes
+    width_px: _builtins.int
+    height_px: _builtins.int
+    @_builtins.property
+    def boxes(self) -> _containers.RepeatedCompositeFieldContainer[Global___DetectedBox]:
+        """What was found; at most 100 boxes, those with the highest scores."""
+
+    def __init__(
+        self,
+        *,
+        frame_index: _builtins.int = ...,
+        colour_jpeg: _builtins.bytes = ...,
+        width_px: _builtins.int = ...,
+        height_px: _builtins.int = ...,
+        boxes: _abc.Iterable[Global___DetectedBox] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["boxes", b"boxes", "colour_jpeg", b"colour_jpeg", "frame_index", b"frame_index", "height_px", b"height_px", "width_px", b"width_px"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___DetectedImage: _TypeAlias = DetectedImage  # noqa: Y015
+
+@_typing.final
+class DetectedBox(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    PHRASE_FIELD_NUMBER: _builtins.int
+    SCORE_FIELD_NUMBER: _builtins.int
+    LEFT_PX_FIELD_NUMBER: _builtins.int
+    TOP_PX_FIELD_NUMBER: _builtins.int
+    RIGHT_PX_FIELD_NUMBER: _builtins.int
+    BOTTOM_PX_FIELD_NUMBER: _builtins.int
+    IS_WEAK_FIELD_NUMBER: _builtins.int
+    phrase: _builtins.str
+    """The task's noun."""
+    score: _builtins.float
+    left_px: _builtins.float
+    top_px: _builtins.float
+    right_px: _builtins.float
+    bottom_px: _builtins.float
+    is_weak: _builtins.bool
+    """The score is below the detector's threshold."""
+    def __init__(
+        self,
+        *,
+        phrase: _builtins.str = ...,
+        score: _builtins.float = ...,
+        left_px: _builtins.float = ...,
+        top_px: _builtins.float = ...,
+        right_px: _builtins.float = ...,
+        bottom_px: _builtins.float = ...,
+        is_weak: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bottom_px", b"bottom_px", "is_weak", b"is_weak", "left_px", b"left_px", "phrase", b"phrase", "right_px", b"right_px", "score", b"score", "top_px", b"top_px"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___DetectedBox: _TypeAlias = DetectedBox  # noqa: Y015
 
 @_typing.final
 class StampedPose(_message.Message):

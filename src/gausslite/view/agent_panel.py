@@ -11,6 +11,7 @@ from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.view.camera_image import with_objects, with_region
+from gausslite.view.camera_panel import CameraPanel
 from gausslite.view.contents import ViewContents
 from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.map_follower import MapFollower
@@ -33,7 +34,6 @@ class AgentPanel:
         self._started_s = self._polled_s = time.monotonic()
         self._bytes = 0
         self._shown_revision = -1
-        self._image: Any = None
         gui = page.server.gui
         with gui.add_folder("Agent", order=0):
             self._status = gui.add_html("")
@@ -41,8 +41,7 @@ class AgentPanel:
             self._assign = gui.add_button("Assign task")
             self._end = gui.add_button("End mission", color="red")
             self._message = gui.add_html("")
-        with gui.add_folder("Camera", order=0) as self._camera_folder:
-            pass
+        self._camera = CameraPanel(gui)
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
@@ -66,7 +65,7 @@ class AgentPanel:
         )
         view = self._client.camera_view()
         if view is not None:
-            self._show_image(view, objects)
+            self._show_images(view, objects)
             rendered, _ = self._client.render(view.camera, view.T_world_camera)
             self._quality.add(time.monotonic() - self._started_s, rendered, view.rgb, view.roi)
             keyframes = [KeyframeView(i, 0, view.camera, T, 0) for i, T in enumerate(view.keyframes)]
@@ -80,14 +79,11 @@ class AgentPanel:
         self._client.close()
         self._follower.close()
 
-    def _show_image(self, view: CameraView, objects: tuple[ObjectLandmark, ...]) -> None:
+    def _show_images(self, view: CameraView, objects: tuple[ObjectLandmark, ...]) -> None:
         image = with_objects(with_region(view.rgb, view.roi), objects, view.camera, view.T_world_camera)
-        if self._image is None:
-            with self._camera_folder:
-                label = "Newest keyframe: the task's region in red, objects in green"
-                self._image = self._page.server.gui.add_image(image, label=label, format="jpeg")
-        else:
-            self._image.image = image
+        self._camera.show_keyframe(image)
+        if view.detected is not None:
+            self._camera.show_detections(view.detected)
 
     def _show_status(self, status: Any) -> None:
         now_s, uplink = time.monotonic(), status.uplink

@@ -1,4 +1,4 @@
-"""The camera's image for a person: the task's region in red, the confirmed objects as boxes with names."""
+"""The camera's image for a person: the task's region in red, confirmed objects and detections as named boxes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, project
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import inverse, transform_points
+from gausslite.domain.relevance import DetectedImage
 
 _REGION_RGB, _BOX_RGB = (255, 60, 60), (60, 230, 90)
+_DETECTION_RGB, _WEAK_RGB = (255, 210, 40), (150, 150, 150)
+_MAX_PX = 1 << 14
 _REGION_WEIGHT = 0.45
 _NEAR_M = 0.1
 _MAX_NAME = 40
@@ -25,6 +28,17 @@ def with_region(rgb: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt
     tinted = rgb.copy()
     tinted[roi] = (1 - _REGION_WEIGHT) * rgb[roi] + _REGION_WEIGHT * np.array(_REGION_RGB)
     return tinted
+
+
+def with_detections(detected: DetectedImage) -> UInt8[ndarray, "h w 3"]:
+    """Return the image with the boxes of the detector, their nouns and scores; those below its threshold in grey."""
+    drawn = detected.rgb.copy()
+    for each in sorted(detected.boxes, key=lambda box: box.score):
+        left, top, right, bottom = (round(min(max(value, -_MAX_PX), _MAX_PX)) for value in each.box_px)
+        colour = _WEAK_RGB if each.is_weak else _DETECTION_RGB
+        cv2.rectangle(drawn, (left, top), (right, bottom), colour, 1)
+        _write(drawn, f"{each.phrase[:_MAX_NAME]} {each.score:.2f}", (left, top), colour)
+    return drawn
 
 
 def with_objects(
@@ -47,7 +61,13 @@ def with_objects(
             continue
         (x0, y0), (x1, y1) = low.astype(int).tolist(), high.astype(int).tolist()
         cv2.rectangle(drawn, (x0, y0), (x1, y1), _BOX_RGB, 1)
-        # the font has ASCII characters only
-        name = landmark.noun[:_MAX_NAME].encode("ascii", "replace").decode()
-        cv2.putText(drawn, name, (x0 + 2, max(y0 - 3, 9)), cv2.FONT_HERSHEY_SIMPLEX, 0.35, _BOX_RGB, 1, cv2.LINE_AA)
+        _write(drawn, landmark.noun[:_MAX_NAME], (x0, y0), _BOX_RGB)
     return drawn
+
+
+def _write(image: UInt8[ndarray, "h w 3"], text: str, corner_px: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    """Write above the top left corner of a box, inside of the image."""
+    # the font has ASCII characters only
+    ascii_text = text.encode("ascii", "replace").decode()
+    origin = (max(corner_px[0], 0) + 2, max(corner_px[1] - 3, 9))
+    cv2.putText(image, ascii_text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.35, colour, 1, cv2.LINE_AA)

@@ -6,16 +6,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.domain.relevance import DetectedImage
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.process.messages import print_message
 from gausslite.view.camera_image import with_objects, with_region
+from gausslite.view.camera_panel import CameraPanel
 from gausslite.view.contents import ViewContents
 from gausslite.view.history_plot import HistoryPlot
 from gausslite.view.open_page import open_page
@@ -35,10 +37,9 @@ class MissionView:
         self._page, self._mapper, self._task_at = page, mapper, task_at
         self._started_s = time.monotonic()
         self._drawn_s = -_INTERVAL_S
-        self._image: Any = None
+        self._detected: DetectedImage | None = None
         gui = page.server.gui
-        with gui.add_folder("Camera", order=0) as self._folder:
-            pass
+        self._camera = CameraPanel(gui)
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
@@ -47,6 +48,7 @@ class MissionView:
     def update(self, outcome: FrameOutcome) -> None:
         """Draw the map after a frame, if the last drawing is older than a second."""
         now_s = time.monotonic()
+        self._detected = outcome.detected or self._detected
         if now_s - self._drawn_s < _INTERVAL_S or not outcome.gaussians:
             return
         self._drawn_s = now_s
@@ -54,6 +56,8 @@ class MissionView:
         if keyframes:
             self._show_image(keyframes[-1])
             self._add_quality(now_s - self._started_s, keyframes[-1])
+        if self._detected is not None:
+            self._camera.show_detections(self._detected)
         if outcome.timing.seconds > 0:
             self._rate.add(now_s - self._started_s, [1 / outcome.timing.seconds])
         self._roi.add(now_s - self._started_s, [100 * outcome.roi_share])
@@ -80,12 +84,7 @@ class MissionView:
         frame = keyframe.frame
         image = with_region(frame.rgb, keyframe.relevance.roi)
         image = with_objects(image, self._mapper.objects, frame.camera, frame.T_world_camera)
-        if self._image is None:
-            with self._folder:
-                label = "Newest keyframe: the task's region in red, objects in green"
-                self._image = self._page.server.gui.add_image(image, label=label, format="jpeg")
-        else:
-            self._image.image = image
+        self._camera.show_keyframe(image)
 
 
 @contextmanager

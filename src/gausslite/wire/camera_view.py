@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,12 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.names import require_name
+from gausslite.domain.relevance import DetectedBox, DetectedImage
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.convert import (
+    MAX_IMAGE_PX,
     camera_from_message,
     camera_to_message,
     transform_from_message,
@@ -20,14 +24,15 @@ from gausslite.wire.convert import (
 )
 from gausslite.wire.images import decode_colour, decode_mask, encode_colour, encode_mask
 
-MAX_POSES, MAX_KEYFRAMES = 1000, 60
+MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraView:
     """The newest keyframe, its pose, and the poses of all frames and keyframes, in the map.
 
-    roi: True in the task's region. times_ns: the capture times of the path, oldest first.
+    roi: True in the task's region. times_ns: the capture times of the path, oldest first. detected: what the detector
+    found in the image on which it ran last; None without a detector.
     """
 
     rgb: UInt8[ndarray, "h w 3"]
@@ -38,6 +43,7 @@ class CameraView:
     times_ns: Int64[ndarray, " t"]
     path: Float64[ndarray, "t 4 4"]
     keyframes: Float64[ndarray, "k 4 4"]
+    detected: DetectedImage | None = None
 
 
 def camera_view_to_message(view: CameraView | None) -> pb.GetCameraViewResponse:
@@ -55,6 +61,7 @@ def camera_view_to_message(view: CameraView | None) -> pb.GetCameraViewResponse:
             for i in _evenly(len(view.path), MAX_POSES)
         ],
         keyframes=[transform_to_message(view.keyframes[i]) for i in _evenly(len(view.keyframes), MAX_KEYFRAMES)],
+        detected=None if view.detected is None else _detected_to_message(view.detected),
     )
 
 
@@ -78,7 +85,48 @@ def camera_view_from_message(message: pb.GetCameraViewResponse) -> CameraView | 
         times_ns=np.array([each.capture_time_ns for each in message.path], np.int64),
         path=_poses("camera view path", [each.t_world_camera for each in message.path]),
         keyframes=_poses("camera view keyframes", list(message.keyframes)),
+        detected=_detected_from_message(message.detected) if message.HasField("detected") else None,
     )
+
+
+def _detected_to_message(detected: DetectedImage) -> pb.DetectedImage:
+    height_px, width_px = detected.rgb.shape[:2]
+    boxes = sorted(detected.boxes, key=lambda each: -each.score)[:MAX_BOXES]
+    return pb.DetectedImage(
+        frame_index=detected.index,
+        colour_jpeg=encode_colour(detected.rgb),
+        width_px=width_px,
+        height_px=height_px,
+        boxes=[
+            pb.DetectedBox(
+                phrase=each.phrase,
+                score=each.score,
+                left_px=each.box_px[0],
+                top_px=each.box_px[1],
+                right_px=each.box_px[2],
+                bottom_px=each.box_px[3],
+                is_weak=each.is_weak,
+            )
+            for each in boxes
+        ],
+    )
+
+
+def _detected_from_message(message: pb.DetectedImage) -> DetectedImage:
+    if not 0 < message.width_px * message.height_px <= MAX_IMAGE_PX:
+        size = f"{message.width_px}x{message.height_px}"
+        raise InvalidInputError(f"detected image: expected 1 to {MAX_IMAGE_PX} pixels, got {size}")
+    if len(message.boxes) > MAX_BOXES:
+        raise InvalidInputError(f"detected boxes: expected at most {MAX_BOXES}, got {len(message.boxes)}")
+    boxes = []
+    for each in message.boxes:
+        require_name("detected phrase", each.phrase)
+        box_px = each.left_px, each.top_px, each.right_px, each.bottom_px
+        if not all(math.isfinite(value) for value in (*box_px, each.score)):
+            raise InvalidInputError("detected boxes: expected finite numbers, got others")
+        boxes.append(DetectedBox(each.phrase, each.score, box_px, each.is_weak))
+    rgb = decode_colour(message.colour_jpeg, message.width_px, message.height_px)
+    return DetectedImage(message.frame_index, rgb, tuple(boxes))
 
 
 def _poses(name: str, messages: list[geometry_pb2.RigidTransform]) -> Float64[ndarray, "n 4 4"]:

@@ -63,13 +63,19 @@ def test_delayed_relevance_refers_to_its_keyframe() -> None:
     for frame in frames:
         assert estimator.estimate(frame).delayed is None
     executor.run_next()
-    delayed = estimator.estimate(frame_at(3)).delayed
+    estimate = estimator.estimate(frame_at(3))
+    delayed, detected = estimate.delayed, estimate.detected
     assert delayed is not None
+    assert detected is not None
+    assert (detected.index, detected.rgb is frames[0].rgb, len(detected.boxes)) == (0, True, 1)
     assert delayed.frame is frames[0]
     assert delayed.lag_frames == 3
-    synchronous = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).estimate(frames[0]).relevance
-    np.testing.assert_array_equal(delayed.relevance.target, synchronous.target)
-    assert estimator.estimate(frame_at(4)).delayed is None
+    synchronous = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).estimate(frames[0])
+    np.testing.assert_array_equal(delayed.relevance.target, synchronous.relevance.target)
+    assert synchronous.detected is not None
+    assert synchronous.detected.boxes == detected.boxes
+    estimate = estimator.estimate(frame_at(4))
+    assert estimate.delayed is estimate.detected is None
 
 
 def test_one_detection_runs_at_a_time_and_the_newest_keyframe_is_queued() -> None:

@@ -6,8 +6,9 @@ import numpy as np
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.relevance import DetectedBox, DetectedImage
 from gausslite.domain.voxels import AxisAlignedBox
-from gausslite.view.camera_image import with_objects, with_region
+from gausslite.view.camera_image import with_detections, with_objects, with_region
 
 CAMERA = Camera(100.0, 100.0, 60.0, 50.0, 120, 100)
 GREEN = np.array([60, 230, 90])
@@ -23,6 +24,19 @@ def test_the_region_is_red_and_the_rest_unchanged() -> None:
     tinted = with_region(rgb, roi)
     assert (tinted[~roi] == 100).all()
     assert (tinted[roi][:, 0] > tinted[roi][:, 1]).all()
+
+
+def test_a_detection_is_outlined_and_a_weak_one_is_grey() -> None:
+    boxes = (
+        DetectedBox("mug", 0.9, (10.0, 20.0, 40.0, 60.0)),
+        DetectedBox("mug é", 0.2, (60.0, 20.0, 1e9, 60.0), is_weak=True),
+    )
+    drawn = with_detections(DetectedImage(3, np.zeros((100, 120, 3), np.uint8), boxes))
+    yellow, grey = (drawn == (255, 210, 40)).all(axis=2), (drawn == (150, 150, 150)).all(axis=2)
+    assert yellow[20:61, 10].all()
+    assert yellow[60, 10:41].all()
+    assert grey[20:61, 60].all()
+    assert not yellow[:, 60:].any()
 
 
 def test_an_object_in_front_is_outlined_where_it_projects() -> None:

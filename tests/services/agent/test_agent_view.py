@@ -5,13 +5,18 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from agent_running import TASK, agent
 from browser import open_browser
 from fusion_running import frame
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.region import BallRegion
 from gausslite.evaluation.metrics import psnr
+from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.view.live_page import live_page, own_address
 from gausslite.wire.clients import AgentClient
 
@@ -45,6 +50,32 @@ def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it():
         tab.get_by_text("Newest keyframe").wait_for()
         tab.get_by_role("button", name="End mission").click()
         tab.get_by_text("robot: ended").wait_for()
+
+
+def test_the_newest_detection_is_drawn_over_its_image_in_a_browser():
+    mug = RegionDetector({"mug": BallRegion((0.0, 0.0, 1.2), 0.2)})
+    with (
+        agent(lambda graph: TaskRelevanceEstimator(graph, mug)) as running,
+        open_browser((900, 700)) as browser,
+        live_page(0, running.client.address, is_agent=True) as url,
+    ):
+        running.client.assign_task("Find the mug")
+        next(running.client.ingest([frame(0)]))
+        detected = running.client.camera_view().detected
+        assert (detected.index, [box.phrase for box in detected.boxes]) == (0, ["mug"])
+        tab = browser.new_page()
+        tab.goto(url)
+        tab.get_by_text("Newest detection, frame 0").wait_for()
+        image = tab.locator("img").last
+        image.scroll_into_view_if_needed()
+        for _ in range(240):
+            pixels = cv2.imdecode(np.frombuffer(image.screenshot(), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+            # JPEG at this size blurs the thin lines
+            yellow = pixels[..., 0].astype(int) - pixels[..., 2] > 60
+            if yellow.sum() > 100:
+                break
+            tab.wait_for_timeout(250)
+        assert yellow.sum() > 100
 
 
 def test_a_wrong_task_is_reported_on_the_page():
