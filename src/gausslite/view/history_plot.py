@@ -12,7 +12,6 @@ import numpy as np
 _MAX_POINTS = 600
 _STROKES = ("#2563eb", "#dc2626", "#16a34a", "#d97706", "#7c3aed", "#0891b2")
 _ASPECT = 2.2
-_MARGIN, _LEAST_MARGIN = 0.05, 0.01
 
 
 class HistoryPlot:
@@ -27,6 +26,7 @@ class HistoryPlot:
         self._names = list(names)
         self._colour_of = colour_of
         self._rows: deque[tuple[float, dict[str, float]]] = deque(maxlen=_MAX_POINTS)
+        self._range = (0.0, 0.0)
         self._time_scale = uplot.Scale(time=False, auto=True)
         self._handle = gui.add_uplot(
             # viser refuses a plot without lines
@@ -44,6 +44,8 @@ class HistoryPlot:
 
     def add_named(self, time_s: float, values: Mapping[str, float]) -> None:
         """Add one point of these lines. A line without a value at a time has none before its first one."""
+        from viser import uplot
+
         if not values:
             return
         self._rows.append((time_s, dict(values)))
@@ -51,8 +53,11 @@ class HistoryPlot:
             self._names += new
             self._handle.series = self._series()
         columns = self.columns()
-        # uPlot finds no range of a line that begins later than the others
-        self._handle.scales = {"x": self._time_scale, "y": _scale_of(columns[1:])}
+        # uPlot finds no range of a line that begins later than the others; a new range builds the plot again
+        value_range = _range_of(columns[1:])
+        if value_range != self._range:
+            self._range = value_range
+            self._handle.scales = {"x": self._time_scale, "y": uplot.Scale(auto=False, range=value_range)}
         self._handle.data = columns
         self._handle.visible = True
 
@@ -77,11 +82,11 @@ class HistoryPlot:
         return _STROKES[self._names.index(name) % len(_STROKES)] if name in self._names else _STROKES[0]
 
 
-def _scale_of(lines: Sequence[np.ndarray]) -> Any:
-    """Return a scale that holds all values, with a margin."""
-    from viser import uplot
-
+def _range_of(lines: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return a range that holds all values, and 0 if they are not far from it, in coarse steps: it seldom changes."""
     values = np.concatenate(lines)
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    margin = max(_MARGIN * (high - low), _LEAST_MARGIN * max(abs(low), abs(high)), _LEAST_MARGIN)
-    return uplot.Scale(auto=False, range=(low - margin, high + margin))
+    if 0 < low < 0.5 * high:
+        low = 0.0
+    step = 10.0 ** math.floor(math.log10(max(high - low, 0.1 * abs(high), 1e-3))) / 2
+    return step * math.floor(low / step), step * (math.floor(high / step) + 1)

@@ -8,7 +8,7 @@ import pytest
 from browser import open_browser
 
 pytest.importorskip("viser")
-from gausslite.view.history_plot import HistoryPlot
+from gausslite.view.history_plot import HistoryPlot, _range_of
 from gausslite.view.open_page import open_page
 
 BLUE, RED = (37, 99, 235), (220, 38, 38)
@@ -38,6 +38,20 @@ def test_old_points_are_dropped(page):
     for time_s in range(700):
         plot.add(time_s, [1.0])
     assert plot.columns()[0].tolist() == list(range(100, 700))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([0.0, 0.0], (0.0, 0.0005)),
+        ([3.0, 17.0], (0.0, 20.0)),
+        ([17.2, 19.9], (17.0, 20.0)),
+        ([25.0, 25.0, np.nan], (25.0, 25.5)),
+        ([0.4, 8.4], (0.0, 8.5)),
+    ],
+)
+def test_the_range_holds_all_values_in_coarse_steps(values, expected):
+    assert _range_of([np.array(values)]) == pytest.approx(expected)
 
 
 def test_an_open_browser_draws_lines_that_begin_later(page):
