@@ -11,9 +11,10 @@ from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.config.numbers import Number
 from gausslite.domain.errors import InvalidInputError
 from gausslite.evaluation.views import view_map
-from gausslite.export.formats import FORMATS, ExportSettings, read_map
+from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map
 from gausslite.export.occupancy import OccupancySettings
 from gausslite.mission.results import as_text, prepare_folder, read_report, require_absent
+from gausslite.process.messages import print_message
 
 _MESH_VOXEL_M, _OCCUPANCY_VOXEL_M, _MIN_OPACITY, _VIDEO_S = 0.01, 0.05, 0.3, 12.0
 _FORMATS_OF = {"voxel": ("octomap", "nav2", "mesh"), "min_opacity": ("octomap", "nav2"), "seconds": ("video",)}
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     report = read_report(options.map)
     if options.to == "json" and not report and (options.map / "report.json").exists():
         raise InvalidInputError(f"{options.map}/report.json: expected the report of a run, got something else")
-    content = read_map(options.map, region, report)
+    content = read_map(options.map, region, report, chosen.max_extent_m)
     out = options.out or _default_file(options.map, chosen.suffix)
     _require_separate(out, options.map)
     if not options.overwrite:
@@ -71,13 +72,24 @@ def run(options: argparse.Namespace) -> int:
     seconds = options.seconds or _VIDEO_S
     settings = ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress, seconds)
     chosen.write(out, content, settings)
-    size = out.stat().st_size
-    if options.json:
-        print(as_text({"file": str(out), "format": options.to, "gaussians": len(content.chosen), "bytes": size}))
-    else:
-        part = "of the task's region" if region == "roi" else "of the map"
-        print(f"{len(content.chosen)} Gaussians {part} → {out} ({chosen.summary}, {size / 1e6:.2f} MB)")
+    _report(options, content, out, "of the task's region" if region == "roi" else "of the map")
     return 0
+
+
+def _report(options: argparse.Namespace, content: MapContent, out: Path, part: str) -> None:
+    """Print what was written, and on stderr what was left out."""
+    chosen, size = FORMATS[options.to], out.stat().st_size
+    if content.left_out:
+        total = content.left_out + len(content.gaussians)
+        print_message(
+            f"left out {content.left_out} of {total} Gaussians: expected coordinates and standard deviations up to "
+            f"{chosen.max_extent_m:g} m, got larger ones"
+        )
+    if options.json:
+        counts = {"gaussians": len(content.chosen), "left_out": content.left_out, "bytes": size}
+        print(as_text({"file": str(out), "format": options.to, **counts}))
+    else:
+        print(f"{len(content.chosen)} Gaussians {part} → {out} ({chosen.summary}, {size / 1e6:.2f} MB)")
 
 
 def _require_effect(options: argparse.Namespace) -> None:

@@ -9,30 +9,36 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
 
 from gausslite.codec.files import write_atomic
 from gausslite.codec.keyframe_views import KeyframeView, read_keyframe_views
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.export.mesh import write_mesh
+from gausslite.export.mesh import Render, write_mesh
 from gausslite.export.occupancy import OccupancySettings, write_nav2, write_octomap
 from gausslite.export.point_formats import write_las, write_pcd
-from gausslite.export.splat_formats import write_gltf, write_splat, write_spz
+from gausslite.export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite.export.video import write_video
 
 Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
+MAX_EXTENT_M = 1e5
+"""Limit of the coordinates that the mapper's voxel grid of 0.1 m can hold; a file with larger ones is damaged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapContent:
     """A map and the other content of its results folder; `views` and `report` are empty for a single PLY file.
 
-    gaussians: the whole map. chosen: the Gaussians to write.
+    gaussians: the whole map. chosen: the Gaussians to write, at least one. left_out: how many Gaussians of the file are
+    in neither, because they are too far away or too large.
     """
 
     gaussians: Gaussians
     chosen: Gaussians
+    left_out: int = 0
     world_frame: str = ""
     views: Sequence[KeyframeView] = ()
     report: Mapping[str, object] = field(default_factory=dict)
@@ -57,42 +63,58 @@ class Format:
     """A file format.
 
     suffix: of the written file. summary: one line of the help. region_only: if the user selects nothing, write only the
-    Gaussians of the task's region.
+    Gaussians of the task's region. max_extent_m: the largest coordinate and standard deviation that the format holds.
     """
 
     suffix: str
     summary: str
     write: Callable[[Path, MapContent, ExportSettings], None]
     region_only: bool = False
+    max_extent_m: float = MAX_EXTENT_M
 
 
-def read_map(path: Path, region: str, report: Mapping[str, object] = MappingProxyType({})) -> MapContent:
+def read_map(
+    path: Path,
+    region: str,
+    report: Mapping[str, object] = MappingProxyType({}),
+    max_extent_m: float = MAX_EXTENT_M,
+) -> MapContent:
     """Read a results folder or a PLY file.
 
     region: `roi` chooses the Gaussians of the task's region, `all` all. report: the content of the results folder's
-    report.json. Raises MapFileError; InvalidInputError if the region is asked for and the map has none.
+    report.json. Gaussians with a coordinate or a standard deviation above max_extent_m are left out. Raises
+    MapFileError; InvalidInputError if nothing is left to write.
     """
     folder, file = (path, path / "map.ply") if path.is_dir() else (None, path)
     if not file.is_file():
         raise MapFileError(f"{path}: expected a results folder with map.ply, or a PLY file, got neither")
-    gaussians = read_ply(file)
+    stored = read_ply(file)
+    if not len(stored):
+        raise InvalidInputError(f"{path}: expected a map with at least one Gaussian, got an empty map")
+    gaussians = stored.take(_largest_extent_m(stored) <= max_extent_m)
+    if not len(gaussians):
+        raise InvalidInputError(f"{path}: expected Gaussians within {max_extent_m:g} m of the origin, got none")
     chosen = gaussians if region == "all" else gaussians.take(gaussians.active)
-    if not len(chosen) and len(gaussians):
+    if not len(chosen):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
-    return MapContent(gaussians, chosen, read_world_frame(file), views, report)
+    return MapContent(gaussians, chosen, len(stored) - len(gaussians), read_world_frame(file), views, report)
+
+
+def _largest_extent_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
+    """Return the largest absolute coordinate or standard deviation of each Gaussian."""
+    return np.concatenate([np.abs(gaussians.means_m), gaussians.scales_m], axis=1).max(axis=1)
 
 
 def _objects(path: Path, content: MapContent, _settings: ExportSettings) -> None:
     """Write the objects that the mission confirmed, and the extent of the chosen Gaussians, as JSON."""
     means_m = content.chosen.means_m
-    bounds = [] if not len(means_m) else np.stack([means_m.min(axis=0), means_m.max(axis=0)]).tolist()
     content_of_map = {
         "world_frame": content.world_frame,
         "task": content.report.get("task"),
         "objects": content.report.get("objects", []),
         "gaussians": len(content.chosen),
-        "bounds_m": bounds,
+        "bounds_m": np.stack([means_m.min(axis=0), means_m.max(axis=0)]).tolist(),
     }
     write_atomic(path, (json.dumps(content_of_map, indent=2, ensure_ascii=False) + "\n").encode())
 
@@ -111,7 +133,12 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
         "ply": Format(
             ".ply", "3D Gaussian splatting PLY", lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame)
         ),
-        "spz": Format(".spz", "compressed splats (SPZ)", lambda path, map_, _: write_spz(path, map_.chosen)),
+        "spz": Format(
+            ".spz",
+            "compressed splats (SPZ)",
+            lambda path, map_, _: write_spz(path, map_.chosen),
+            max_extent_m=MAX_SPZ_COORDINATE_M,
+        ),
         "splat": Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen)),
         "gltf": Format(".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen)),
         "pcd": Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,7 +66,7 @@ class TsdfVolume:
     colours: Float32[ndarray, "n 3"] = field(init=False)
 
     def __post_init__(self) -> None:
-        count = int(np.prod(self.shape))
+        count = math.prod(self.shape)
         if count > _MAX_VOXELS:
             raise InvalidInputError(f"mesh: expected at most {_MAX_VOXELS} voxels, got {count}; use a larger --voxel")
         self.distances = np.ones(count, np.float32)
@@ -130,8 +131,8 @@ def write_mesh(
     surface or without the scikit-image package, StorageError.
     """
     measure = import_extra("skimage.measure", "export", "meshes")
-    if not views or not len(gaussians):
-        raise InvalidInputError("mesh: expected a results folder with keyframes.json and a map that is not empty")
+    if not views:
+        raise InvalidInputError("mesh: expected a results folder with keyframes.json, got none")
     volume = _volume_around(gaussians, voxel_m)
     for view in progress(views):
         volume.integrate(view, render(view.camera, view.T_world_camera))

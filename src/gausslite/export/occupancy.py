@@ -22,7 +22,10 @@ from gausslite.export.packages import import_extra
 
 _EXTENT_SIGMAS = 1.5
 _MAX_SAMPLES_PER_AXIS = 33
+_MAX_SAMPLES = 1 << 28
 _MAX_GRID_CELLS = 1 << 26
+_MAX_OCTOMAP_KEY = 1 << 15
+"""OctoMap keys are 16-bit integers with the origin in the middle."""
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 """Grey values of nav2's trinary map images."""
 _FLOOR_PERCENTILE = 2.0
@@ -44,7 +47,8 @@ class OccupancySettings:
 def occupied_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[ndarray, "v 3"]:
     """Return the indices floor(p / voxel_m) of all voxels that an ellipsoid of 1.5 standard deviations touches.
 
-    Each ellipsoid is sampled in steps of half a voxel, at most 33 per axis. The result is sorted and unique.
+    Each ellipsoid is sampled in steps of half a voxel, at most 33 per axis. The result is sorted and unique. Raises
+    InvalidInputError, before memory is taken, if all ellipsoids together have more than 2^28 samples.
     """
     chosen = gaussians.take(gaussians.opacities >= settings.min_opacity)
     if not len(chosen):
@@ -52,6 +56,12 @@ def occupied_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[
     axes = _rotation_matrices(chosen.quats_wxyz) * (_EXTENT_SIGMAS * chosen.scales_m[:, None, :])
     steps = np.ceil(2 * _EXTENT_SIGMAS * chosen.scales_m / (settings.voxel_m / 2)).astype(np.int64)
     counts = np.clip(steps + 1 - steps % 2, 1, _MAX_SAMPLES_PER_AXIS)  # odd, so that the centre is a sample
+    samples = int(counts.prod(axis=1).sum())
+    if samples > _MAX_SAMPLES:
+        raise InvalidInputError(
+            f"--voxel {settings.voxel_m:g}: expected at most {_MAX_SAMPLES} samples of the Gaussians, got {samples}; "
+            "use larger voxels"
+        )
     found = []
     for count in np.unique(counts, axis=0):  # all Gaussians with the same numbers of samples at once
         rows = np.flatnonzero((counts == count).all(axis=1))
@@ -65,11 +75,19 @@ def occupied_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[
 def write_octomap(path: Path, gaussians: Gaussians, settings: OccupancySettings) -> None:
     """Write an OctoMap binary tree (.bt) of the occupied voxels; all other space is unknown.
 
-    Raises InvalidInputError without the pyoctomap package, StorageError.
+    Raises InvalidInputError without the pyoctomap package, without an occupied voxel or if the map reaches beyond
+    OctoMap's keys; StorageError.
     """
     octomap = import_extra("pyoctomap", "export", "OctoMap files")
+    voxels = _require_voxels(gaussians, settings)
+    reach = int(np.maximum(-voxels.min(), voxels.max() + 1))
+    if reach > _MAX_OCTOMAP_KEY:
+        raise InvalidInputError(
+            f"octomap: expected a map within {_MAX_OCTOMAP_KEY * settings.voxel_m:g} m of the origin with --voxel "
+            f"{settings.voxel_m:g}, got one up to {reach * settings.voxel_m:g} m; use larger voxels"
+        )
     tree = octomap.OcTree(settings.voxel_m)
-    for centre_m in (occupied_voxels(gaussians, settings) + 0.5) * settings.voxel_m:
+    for centre_m in (voxels + 0.5) * settings.voxel_m:
         tree.updateNode(centre_m, True, True)
     tree.updateInnerOccupancy()
 
@@ -85,9 +103,9 @@ def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) ->
     """Write a nav2 map: `path` is the YAML file, the image next to it has the suffix .pgm.
 
     The grid lies in x and y, so the map's z axis must point up. The floor is at the 2nd percentile of the occupied
-    heights. Raises InvalidInputError if the grid is too large, StorageError.
+    heights. Raises InvalidInputError without an occupied voxel or if the grid is too large, StorageError.
     """
-    image, origin_m = _grid(occupied_voxels(gaussians, settings), settings)
+    image, origin_m = _grid(_require_voxels(gaussians, settings), settings)
     encoded, data = cv2.imencode(".pgm", image)
     if not encoded:
         raise InvalidInputError(f"nav2: expected an image that OpenCV can encode, got {image.shape}")
@@ -105,12 +123,21 @@ def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) ->
     write_atomic(path, yaml.safe_dump(description, sort_keys=False).encode())
 
 
+def _require_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[ndarray, "v 3"]:
+    """Return the occupied voxels, at least one. Raises InvalidInputError."""
+    voxels = occupied_voxels(gaussians, settings)
+    if not len(voxels):
+        raise InvalidInputError(
+            f"--min-opacity {settings.min_opacity:g}: expected an opacity that some Gaussian has, "
+            f"got at most {gaussians.opacities.max():.2f}"
+        )
+    return voxels
+
+
 def _grid(
     voxels: Int64[ndarray, "v 3"], settings: OccupancySettings
 ) -> tuple[UInt8[ndarray, "h w"], Float64[ndarray, "2"]]:
     """Return the grid image, its first row at the largest y, and the position of its lower left corner in metres."""
-    if not len(voxels):
-        return np.full((1, 1), _UNKNOWN, np.uint8), np.zeros(2)
     first, last = voxels.min(axis=0), voxels.max(axis=0)
     width, height = (int(n) for n in (last - first + 1)[:2])
     if width * height > _MAX_GRID_CELLS:

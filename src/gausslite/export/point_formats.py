@@ -14,7 +14,7 @@ _PCD_ROW = np.dtype(
     [("mean_m", "<f4", 3), ("bgra", "u1", 4), ("opacity", "<f4"), ("kappa", "<u4"), ("target", "<i2"), ("active", "u1")]
 )
 _LAS_STEP_M = 1e-4
-"""Resolution of LAS coordinates, which are 32-bit integers: 0.1 mm covers 214 km."""
+"""Resolution of LAS coordinates, which are 32-bit integers: 0.1 mm covers the 200 km of `formats.MAX_EXTENT_M`."""
 
 
 def write_pcd(path: Path, gaussians: Gaussians) -> None:
@@ -47,7 +47,7 @@ def write_las(path: Path, gaussians: Gaussians) -> None:
     laspy = import_extra("laspy", "export", "LAS files")
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.scales = np.full(3, _LAS_STEP_M)
-    header.offsets = np.floor(gaussians.means_m.min(axis=0)) if len(gaussians) else np.zeros(3)
+    header.offsets = np.floor(gaussians.means_m.min(axis=0))
     header.add_extra_dims([laspy.ExtraBytesParams("kappa", np.uint32), laspy.ExtraBytesParams("target", np.int16)])
     points = laspy.LasData(header)
     points.xyz = gaussians.means_m.astype(np.float64)

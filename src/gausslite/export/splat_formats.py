@@ -16,14 +16,17 @@ from numpy import ndarray
 from gausslite.codec.files import write_atomic, write_atomic_with
 from gausslite.codec.ply import SH_C0
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.srgb import linear_light
 from gausslite.export.packages import import_extra
 
 _SPLAT_ROW = np.dtype([("mean_m", "<f4", 3), ("scale_m", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 _OPACITY_EDGE = 1e-6
 _TURN_ABOUT_X = np.array([1, -1, -1], np.float32)
 """Signs of x, y, z after a turn by 180 degrees about x; also of a quaternion's x, y, z when the axes turn so."""
+MAX_SPZ_COORDINATE_M = 2047.0
+"""SPZ positions are 24-bit integers with 12 fractional bits."""
 _GLB_MAGIC, _GLB_VERSION, _GLB_JSON, _GLB_BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
-_FLOAT, _POINTS = 5126, 0
+_FLOAT, _POINTS, _ARRAY_BUFFER = 5126, 0, 34962
 _Z_UP_TO_Y_UP_XYZW = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
 """The rotation that a glTF node applies to a map whose z axis points up; glTF's y axis points up."""
 
@@ -63,12 +66,12 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
 
 
 def write_gltf(path: Path, gaussians: Gaussians) -> None:
-    """Write a binary glTF file (.glb): points with the extension KHR_gaussian_splatting.
+    """Write a binary glTF file (.glb): points with the extension KHR_gaussian_splatting, release candidate.
 
-    Scales are metres and opacities linear. COLOR_0 lets viewers without the extension show coloured points. Raises
-    StorageError.
+    Scales are metres and opacities linear. COLOR_0 lets viewers without the extension show coloured points; glTF
+    defines its colours as linear light, so the map's sRGB colours are decoded. Raises StorageError.
     """
-    colours = np.concatenate([np.clip(gaussians.rgb, 0, 1), gaussians.opacities[:, None]], axis=1)
+    colours = np.concatenate([linear_light(np.clip(gaussians.rgb, 0, 1)), gaussians.opacities[:, None]], axis=1)
     columns = {
         "POSITION": gaussians.means_m,
         "COLOR_0": colours,
@@ -82,14 +85,10 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
 
 def _glb(columns: dict[str, Float32[ndarray, "n *k"]], count: int) -> bytes:
     """Return a GLB container: header, JSON chunk, binary chunk with one buffer view per column."""
-    if not count:
-        scene = {"asset": _asset(), "scene": 0, "scenes": [{"nodes": []}]}
-        text = _padded(json.dumps(scene).encode(), b" ")
-        return struct.pack("<IIIII", _GLB_MAGIC, _GLB_VERSION, 20 + len(text), len(text), _GLB_JSON) + text
     views, accessors, chunks, offset = [], [], [], 0
     for name, values in columns.items():
         data = np.ascontiguousarray(values, "<f4").tobytes()
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data)})
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": _ARRAY_BUFFER})
         kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
         accessor = {"bufferView": len(views) - 1, "componentType": _FLOAT, "count": count, "type": kind}
         if name == "POSITION":  # glTF requires the bounds of positions
@@ -114,20 +113,21 @@ def _glb(columns: dict[str, Float32[ndarray, "n *k"]], count: int) -> bytes:
 
 
 def _gltf_scene(attributes: dict[str, int]) -> dict[str, object]:
-    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
     primitive = {"mode": _POINTS, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": extension}}
     return {
-        "asset": _asset(),
+        "asset": {"version": "2.0", "generator": "GaussLite"},
         "extensionsUsed": ["KHR_gaussian_splatting"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "rotation": [float(value) for value in _Z_UP_TO_Y_UP_XYZW]}],
         "meshes": [{"primitives": [primitive]}],
     }
-
-
-def _asset() -> dict[str, str]:
-    return {"version": "2.0", "generator": "GaussLite"}
 
 
 def _padded(data: bytes, fill: bytes) -> bytes:

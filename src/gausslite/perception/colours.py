@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from numpy import ndarray
 
+from gausslite.domain.srgb import linear_light
+
 BASIC_TERMS: Final = ("black", "grey", "white", "red", "orange", "yellow", "green", "blue", "purple", "pink", "brown")
 
 # other words, by the terms that they may mean
@@ -190,8 +192,7 @@ def _oklab(
     rgb: Float64[ndarray, "n 3"],
 ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"], Float64[ndarray, " n"]]:
     """Return lightness, hue in degrees from -20 to 340, and saturation: the ratio of chroma to lightness."""
-    encoded = np.minimum(rgb / 255.0, 1.0)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    linear = linear_light(np.minimum(rgb / 255.0, 1.0))
     lightness, a, b = (np.cbrt(linear @ _CONES_OF_RGB.T) @ _OKLAB_OF_CONES.T).T
     hue_deg = (np.degrees(np.arctan2(b, a)) + 20.0) % 360.0 - 20.0
     return lightness, hue_deg, np.hypot(a, b) / np.maximum(lightness, 1e-6)

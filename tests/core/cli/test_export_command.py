@@ -3,10 +3,14 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 from gausslite.cli.main import main
 from gausslite.codec.keyframe_views import read_keyframe_views
+from gausslite.codec.ply import read_ply, write_ply
+from gausslite.domain.gaussians import Gaussians
+from gausslite.export.formats import FORMATS
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +34,76 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["ply", "spz", "splat", "gltf", "pcd", "las", "octomap", "nav2", "mesh", "video", "json"]
-)
+ALL_FORMATS = tuple(FORMATS)
+
+
+def run_with_map(results, folder, gaussians):
+    """Write a results folder with this map and the keyframes of a real run."""
+    folder.mkdir()
+    for name in ("keyframes.json", "report.json"):
+        shutil.copy(results / name, folder)
+    write_ply(folder / "map.ply", gaussians)
+    return folder
+
+
+@pytest.mark.parametrize("name", ALL_FORMATS)
+def test_an_empty_map_is_refused_by_every_format(results, tmp_path, name, capsys):
+    run = run_with_map(results, tmp_path / "empty", Gaussians.empty())
+    assert main(["export", str(run), "--to", name]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "expected a map with at least one Gaussian, got an empty map" in line
+    assert {file.name for file in run.iterdir()} == {"map.ply", "keyframes.json", "report.json"}
+
+
+@pytest.mark.parametrize("name", ALL_FORMATS)
+def test_a_mean_that_is_nan_is_refused_by_every_format(results, tmp_path, name, capsys):
+    gaussians = read_ply(results / "map.ply")
+    gaussians.means_m[3, 1] = np.nan
+    run = run_with_map(results, tmp_path / "nan", gaussians)
+    assert main(["export", str(run), "--to", name, "--region", "all"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "column y: expected finite values" in line
+
+
+@pytest.mark.parametrize("column", ["means_m", "scales_m"])
+@pytest.mark.parametrize("name", ALL_FORMATS)
+def test_a_gaussian_far_outside_is_left_out_with_one_line(results, tmp_path, name, column, capsys):
+    gaussians = read_ply(results / "map.ply")
+    getattr(gaussians, column)[3, 1] = 1e30
+    run = run_with_map(results, tmp_path / "far", gaussians)
+    assert main(["export", str(run), "--to", name, "--region", "all", "--json", *OPTIONS.get(name, ())]) == 0
+    captured = capsys.readouterr()
+    report = json.loads(captured.out)
+    assert (report["gaussians"], report["left_out"]) == (len(gaussians) - 1, 1)
+    notes = [line for line in captured.err.splitlines() if "left out" in line]
+    assert notes == [
+        f"left out 1 of {len(gaussians)} Gaussians: expected coordinates and standard deviations up to "
+        f"{FORMATS[name].max_extent_m:g} m, got larger ones"
+    ]
+
+
+def test_a_map_that_is_far_outside_as_a_whole_is_refused(results, tmp_path, capsys):
+    gaussians = read_ply(results / "map.ply")
+    gaussians.means_m[:] = 1e30
+    run = run_with_map(results, tmp_path / "far", gaussians)
+    assert main(["export", str(run), "--to", "nav2"]) == 2
+    assert "expected Gaussians within 100000 m of the origin, got none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ALL_FORMATS)
+def test_one_gaussian_is_exported_unless_it_has_no_surface(results, tmp_path, name, capsys):
+    gaussians = read_ply(results / "map.ply")
+    run = run_with_map(results, tmp_path / "one", gaussians.take(np.flatnonzero(gaussians.opacities > 0.5)[:1]))
+    code = main(["export", str(run), "--to", name, "--region", "all", *OPTIONS.get(name, ())])
+    captured = capsys.readouterr()
+    if name == "mesh":
+        assert (code, captured.out) == (2, "")
+        assert "mesh: expected a surface that the keyframes show" in captured.err
+    else:
+        assert (code, captured.out[:13]) == (0, "1 Gaussians o")
+
+
+@pytest.mark.parametrize("name", ALL_FORMATS)
 def test_every_format_writes_its_default_file(results, name, capsys):
     command = ["export", str(results), "--to", name, "--region", "all", *OPTIONS.get(name, ())]
     assert main([*command, "--json"]) == 0

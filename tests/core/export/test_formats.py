@@ -46,7 +46,8 @@ def export(tmp_path: Path, name: str, gaussians: Gaussians, region: str = "all",
     source = tmp_path / "map.ply"
     write_ply(source, gaussians)
     out = tmp_path / f"out{FORMATS[name].suffix}"
-    FORMATS[name].write(out, read_map(source, region), ExportSettings(no_rendering, OccupancySettings(voxel_m=voxel_m)))
+    content = read_map(source, region, max_extent_m=FORMATS[name].max_extent_m)
+    FORMATS[name].write(out, content, ExportSettings(no_rendering, OccupancySettings(voxel_m=voxel_m)))
     return out
 
 
@@ -92,8 +93,6 @@ def read_glb(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     assert kind == 0x4E4F534A
     assert length % 4 == 0
     scene = json.loads(raw[20 : 20 + length])
-    if len(raw) == 20 + length:
-        return scene, {}
     binary = raw[28 + length :]
     columns = {}
     for name, index in scene["meshes"][0]["primitives"][0]["attributes"].items():
@@ -111,7 +110,12 @@ def test_gltf_has_the_extensions_attributes_and_units(tmp_path):
     primitive = scene["meshes"][0]["primitives"][0]
     assert scene["extensionsUsed"] == ["KHR_gaussian_splatting"]
     assert primitive["mode"] == 0
-    assert primitive["extensions"]["KHR_gaussian_splatting"]["kernel"] == "ellipse"
+    assert primitive["extensions"]["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
     np.testing.assert_allclose(columns["POSITION"], gaussians.means_m)
     np.testing.assert_allclose(columns["KHR_gaussian_splatting:SCALE"], gaussians.scales_m, rtol=1e-5)
     np.testing.assert_allclose(columns["KHR_gaussian_splatting:OPACITY"][:, 0], gaussians.opacities, atol=1e-6)
@@ -123,10 +127,11 @@ def test_gltf_has_the_extensions_attributes_and_units(tmp_path):
     np.testing.assert_allclose(scene["accessors"][0]["min"], gaussians.means_m.min(axis=0))
 
 
-def test_an_empty_map_is_a_valid_glb_without_accessors(tmp_path):
-    scene, columns = read_glb(export(tmp_path, "gltf", Gaussians.empty()))
-    assert scene["scenes"] == [{"nodes": []}]
-    assert not columns
+def test_gltf_point_colours_are_linear_light_as_gltf_defines_them(tmp_path):
+    grey = dataclasses.replace(random_map(), rgb=np.full((COUNT, 3), 0.5, np.float32))
+    _, columns = read_glb(export(tmp_path, "gltf", grey))
+    np.testing.assert_allclose(columns["COLOR_0"][:, :3], 0.21404, atol=1e-5)
+    np.testing.assert_allclose(columns["COLOR_0"][:, 3], grey.opacities, atol=1e-6)
 
 
 def test_pcd_rows_follow_the_header(tmp_path):
@@ -189,6 +194,39 @@ def test_occupied_voxels_cover_the_ellipsoid_of_a_long_gaussian():
 
 def test_faint_gaussians_occupy_nothing():
     assert len(occupied_voxels(plate(0), OccupancySettings(min_opacity=0.95))) == 0
+
+
+@pytest.mark.parametrize("name", ["octomap", "nav2"])
+def test_a_map_that_is_too_faint_to_occupy_a_voxel_is_refused(tmp_path, name):
+    faint = dataclasses.replace(plate(0.5), opacities=np.full(len(plate(0.5)), 0.1, np.float32))
+    with pytest.raises(InvalidInputError, match=r"--min-opacity 0\.3: expected an opacity .* at most 0\.10"):
+        export(tmp_path, name, faint)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("octomap", "octomap: expected a map within 1638"), ("nav2", "nav2: expected at most 67108864 cells")],
+)
+def test_a_map_beyond_the_grid_is_refused_before_memory_is_taken(tmp_path, name, message):
+    room = plate(0.5)
+    means_m = room.means_m.copy()
+    means_m[[0, 1], [0, 1]] = 5000
+    with pytest.raises(InvalidInputError, match=message):
+        export(tmp_path, name, dataclasses.replace(room, means_m=means_m))
+
+
+def test_too_many_samples_of_large_gaussians_are_refused(tmp_path):
+    large = dataclasses.replace(plate(0.5, size_m=4), scales_m=np.full((40_000, 3), 2, np.float32))
+    with pytest.raises(InvalidInputError, match=r"--voxel 0\.05: expected at most 268435456 samples"):
+        export(tmp_path, "octomap", large)
+
+
+def test_spz_leaves_out_what_its_integers_cannot_hold(tmp_path):
+    gaussians = random_map()
+    gaussians.means_m[7, 1] = -2100
+    data = gsply.read_spz(str(export(tmp_path, "spz", gaussians)))
+    assert len(data.means) == COUNT - 1
+    np.testing.assert_allclose(data.means * [1, -1, -1], np.delete(gaussians.means_m, 7, axis=0), atol=1e-3)
 
 
 def test_octomap_marks_the_surface_and_nothing_else(tmp_path):
