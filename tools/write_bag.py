@@ -22,8 +22,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gausslite.datasets.intrinsics import read_folder_camera
+from gausslite.datasets.images import first_readable_size
 from gausslite.datasets.text_files import read_rows
+from gausslite.datasets.tum import read_tum_camera
+from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.lens import Lens
 
 COLOUR_FRAME, WORLD_FRAME = "camera_color_optical_frame", "odom"
@@ -153,16 +155,14 @@ class TumFolder:
 
     @classmethod
     def read(cls, folder: Path) -> TumFolder:
-        """Read a folder with a camera file, such as cam_params.json."""
+        """Read a folder with a camera file, or one named after fr1, fr2 or fr3. Raises DatasetError."""
         images = {
             kind: [(_nanoseconds(fields[0]), folder / fields[1]) for _, fields in read_rows(folder / f"{kind}.txt")]
             for kind in ("rgb", "depth")
         }
         rows = [fields for _, fields in read_rows(folder / "groundtruth.txt")]
         poses = [(_nanoseconds(fields[0]), [float(value) for value in fields[1:]]) for fields in rows]
-        found = read_folder_camera(folder, 0, 0)
-        if found is None:
-            raise SystemExit(f"{folder}: expected a camera file such as cam_params.json, got none")
+        found = read_tum_camera(folder, *first_readable_size(path for _, path in images["rgb"]))
         camera = found.camera
         intrinsics = camera.fx_px, camera.fy_px, camera.cx_px - 0.5, camera.cy_px - 0.5
         units = found.units_per_metre or _TUM_UNITS_PER_METRE
@@ -231,11 +231,14 @@ def _nanoseconds(seconds: str) -> int:
 def main() -> None:
     """Convert the folder of the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, help="a sequence in TUM layout with a camera file")
+    parser.add_argument("folder", type=Path, help="a sequence in TUM layout")
     parser.add_argument("bag", type=Path, help="NAME.bag (ROS 1), NAME.mcap or the folder NAME (ROS 2)")
     parser.add_argument("--compressed", action="store_true", help="compressed images instead of raw ones")
     options = parser.parse_args()
-    write_tum_bag(options.folder, options.bag, options.compressed)
+    try:
+        write_tum_bag(options.folder, options.bag, options.compressed)
+    except GaussLiteError as error:
+        raise SystemExit(str(error)) from None
 
 
 if __name__ == "__main__":

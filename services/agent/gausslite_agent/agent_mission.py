@@ -157,6 +157,19 @@ class AgentMission:
         if self._state_machine.state is not MissionState.WAITING_FOR_TASK:
             self._end(self.end_by_options, None)
 
+    def describe_lost_data(self) -> str:
+        """Return what is lost when the process ends now, because no file keeps it; empty if nothing is."""
+        uplink = self._worker.uplink
+        if uplink is None or self._settings.link.spool is not None:
+            return ""
+        left = uplink.counters()
+        if not (left.voxels_waiting or left.keyframes_waiting):
+            return ""
+        return (
+            f"lost {left.voxels_waiting} voxels and {left.keyframes_waiting} keyframes that were not sent; "
+            "--spool FILE keeps them until the next start"
+        )
+
     def save(self) -> float:
         """Save the mission after the current frame if there is a file for it; returns the seconds that it took.
 

@@ -29,22 +29,25 @@ class WaitingParser:
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """End the wait: an open call is cancelled, and `parse` raises its last error."""
+        """End the wait: an open call is cancelled, and `parse` raises UnavailableError with the last error before."""
         self._stopping.set()
         self._cancel()
 
     def parse(self, text: str) -> TaskGraph:
         """Return the graph of a task. Raises TaskError; UnavailableError after the timeout or `stop`."""
         deadline_s = time.monotonic() + self._timeout_s
-        reported = False
+        last_error: UnavailableError | None = None
         while True:
             try:
                 return self._parser.parse(text)
             except UnavailableError as error:
-                if self._stopping.is_set() or time.monotonic() >= deadline_s:
-                    raise
-                if not reported:
-                    _log.warning("%s; retrying for %.0f s", error, self._timeout_s)
-                    reported = True
+                if not self._stopping.is_set():
+                    if time.monotonic() >= deadline_s:
+                        raise
+                    if last_error is None:
+                        _log.warning("%s; retrying for %.0f s", error, self._timeout_s)
+                    last_error = error
+                # the error of a call that `stop` cancels says nothing about the service
                 if self._stopping.wait(_RETRY_S):
-                    raise
+                    waited = "stopped while waiting for the parser service"
+                    raise UnavailableError(waited if last_error is None else f"{waited}: {last_error}") from None

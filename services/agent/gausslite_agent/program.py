@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
+from gausslite.config.options_without_effect import NO_TEAM_MAP
 from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.frame_stream import FrameStream, region_file_note
@@ -31,17 +32,20 @@ from gausslite_agent.mission_checkpoint import SavedMission
 from gausslite_agent.parser_wait import WaitingParser
 from gausslite_agent.periodic_save import PeriodicSave
 from gausslite_agent.servicer import AgentServicer
-from gausslite_agent.settings import NO_TEAM_MAP, AgentSettings, ConnectionSettings, parse_arguments
+from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_arguments
 from gausslite_agent.team_map import TeamMapFollower
 
 _log = logging.getLogger(__name__)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the agent and return its exit code: 0, or 2 with one line on stderr for an error the operator can fix."""
+    """Run the agent and return its exit code.
 
-    async def serve() -> None:
-        await _serve(parse_arguments(arguments))
+    1 if data that no --spool keeps was not sent, 2 with one line on stderr for an error the operator can fix, else 0.
+    """
+
+    async def serve() -> int:
+        return await _serve(parse_arguments(arguments))
 
     return run_service("gausslite-agent", serve)
 
@@ -67,8 +71,8 @@ class _Mission:
         self.first_parser.stop()
 
 
-async def _serve(settings: AgentSettings) -> None:
-    """Build the agent, serve it and run its mission; close in reverse order."""
+async def _serve(settings: AgentSettings) -> int:
+    """Build the agent, serve it and run its mission; close in reverse order. Returns the exit code."""
     _require_usable(settings)
     stream = None if settings.source is None else FrameStream.open(settings.source)
     saved = _read_saved(settings)
@@ -102,6 +106,10 @@ async def _serve(settings: AgentSettings) -> None:
         stack.enter_context(own_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
         run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
+        lost = mission.describe_lost_data()
+        if lost:
+            _log.error("%s", lost)
+        return 1 if lost else 0
 
 
 def _require_usable(settings: AgentSettings) -> None:

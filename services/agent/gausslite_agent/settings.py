@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gausslite.config.command_parser import CommandParser
 from gausslite.config.default_addresses import AGENT_ADDRESS
 from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import (
@@ -20,7 +21,7 @@ from gausslite.config.mapping_options import (
     perception_settings,
 )
 from gausslite.config.numbers import Number
-from gausslite.config.options_without_effect import require_effect
+from gausslite.config.options_without_effect import NO_TEAM_MAP, require_effect, require_fusion_server
 from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
@@ -40,7 +41,6 @@ from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.load import LoadSettings, QueuePolicy
 from gausslite_agent.mission_end import MAX_DRAIN_S
 
-NO_TEAM_MAP = "none"
 _KEYFRAMES = 64
 _MAX_KEYFRAMES = 10_000
 _IDLE_ITERATIONS = 64
@@ -120,6 +120,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         raise InvalidInputError("--task: expected a task for the source, got none")
     _require_valid(options)
     require_effect(options)
+    require_fusion_server(options)
     source = None
     if options.source is not None:
         source = SourceSettings(
@@ -206,7 +207,7 @@ def _require_valid(options: argparse.Namespace) -> None:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of `gausslite-agent`, without the options of configuration files."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="gausslite-agent",
         description="Map the region of interest (ROI) of a task online, and send it to a fusion server. With --source "
         "the agent replays a sequence; otherwise it receives frames by the IngestFrames call.",

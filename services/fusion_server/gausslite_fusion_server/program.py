@@ -45,11 +45,12 @@ def run(arguments: Sequence[str] | None = None) -> int:
     if given and given[0] in MAINTENANCE_COMMANDS:
         return run_command(given)
 
-    async def serve() -> None:
+    async def serve() -> int:
         settings = parse_arguments(arguments)
         if settings.log_format is LogFormat.JSON:
             log_to_stderr(PROGRAM, LogFormat.JSON)
         await _serve(settings)
+        return 0
 
     return run_service(PROGRAM, serve)
 

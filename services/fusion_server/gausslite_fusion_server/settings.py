@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gausslite.config.command_parser import CommandParser
 from gausslite.config.default_addresses import FUSION_ADDRESS
 from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
@@ -162,7 +163,7 @@ def _require_one_mission(options: argparse.Namespace) -> None:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of `gausslite-fusion-server`, without the options of configuration files."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog=PROGRAM,
         description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "
         "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins.",
@@ -266,7 +267,7 @@ def build_parser_with_commands() -> argparse.ArgumentParser:
 
 
 def _maintenance_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=PROGRAM, description="Maintain the file of a store.")
+    parser = CommandParser(prog=PROGRAM, description="Maintain the file of a store.")
     _add_maintenance_commands(parser, required=True)
     return parser
 

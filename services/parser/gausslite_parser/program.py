@@ -23,8 +23,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
         print_message(f"gausslite-parser: {error}")
         return 2
 
-    async def serve() -> None:
+    async def serve() -> int:
         with tracing(settings.traces, "gausslite-parser"):
             await serve_until_stopped(settings.listen, [parser_service(parser)], tls=settings.tls)
+        return 0
 
     return run_service("gausslite-parser", serve)

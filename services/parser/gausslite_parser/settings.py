@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from gausslite.config.command_parser import CommandParser
 from gausslite.config.default_addresses import PARSER_ADDRESS
 from gausslite.config.layers import parse_options
 from gausslite.config.task_parser_options import add_backend, backend_settings
@@ -40,7 +41,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of `gausslite-parser`, without the options of configuration files."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="gausslite-parser", description="Serve gausslite.v1.ParserService: parse task texts into task graphs."
     )
     parser.add_argument(

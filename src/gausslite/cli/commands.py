@@ -6,6 +6,8 @@ import argparse
 import importlib
 from collections.abc import Collection
 
+from gausslite.config.command_parser import CommandParser
+
 SUMMARIES = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",
     "demo": "run a task parser, a fusion server and two agents as processes; fuse and score their maps",
@@ -46,9 +48,7 @@ class _PrintVersion(argparse.Action):
 
 def build_parser(configured: Collection[str] = tuple(SUMMARIES)) -> argparse.ArgumentParser:
     """Return the parser of `gausslite`. configured: commands that get their options; each imports its module."""
-    parser = argparse.ArgumentParser(
-        prog="gausslite", description="Online 3D Gaussian maps that spend their detail on a task."
-    )
+    parser = CommandParser(prog="gausslite", description="Online 3D Gaussian maps that spend their detail on a task.")
     parser.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, summary in SUMMARIES.items():

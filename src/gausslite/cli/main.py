@@ -47,11 +47,16 @@ def _dispatch(arguments: list[str]) -> int:
 
 def _parse(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:
     """Return the options of the chosen command, which may also come from a file and from the environment."""
-    if not arguments or arguments[0] not in _CONFIGURABLE:
-        return parser.parse_args(arguments)
-    from gausslite.config.layers import parse_options
+    if arguments and arguments[0] in _CONFIGURABLE:
+        from gausslite.config.layers import parse_options
 
-    return parse_options(parser, arguments, warn=print_message)
+        return parse_options(parser, arguments, warn=print_message)
+    options = parser.parse_args(arguments)
+    from gausslite.config.environment import describe_unknown_variables
+
+    for message in describe_unknown_variables((), os.environ, getattr(options, "llm_key_variable", None)):
+        print_message(f"gausslite: {message}")
+    return options
 
 
 def _fail(message: str) -> int:

@@ -222,13 +222,19 @@ class _Run:
     def print_results(self, result: MissionResult) -> None:
         """Print the figures and the notes of a complete run."""
         totals, report = result.totals, self._report
-        counts = ((totals.skipped, "without depth"), (self._corrupt.count, "corrupt"))
+        counts = (
+            (totals.skipped - totals.lost, "without depth"),
+            (totals.lost, "lost by tracking"),
+            (self._corrupt.count, "corrupt"),
+        )
         skipped = ", ".join(f"{count} {reason}" for count, reason in counts if count)
         print(
             f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
             f"{len(self._gaussians)} Gaussians ({report['active_gaussians']} in the task's region) → "
             f"{self._options.out / 'map.ply'}; {PREVIEW} in the same folder shows it"
         )
+        if totals.late:
+            print(f"  {totals.late} of {totals.frames} frames missed the deadline of --rate {self._options.rate:g}")
         if self._inputs.mission.poses is PoseMode.TRACK:
             print(f"  {tracking_text(report)}")
         if result.processed == 0:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gausslite.config.paths import read_path
 from gausslite.mission.results import as_text, prepare_folder
+from gausslite.process.messages import print_message
 from gausslite.report.page import PAGE, require_replaceable, write_page
 from gausslite.report.run_results import read_results
 
@@ -29,6 +30,8 @@ def run(options: argparse.Namespace) -> int:
     """Read the runs and write the page. Raises MapFileError for a folder without a run, StorageError."""
     out = options.out or (options.runs[0] / PAGE if len(options.runs) == 1 else Path(PAGE))
     contents = read_results(options.runs)
+    for note in (note for each in contents.runs for note in each.notes):
+        print_message(note)
     require_replaceable(out)
     prepare_folder(out.absolute().parent)
     size = write_page(out, contents)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final
 
 from gausslite.config.known_options import KNOWN_OPTIONS
@@ -23,7 +23,8 @@ _OTHER_VARIABLES: Final = frozenset(
         # of deploy/, of the native build and of the tests
         *("GAUSSLITE_AGENTS", "GAUSSLITE_CERTS", "GAUSSLITE_CERT_DAYS", "GAUSSLITE_EXTRAS", "GAUSSLITE_FUSION_PORT"),
         *("GAUSSLITE_LLM", "GAUSSLITE_MODELS", "GAUSSLITE_RECORDINGS", "GAUSSLITE_SOURCES", "GAUSSLITE_TASKS"),
-        *("GAUSSLITE_SANITIZE", "GAUSSLITE_ONNX_TASKS"),
+        *("GAUSSLITE_SANITIZE", "GAUSSLITE_ONNX_TASKS", "GAUSSLITE_TEST_RAY", "GAUSSLITE_CPP_CLIENT"),
+        "GAUSSLITE_CPP_BUILD",
     }
 )
 """Variables with the prefix that are not options, or only options of one program."""
@@ -58,17 +59,20 @@ def read_environment(table: OptionTable, environment: Mapping[str, str]) -> Laye
 
 
 def describe_unknown_variables(
-    table: OptionTable, environment: Mapping[str, str], key_variable: str | None
+    options: Collection[str], environment: Mapping[str, str], key_variable: str | None
 ) -> list[str]:
     """Return a message for every variable with the prefix that nothing reads, without its value.
 
-    Options of other programs give no warning: one environment may configure several programs. key_variable: the
-    variable that the options name for the API key.
+    Options of other programs give no warning: one environment may configure several programs. options: names of the
+    program's options, without dashes in front. key_variable: the variable that the options name for the API key.
     """
-    options = {variable_name(table.key(dest)) for dest in table.actions}
-    known = {*options, *map(variable_name, KNOWN_OPTIONS), *_OTHER_VARIABLES, key_variable}
-    unknown = sorted(name for name in environment if name.startswith(PREFIX) and name not in known)
-    return [f"{name} is not an option{suggestion(name, options)}" for name in unknown]
+    known = {variable_name(key) for key in (*options, *KNOWN_OPTIONS)} | _OTHER_VARIABLES
+    unknown = sorted(
+        name for name in environment if name.startswith(PREFIX) and name not in known and name != key_variable
+    )
+    # the common prefix would make all names similar
+    names = [name.removeprefix(PREFIX) for name in known]
+    return [f"{name} is not an option{suggestion(name.removeprefix(PREFIX), names, PREFIX)}" for name in unknown]
 
 
 def without_options(environment: Mapping[str, str]) -> dict[str, str]:

@@ -58,7 +58,8 @@ def parse_options(
     values, origins = _combine(table, values, [_read_preset(table, values.get("preset"))], origins)
     _require_paths(table, values)
     options = _parse_with_defaults(parser, arguments, table.convert(values, origins), print_only)
-    for message in describe_unknown_variables(table, environment, getattr(options, "llm_key_variable", None)):
+    keys = [table.key(dest) for dest in table.actions]
+    for message in describe_unknown_variables(keys, environment, getattr(options, "llm_key_variable", None)):
         warn(f"{parser.prog}: {message}")
     if print_only:
         print(_configuration_text(parser.prog, table, values, options), end="")

@@ -8,8 +8,11 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.motion_model import MotionModel
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.mission.settings import PoseMode
+from gausslite.task.backends import RESPONSE_FORMATS, Backend
 
-_DETECTOR, _RATE = "--detector FILE.onnx", "--rate HZ"
+NO_TEAM_MAP = "none"
+_DETECTOR, _RATE, _FUSION = "--detector FILE.onnx", "--rate HZ", "--fusion ADDRESS"
+_MODEL, _HTTP = "--backend onnx or http", "--backend http"
 
 
 def require_effect(options: argparse.Namespace) -> None:
@@ -40,6 +43,36 @@ def _require_default_schedule(options: argparse.Namespace) -> None:
         _refuse("--skip-stages", _RATE)
     if options.deadline_slack != defaults.deadline_slack:
         _refuse("--deadline-slack", _RATE)
+
+
+def require_fusion_server(options: argparse.Namespace) -> None:
+    """Raise InvalidInputError for an option of `gausslite-agent` that has no effect without a fusion server.
+
+    The default itself is accepted, as in `require_effect`.
+    """
+    if options.fusion is not None:
+        return
+    values = {
+        "--spool": options.spool is not None,
+        "--handover": options.handover,
+        "--keyframes": bool(options.keyframes),
+        "--team-map": options.team_map != NO_TEAM_MAP,
+    }
+    for flag, is_set in values.items():
+        if is_set:
+            _refuse(flag, _FUSION)
+
+
+def require_language_model(options: argparse.Namespace) -> None:
+    """Raise InvalidInputError for an option of `add_backend` that the chosen backend does not use."""
+    backend = Backend(options.backend)
+    if backend is not Backend.HTTP:
+        if options.llm_url is not None:
+            _refuse("--llm-url", _HTTP)
+        if options.llm_format != RESPONSE_FORMATS[0]:
+            _refuse("--llm-format", _HTTP)
+    if backend is Backend.RULES and options.llm_model is not None:
+        _refuse("--llm-model", _MODEL)
 
 
 def _refuse(flag: str, needed: str) -> None:

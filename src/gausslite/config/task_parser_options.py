@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Mapping
 
 from gausslite.config.environment import KEY_VARIABLE
+from gausslite.config.options_without_effect import require_language_model
 from gausslite.task.backends import RESPONSE_FORMATS, Backend, BackendSettings
 
 
@@ -44,6 +45,7 @@ def add_backend(parser: argparse.ArgumentParser) -> None:
 
 def backend_settings(options: argparse.Namespace, environment: Mapping[str, str]) -> BackendSettings:
     """Return the settings of the options, with the API key from the environment. Raises InvalidInputError."""
+    require_language_model(options)
     return BackendSettings(
         Backend(options.backend),
         options.llm_model,

@@ -67,7 +67,7 @@ class TumSource(FolderSource):
         super().__init__(folder)
         self._matches, self._recorded = _associate(folder, require_poses)
         size_px = first_readable_size(match.colour for match in self._matches)
-        self._set_camera(_camera(folder, *size_px), _UNITS)
+        self._set_camera(read_tum_camera(folder, *size_px), _UNITS)
         has_poses = require_poses or (folder / _POSES).is_file()
         self._up_axis = unit_up_axis(up_axis or ((0.0, 0.0, 1.0) if has_poses else FIRST_VIEW_UP))
 
@@ -178,8 +178,11 @@ def _read_poses(path: Path, required: bool) -> PoseTrack | None:
     return PoseTrack(str(path), times_s, translations_m, quats_xyzw, _MAX_POSE_GAP_S, _MAX_POSE_LAG_S)
 
 
-def _camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
-    """Return the camera of a file in the folder, else the published one of fr1, fr2 or fr3 by the folder's name."""
+def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
+    """Return the camera of a file in the folder, else the published one of fr1, fr2 or fr3 by the folder's name.
+
+    Raises DatasetError.
+    """
     from_file = read_folder_camera(folder, width_px, height_px)
     if from_file is not None:
         return from_file

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from gausslite.domain.arguments import require_whole
 from gausslite.domain.errors import InvalidInputError
 
 _MAX_SIDE_PX = 16384
@@ -45,6 +46,7 @@ class Camera:
                 raise InvalidInputError(f"camera {name}: expected a finite number, got {value}")
         for name in ("width_px", "height_px"):
             value = getattr(self, name)
+            require_whole(f"camera {name}", value)
             if not 1 <= value <= _MAX_SIDE_PX:
                 raise InvalidInputError(f"camera {name}: expected 1 to {_MAX_SIDE_PX}, got {value}")
         for axis, side_px in (("x", self.width_px), ("y", self.height_px)):

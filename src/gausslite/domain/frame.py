@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
+from gausslite.domain.arguments import require_whole
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_motion import CameraMotion
@@ -39,6 +40,8 @@ class Frame:
     recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
 
     def __post_init__(self) -> None:
+        require_whole("frame index", self.index)
+        require_whole("frame capture_time_ns", self.capture_time_ns)
         size = (self.camera.height_px, self.camera.width_px)
         require_array("frame rgb", self.rgb, (*size, 3), np.uint8)
         require_array("frame depth_m", self.depth_m, size, np.float32)

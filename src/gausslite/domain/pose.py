@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Real
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float64
@@ -13,6 +15,7 @@ UpAxis = tuple[float, float, float]
 """Upward direction in a world frame."""
 
 _RIGIDITY_TOLERANCE = 1e-2
+_UNIT_TOLERANCE = 1e-3
 
 
 def require_rigid(name: str, T: Float[ndarray, "4 4"]) -> None:
@@ -88,6 +91,13 @@ def rotation_angle_deg(T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[nd
 def translation_m(T_world_a: Float64[ndarray, "4 4"], T_world_b: Float64[ndarray, "4 4"]) -> float:
     """Distance between the origins of two poses, in metres."""
     return float(np.linalg.norm(T_world_a[:3, 3] - T_world_b[:3, 3]))
+
+
+def require_up_axis(up_axis: UpAxis) -> None:
+    """Raise InvalidInputError unless the up axis is three numbers of length 1."""
+    numbers = isinstance(up_axis, tuple | list) and all(isinstance(value, Real) for value in up_axis)
+    if not numbers or len(up_axis) != 3 or not abs(float(np.linalg.norm(up_axis)) - 1.0) < _UNIT_TOLERANCE:
+        raise InvalidInputError(f"up_axis: expected three numbers of length 1 such as (0, 0, 1), got {up_axis!r}")
 
 
 def unit_up_axis(up_axis: UpAxis) -> UpAxis:

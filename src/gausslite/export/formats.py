@@ -103,7 +103,8 @@ def read_map(
 
 def _largest_extent_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
     """Return the largest absolute coordinate or standard deviation of each Gaussian."""
-    return np.concatenate([np.abs(gaussians.means_m), gaussians.scales_m], axis=1).max(axis=1)
+    largest: Float32[ndarray, " n"] = np.maximum(np.abs(gaussians.means_m), gaussians.scales_m).max(axis=1)
+    return largest
 
 
 def _objects(path: Path, content: MapContent, _settings: ExportSettings) -> None:

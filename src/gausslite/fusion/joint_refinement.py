@@ -19,6 +19,7 @@ from gausslite.domain.depth_edges import without_depth_edges
 from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
+from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.rates import REFINE_RATES
@@ -88,8 +89,9 @@ def refine(
     settings: RefineSettings,
     report_progress: ProgressCallback,
 ) -> Gaussians:
-    """Return the map after joint optimisation with every Gaussian active; the partial result if stopped.
+    """Return the map after joint optimisation of every Gaussian; the partial result if stopped.
 
+    The Gaussians of the tasks' regions are active in the result: those that show a target.
     Raises InvalidInputError if no keyframe shows the map, QuotaError if the map exceeds max_gaussians.
     """
     table = _fill_table(gaussians, settings)
@@ -108,7 +110,8 @@ def refine(
             due = iteration % settings.report_every == 0 or iteration == settings.iterations
             if due and not report_progress(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
                 break
-    return table.to_gaussians()
+    refined = table.to_gaussians()
+    return replace(refined, active=refined.target != NO_TARGET)
 
 
 def _bind_tables(table: SplatTable, rasterizer: Rasterizer) -> AbstractContextManager[None]:

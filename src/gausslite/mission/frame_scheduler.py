@@ -71,12 +71,17 @@ class SchedulerSettings:
 
 @dataclass(frozen=True, slots=True)
 class FrameTiming:
-    """Time of one frame in total and by stage, its skipped stages, and whether it trained fewer than min_iterations."""
+    """Time of one frame in total and by stage, and its skipped stages.
+
+    under_trained: it trained fewer than min_iterations. late: it ended after its deadline and the slack, so that the
+    rate falls.
+    """
 
     seconds: float
     stages_s: Mapping[Stage, float]
     skipped_stages: frozenset[SkippableStage]
     under_trained: bool
+    late: bool = False
 
 
 class FrameScheduler:
@@ -175,12 +180,13 @@ class FrameScheduler:
     def end(self) -> FrameTiming:
         """Return the timing of the current frame and carry its overrun to the next one."""
         seconds = self._clock() - self._begin_s
-        under_trained = False
+        under_trained = late = False
         if self._settings is not None:
             behind_s = self._behind_s + seconds - self._settings.seconds_per_frame
             self._behind_s = min(max(behind_s, 0.0), self._settings.deadline_slack_s)
+            late = behind_s > self._settings.deadline_slack_s
             under_trained = self._iterations < self._settings.min_iterations
-        return FrameTiming(seconds, dict(self._stages_s), self._skipped, under_trained)
+        return FrameTiming(seconds, dict(self._stages_s), self._skipped, under_trained, late)
 
     def _update_deadlines(self, settings: SchedulerSettings) -> None:
         """Set the deadlines of all training and of the min_iterations, reserving time for the fixed stages to come."""

@@ -19,7 +19,7 @@ from gausslite.codec.files import write_atomic
 from gausslite.codec.ply import write_ply
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.datasets.pose_file import format_pose_rows, read_pose_rows
-from gausslite.domain.errors import StorageError
+from gausslite.domain.errors import MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose_correction import CorrectionTrack, pose_at
 from gausslite.mapping.pose_history import PoseHistory
@@ -153,8 +153,14 @@ def read_report(folder: Path) -> Mapping[str, object]:
 
 
 def read_evaluation(folder: Path) -> Mapping[str, object]:
-    """Return the content of evaluation.json, see `write_evaluation`; empty if there is none or it is not an object."""
-    return _read_json(folder / EVALUATION)
+    """Return the content of evaluation.json, see `write_evaluation`; empty if there is none.
+
+    Raises MapFileError for a damaged file.
+    """
+    scores = _read_json(folder / EVALUATION)
+    if not scores and (folder / EVALUATION).exists():
+        raise MapFileError(f"{folder / EVALUATION}: expected the scores of `gausslite eval`, got something else")
+    return scores
 
 
 def write_evaluation(folder: Path, scores: Mapping[str, object]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
-from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.mission.task_mapper import TRACKING_LOST, FrameOutcome
 from gausslite.process.interrupts import DeferredInterrupt
 
 _NO_FRAME_INDEX = -1
@@ -16,10 +16,16 @@ _NO_FRAME_INDEX = -1
 
 @dataclass(slots=True)
 class MissionTotals:
-    """Sums over the frames of a mission."""
+    """Sums over the frames of a mission.
+
+    frames: mapped ones; late: those of them that missed their deadline. skipped: frames without depth, and those that
+    tracking has lost, which `lost` counts alone.
+    """
 
     frames: int = 0
     skipped: int = 0
+    lost: int = 0
+    late: int = 0
     iterations: int = 0
     keyframes_reevaluated: int = 0
     seeded_in_keyframes: int = 0
@@ -34,8 +40,10 @@ class MissionTotals:
         self.region_seen |= outcome.roi_share > 0
         if outcome.skipped is not None:
             self.skipped += 1
+            self.lost += outcome.skipped == TRACKING_LOST
             return
         self.frames += 1
+        self.late += outcome.timing.late
         self.iterations += outcome.iterations
         self.roi_share_sum += outcome.roi_share
         self.busy_s += outcome.timing.seconds
@@ -56,7 +64,7 @@ class MissionResult:
 
     @property
     def processed(self) -> int:
-        """Number of frames, including those skipped because they have no depth."""
+        """Number of frames, including skipped ones."""
         return self.totals.frames + self.totals.skipped
 
     @property
@@ -75,6 +83,7 @@ class MissionResult:
         return {
             "frames": totals.frames,
             "frames_skipped": totals.skipped,
+            "frames_late": totals.late,
             "iterations": totals.iterations,
             "roi_share": totals.roi_share_sum / max(totals.frames, 1),
             "keyframes_reread": totals.keyframes_reevaluated,

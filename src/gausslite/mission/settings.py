@@ -15,7 +15,7 @@ from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.object_names import same_kind
-from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose import UpAxis, require_up_axis
 from gausslite.domain.pose_exposure_prior import TRACKED_PRIOR, PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
 from gausslite.mapping.policies import TASK, UNIFORM, disable, follows_task, policy
@@ -61,10 +61,16 @@ class PoseMode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
-    """Information about the scene of a mission: the upward direction and, for tests, the regions of objects."""
+    """Information about the scene of a mission: the upward direction and, for tests, the regions of objects.
+
+    up_axis: unit vector of the world frame. Raises InvalidInputError.
+    """
 
     up_axis: UpAxis = (0.0, 0.0, 1.0)
     regions: Mapping[str, Region] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_up_axis(self.up_axis)
 
     @classmethod
     def of(cls, source: Source) -> SceneInfo:

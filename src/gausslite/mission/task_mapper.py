@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 from jaxtyping import Float32
 from numpy import ndarray
@@ -27,6 +28,8 @@ from gausslite.mapping.team_voxels import InsertedVoxels
 from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.perception.relevance_estimator import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
+
+TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +218,7 @@ class TaskMapper:
             gaussians=self._mapper.count,
             roi_share=0.0,
             timing=self._scheduler.end(),
-            skipped="tracking is lost: the frame agrees with no part of the map",
+            skipped=TRACKING_LOST,
             changed_roi=None,
             detection_lag_frames=None,
             reevaluation=Reevaluation(0, 0),

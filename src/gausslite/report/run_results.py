@@ -26,7 +26,8 @@ class RunResults:
     """One map with its reports: one column of the page.
 
     report: report.json. scores: figures on held-out views by name, empty if the map was not scored. timeline: the
-    columns of frames.csv. views: photographs of keyframes. Any but the map may be empty.
+    columns of frames.csv. views: photographs of keyframes. notes: what could not be read. Any but the map may be
+    empty.
     """
 
     name: str
@@ -37,6 +38,7 @@ class RunResults:
     scores: Mapping[str, object] = field(default_factory=dict)
     timeline: Mapping[str, Float64[ndarray, " n"]] = field(default_factory=dict)
     views: Sequence[ViewImage] = ()
+    notes: Sequence[str] = ()
 
     @property
     def map_bytes(self) -> int:
@@ -79,15 +81,23 @@ def _read_run(folder: Path, name: str, scores: Mapping[str, object] | None = Non
     report, file = read_report(folder), folder / _MAP
     if not report and (folder / "report.json").exists():
         raise MapFileError(f"{folder}/report.json: expected the report of a run, got something else")
+    notes = []
+    if scores is None:
+        try:
+            scores = read_evaluation(folder)
+        except MapFileError as error:
+            scores = {}
+            notes.append(f"{error}; the page has no scores of it")
     return RunResults(
         name,
         file,
         read_contents(folder),
         read_world_frame(file),
         report,
-        read_evaluation(folder) if scores is None else scores,
+        scores,
         read_timeline(folder),
         read_view_images(folder),
+        notes,
     )
 
 

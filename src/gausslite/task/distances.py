@@ -45,6 +45,11 @@ _VAGUE: Final = re.compile(
     r"centimet(?:er|re)s?)(?: away)? from\b|\b(?:at )?(?:some|a|a certain|a short|a safe|a little) "
     r"(?:distance|way)(?: away)? from\b"
 )
+# after a number or a unit, a minus sign is a range: "2 -3 m"
+_NEGATIVE: Final = re.compile(
+    rf"(?:\b(?:{_MAX}|{_MIN}|{_ABOUT}) )*(?:(?<![\w])(?<![\dm] )[-\u2212](?=\d)|\bminus ){_VALUE} ?{_UNIT}\b"
+    rf"(?: (?:away|apart|off|distant))?(?: (?:of|from|to)\b)?"
+)
 _MARKER: Final = re.compile(r"(at|bound)distance_(x|\d+)_(x|\d+)")
 VAGUE_MARKER: Final = "vaguedistance"
 
@@ -62,8 +67,11 @@ UNBOUNDED: Final = Bounds()
 
 
 def mark_distances(text: str) -> str:
-    """Return the text with every distance to something replaced by a marker word."""
-    return _DISTANCE.sub(_marker, _VAGUE.sub(f" {VAGUE_MARKER} ", text))
+    """Return the text with every distance to something replaced by a marker word.
+
+    A negative distance, which nothing has, becomes the marker of a distance without a number.
+    """
+    return _DISTANCE.sub(_marker, _NEGATIVE.sub(f" {VAGUE_MARKER} ", _VAGUE.sub(f" {VAGUE_MARKER} ", text)))
 
 
 def bounds_of(marker: str) -> Bounds | None:

@@ -122,7 +122,7 @@ class GraphDraft:
         if terms.relation == "outside" and anchor.split()[-1] in lexicon.CONTAINERS:
             return Predicate.INSIDE, not terms.negated
         if terms.relation == "at_distance":
-            self.warnings.append(f"the distance from {anchor!r} is not a number: it is dropped")
+            self.warnings.append(f"the distance from {anchor!r} is vague or negative: it is dropped")
             return None
         if terms.relation in _PREDICATES:
             return Predicate(terms.relation), terms.negated

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import socket
 from typing import Any
 from urllib.parse import urlsplit
@@ -21,6 +22,8 @@ class LocalServer(viser.ViserServer):
 
     def __init__(self, port: int, title: str) -> None:
         """port: 0 chooses a free one."""
+        # one line for each connection says nothing to an operator
+        logging.getLogger("websockets.server").setLevel(logging.WARNING)
         with _without_output():
             super().__init__(host=LOOPBACK, port=_require_free(port), label=title, verbose=False)
         # before viser's own callback, so that a refused connection gets nothing

@@ -59,16 +59,15 @@ def log_to_stderr(program: str, log_format: LogFormat = LogFormat.TEXT) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=log_format is LogFormat.JSON)
 
 
-def run_service(program: str, serve: Callable[[], Awaitable[None]]) -> int:
-    """Run the service; returns 0 after a clean end, 2 with one line on stderr after a GaussLiteError."""
+def run_service(program: str, serve: Callable[[], Awaitable[int]]) -> int:
+    """Run the service and return its exit code; 2 with one line on stderr after a GaussLiteError."""
     log_to_stderr(program)
 
-    async def body() -> None:
-        await serve()
+    async def body() -> int:
+        return await serve()
 
     try:
-        asyncio.run(body())
+        return asyncio.run(body())
     except GaussLiteError as error:
         print_message(f"{program}: {error}")
         return 2
-    return 0

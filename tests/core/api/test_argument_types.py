@@ -28,13 +28,20 @@ WRONG = {
     "gl.MissionSettings(policy=5)": "policy: expected the name of a policy",
     'gl.FusionClient("nonsense")': "FusionClient address: expected HOST:PORT or unix:PATH, got 'nonsense'",
     'gl.AgentClient("host:0")': "AgentClient address: expected the port",
+    "gl.SceneInfo(up_axis=(0, 0, 0))": r"up_axis: expected three numbers of length 1 .*got \(0, 0, 0\)",
+    "gl.SceneInfo(up_axis=(0, 0, 2))": "up_axis: expected three numbers of length 1",
+    'gl.SceneInfo(up_axis="up")': "up_axis: expected three numbers of length 1 .*got 'up'",
+    "gl.Camera(300, 300, 160, 120, 320.0, 240)": "camera width_px: expected a whole number, got float 320.0",
+    "dataclasses.replace(frame, capture_time_ns=1.5e9)": "frame capture_time_ns: expected a whole number, got float",
+    "dataclasses.replace(frame, index=0.5)": "frame index: expected a whole number, got float 0.5",
     "gl.AgentClient(50053)": "AgentClient address: expected HOST:PORT or unix:PATH as text, got int",
 }
 PROGRAM = """
-import json, sys
+import dataclasses, json, sys
 import gausslite as gl
 from gausslite.domain.errors import InvalidInputError
 home = gl.open_sequence("sim:home")
+frame = home.frame(0, (32, 24))
 messages = {}
 for call in json.load(sys.stdin):
     try:

@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gausslite.cli.main import main
+from gausslite.config.command_parser import CommandParser
 from gausslite.config.environment import without_options
 from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import add_budget, add_policy
@@ -23,7 +25,7 @@ from gausslite.process.messages import print_message
 
 def program() -> argparse.ArgumentParser:
     """Return a parser with one option of every kind."""
-    parser = argparse.ArgumentParser(prog="mapper")
+    parser = CommandParser(prog="mapper")
     parser.add_argument("source", metavar="SOURCE")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--names", type=read_names, default=())
@@ -159,6 +161,25 @@ def test_unknown_variables_are_warnings_without_their_values(capsys: pytest.Capt
     assert warning == "mapper: GAUSSLITE_MAX_GAUSIANS is not an option; did you mean GAUSSLITE_MAX_GAUSSIANS?"
 
 
+@pytest.mark.parametrize(
+    ("variable", "meant"), [("GAUSSLITE_SIMDD", "GAUSSLITE_SIMD"), ("GAUSSLITE_MODEL_URL", "GAUSSLITE_MODELS_URL")]
+)
+def test_the_nearest_of_all_known_variables_is_suggested(
+    variable: str, meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parse("home", "--out=x", environment={variable: "x"})
+    assert capsys.readouterr().err == f"mapper: {variable} is not an option; did you mean {meant}?\n"
+
+
+def test_a_command_without_configuration_names_a_misspelt_variable(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GAUSSLITE_LLM_API_KEI", "secret")
+    assert main(["parse", "Find the mug"]) == 0
+    expected = "gausslite: GAUSSLITE_LLM_API_KEI is not an option; did you mean GAUSSLITE_LLM_API_KEY?\n"
+    assert capsys.readouterr().err == expected
+
+
 def test_the_environment_can_name_the_file(tmp_path: Path) -> None:
     file = written(tmp_path, "seed = 4\n")
     assert parse("home", "--out=x", environment={"GAUSSLITE_CONFIG": str(file)}).seed == 4
@@ -181,8 +202,9 @@ def test_argparse_still_reports_wrong_flags(flags: tuple[str, ...], capsys: pyte
     with pytest.raises(SystemExit) as ended:
         parse(*flags)
     assert ended.value.code == 2
-    usage, *_ = capsys.readouterr().err.splitlines()
-    assert usage.startswith("usage: mapper")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("mapper: ")
+    assert line.endswith("; see `mapper --help`")
 
 
 def test_help_shows_the_real_defaults(capsys: pytest.CaptureFixture[str]) -> None:

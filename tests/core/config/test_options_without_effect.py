@@ -9,6 +9,7 @@ from tiny_sequences import write_tum
 
 from gausslite.cli.main import main
 from gausslite_agent.program import run as run_agent
+from gausslite_parser.program import run as run_parser
 
 
 @pytest.mark.parametrize(
@@ -41,3 +42,32 @@ def test_an_option_without_effect_is_refused(
     message = f"{program}: {given[0]}: has an effect only with {needed}; give both, or omit {given[0]}"
     assert capsys.readouterr().err.splitlines() == [message]
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "given", [("--spool", "x.spool"), ("--handover",), ("--keyframes", "4"), ("--team-map", "vote")]
+)
+def test_an_option_of_the_uplink_is_refused_without_a_fusion_server(
+    given: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_agent(["--listen", "127.0.0.1:0", *given]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{given[0]}: has an effect only with --fusion ADDRESS; give both, or omit {given[0]}" in line
+
+
+@pytest.mark.parametrize(
+    ("given", "needed"),
+    [
+        (("--llm-model", "phi-3-mini"), "--backend onnx or http"),
+        (("--llm-url", "http://localhost:8000/v1"), "--backend http"),
+        (("--llm-format", "none"), "--backend http"),
+        (("--backend", "onnx", "--llm-model", "phi", "--llm-url", "http://localhost:8000/v1"), "--backend http"),
+    ],
+)
+@pytest.mark.parametrize("command", ["parse", "service"])
+def test_an_option_of_a_language_model_is_refused_without_its_backend(
+    command: str, given: tuple[str, ...], needed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (main(["parse", "Find the mug", *given]) if command == "parse" else run_parser(list(given))) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{given[-2]}: has an effect only with {needed}" in line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from dataclasses import fields
@@ -44,6 +45,26 @@ def test_a_bag_has_the_frames_of_its_folder(tmp_path: Path, folder: Path, name: 
         assert frame.rgb.tobytes() == other.rgb.tobytes()
         assert frame.depth_m.tobytes() == other.depth_m.tobytes()
         assert frame.T_world_camera.tobytes() == other.T_world_camera.tobytes()
+
+
+def test_a_folder_without_a_camera_file_has_the_published_camera_of_its_name(tmp_path: Path, folder: Path) -> None:
+    named = tmp_path / "rgbd_dataset_freiburg1_home"
+    shutil.copytree(folder, named)
+    (named / "cam_params.json").unlink()
+    convert(named, tmp_path / "b.mcap")
+    expected, bag = open_source(str(named)), open_source(str(tmp_path / "b.mcap"))
+    assert (bag.camera, bag.lens) == (expected.camera, expected.lens)
+    assert bag.frame(0).depth_m.tobytes() == expected.frame(0).depth_m.tobytes()
+
+
+def test_a_folder_of_an_unknown_camera_is_one_line(tmp_path: Path, folder: Path) -> None:
+    shutil.copytree(folder, tmp_path / "kitchen")
+    (tmp_path / "kitchen" / "cam_params.json").unlink()
+    command = [sys.executable, str(TOOL), str(tmp_path / "kitchen"), str(tmp_path / "b.mcap")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    (line,) = done.stderr.splitlines()
+    assert "the camera is unknown" in line
+    assert done.returncode == 1
 
 
 @pytest.mark.parametrize("name", ["b.bag", "b", "b.mcap"])

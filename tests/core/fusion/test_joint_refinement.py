@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
@@ -10,6 +12,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, KeyframeLimits, KeyframePool
 from gausslite.fusion.memory_store import MemoryStore
@@ -58,6 +61,14 @@ def test_refinement_moves_the_map_towards_the_keyframes() -> None:
     assert [progress.iteration for progress in reports] == [2, 4, 6]
     assert reports[-1].loss < reports[0].loss
     assert {progress.gaussians for progress in reports} == {16}
+
+
+def test_after_the_refinement_only_the_gaussians_of_a_target_are_of_the_region() -> None:
+    targets = np.where(np.arange(16) < 5, 0, NO_TARGET).astype(np.int16)
+    before = dataclasses.replace(patch(0.2), target=targets)
+    after = refine(before, [view(1, 200)], ReferenceRasterizer(), QUICK, always)
+    assert (after.active == (targets == 0)).all()
+    assert (after.rgb != before.rgb).any(axis=1).all()
 
 
 def test_the_same_seed_gives_the_same_map() -> None:

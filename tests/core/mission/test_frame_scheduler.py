@@ -100,6 +100,16 @@ def test_remaining_time_is_filled_with_iterations() -> None:
     assert scheduler.end().seconds == pytest.approx(99.0)
 
 
+def test_a_frame_is_late_if_it_overruns_its_deadline_by_more_than_the_slack() -> None:
+    def timing(rate_hz: float) -> FrameTiming:
+        clock = WorkClock()
+        return run_frame(FrameScheduler(SchedulerSettings(1 / rate_hz, 1, deadline_slack=0.5), clock), clock, CHEAP)[0]
+
+    # the fixed stages and one iteration cost 6
+    assert timing(1 / 3).late
+    assert not timing(1 / 5).late
+
+
 def test_the_stages_add_up_to_the_frame() -> None:
     clock = WorkClock()
     timing, done = run_frame(FrameScheduler(SchedulerSettings(50.0, 4), clock), clock, CHEAP)

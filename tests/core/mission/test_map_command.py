@@ -11,6 +11,11 @@ from tiny_sequences import write_seven_scenes
 from tum_recording import write_home
 
 from gausslite.cli.main import main
+from gausslite.mapping.task_change import Reevaluation
+from gausslite.mission.frame_scheduler import FrameTiming
+from gausslite.mission.runner import MissionTotals
+from gausslite.mission.settings import MAX_RATE_HZ
+from gausslite.mission.task_mapper import TRACKING_LOST, FrameOutcome
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 FRAMES = tuple(range(0, 24, 4))
@@ -55,6 +60,27 @@ def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, capsys: pytest.C
     assert "5 frames (skipped: 1 corrupt)" in printed.out
     report = report_of(tmp_path / "out")
     assert (report["frames"], report["frames_skipped"], report["frames_corrupt"]) == (5, 0, 1)
+
+
+def test_the_summary_counts_the_frames_that_missed_their_deadline(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    assert map_command(sequence, tmp_path / "out", "--rate", f"{MAX_RATE_HZ:g}") == 0
+    late = report_of(tmp_path / "out")["frames_late"]
+    printed = capsys.readouterr().out
+    assert (f"  {late} of 6 frames missed the deadline of --rate {MAX_RATE_HZ:g}" in printed) == (late > 0)
+
+
+def test_frames_without_depth_are_counted_apart_from_lost_ones() -> None:
+    def outcome(skipped: str | None, late: bool = False) -> FrameOutcome:
+        timing = FrameTiming(0.1, {}, frozenset(), False, late)
+        return FrameOutcome(0, 1, 10, 0.0, timing, skipped, None, None, Reevaluation(0, 0))
+
+    totals = MissionTotals()
+    for each in (outcome(None), outcome(None, late=True), outcome("no depth"), outcome(TRACKING_LOST)):
+        totals.add(each)
+    assert (totals.frames, totals.late, totals.skipped, totals.lost) == (2, 1, 2, 1)
 
 
 def test_with_strict_a_corrupt_frame_ends_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -93,6 +93,15 @@ def test_runs_are_side_by_side_at_the_same_views(tmp_path):
     assert page.tags.count("polyline") > 4
 
 
+def test_a_damaged_evaluation_is_one_line_and_leaves_out_the_scores(tmp_path, capsys):
+    run = write_run(tmp_path / "run")
+    (run / "evaluation.json").write_text('{"roi_psnr": 25')
+    assert main(["report", str(run)]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "evaluation.json: expected the scores of `gausslite eval`, got something else" in line
+    assert "region PSNR" not in table_rows(run / "report.html")
+
+
 def test_maps_of_other_world_frames_are_not_rendered_at_the_same_views(tmp_path):
     runs = [write_run(tmp_path / name, world_frame=name) for name in ("a", "b")]
     page = report(*runs, out=tmp_path / "page.html")

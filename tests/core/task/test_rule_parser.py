@@ -230,6 +230,9 @@ def test_distances_bound_a_relation(phrase, predicate, min_m, max_m):
         ("Open the second drawer", "second"),
         ("Take the oldest box", "oldest"),
         ("Find the mug a few metres from the door", "door"),
+        ("Find the mug within -3 metres of the door", "door"),
+        ("Find the mug at most -0.5 m from the door", "door"),
+        ("Find the mug within minus two metres of the door", "door"),
         ("Pick up all mugs except the red one near the sink", "sink"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -170,6 +171,18 @@ def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> Non
     assert (ended.voxels_waiting, ended.keyframes_waiting) == (0, 0)
     assert stored.keyframes == 6
     assert stored.gaussians == ended.gaussians
+
+
+def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> None:
+    with agent_process(tmp_path, "127.0.0.1:1", "--grace-period", "0.1") as (process, client):
+        client.assign_task("Pick up the cup")
+        list(client.ingest([red_frame(index) for index in range(6)]))
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr is not None
+        log = process.stderr.read().splitlines()
+        assert process.wait(60) == 1
+    (line,) = [line for line in log if " ERROR " in line]
+    assert re.search(r"lost [1-9]\d* voxels and 0 keyframes that were not sent; --spool FILE keeps them", line)
 
 
 def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def test_the_wait_ends_after_its_timeout_and_for_an_invalid_task() -> None:
 def test_stop_ends_the_wait() -> None:
     parser = WaitingParser(LateParser(99))
     threading.Timer(0.1, parser.stop).start()
-    with pytest.raises(UnavailableError, match="refused"):
+    with pytest.raises(UnavailableError, match=r"stopped while waiting for the parser service: .* refused"):
         parser.parse(TASK)
 
 
@@ -71,7 +71,7 @@ def test_stop_cancels_a_call_that_the_service_does_not_answer() -> None:
         waiting = WaitingParser(client, cancel=client.close)
         threading.Thread(target=lambda: silent.called.wait() and waiting.stop()).start()
         try:
-            with pytest.raises(UnavailableError):
+            with pytest.raises(UnavailableError, match=r"^stopped while waiting for the parser service$"):
                 waiting.parse(TASK)
         finally:
             silent.end.set()
