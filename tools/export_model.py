@@ -16,8 +16,11 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import torch
-import transformers
+try:
+    import torch
+    import transformers
+except ImportError as error:
+    raise SystemExit(f"export_model: {error}; install: pip install 'transformers<5' torch onnx") from None
 
 from gausslite.perception.grounding import INPUTS, OUTPUTS
 from gausslite.perception.phrase_vectors import TEXT_ENCODER, TOKENIZER

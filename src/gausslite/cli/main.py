@@ -51,7 +51,12 @@ def _parse(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Na
         from gausslite.config.layers import parse_options
 
         return parse_options(parser, arguments, warn=print_message)
-    options = parser.parse_args(arguments)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        from gausslite.config.layers import leaf_parser
+
+        # of the sub-command, whose help has the options
+        leaf_parser(parser, arguments)[0].error(f"unrecognized arguments: {' '.join(unknown)}")
     from gausslite.config.environment import describe_unknown_variables
 
     for message in describe_unknown_variables((), os.environ, getattr(options, "llm_key_variable", None)):

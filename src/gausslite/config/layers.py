@@ -40,7 +40,7 @@ def parse_options(
     A parser with sub-commands gets them in its chosen sub-command. Ends the process with code 0 after --print-config
     and with code 2 for wrong flags. Raises InvalidInputError for wrong values in the file or the environment.
     """
-    parser, arguments = _leaf_parser(parser, list(sys.argv[1:] if arguments is None else arguments))
+    parser, arguments = leaf_parser(parser, list(sys.argv[1:] if arguments is None else arguments))
     environment = os.environ if environment is None else environment
     if subcommands(parser) is not None:
         return parser.parse_args(arguments)
@@ -67,14 +67,14 @@ def parse_options(
     return options
 
 
-def _leaf_parser(
+def leaf_parser(
     parser: argparse.ArgumentParser, arguments: Sequence[str]
 ) -> tuple[argparse.ArgumentParser, Sequence[str]]:
     """Return the parser of the chosen sub-command and the arguments after the command's name."""
     commands = subcommands(parser)
     if commands is None or not arguments or arguments[0] not in commands:
         return parser, arguments
-    return _leaf_parser(commands[arguments[0]], arguments[1:])
+    return leaf_parser(commands[arguments[0]], arguments[1:])
 
 
 def subcommands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser] | None:

@@ -40,6 +40,20 @@ def test_wrong_options_have_the_code_of_wrong_input() -> None:
     assert ended.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("arguments", "program"),
+    [(("parse", "Find the mug", "--jsn"), "gausslite parse"), (("bench", "parser", "--jsn"), "gausslite bench parser")],
+)
+def test_an_unknown_option_is_one_line_that_names_the_help_of_its_command(
+    arguments: tuple[str, ...], program: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(list(arguments))
+    assert ended.value.code == 2
+    expected = f"{program}: unrecognized arguments: --jsn; see `{program} --help`\n"
+    assert capsys.readouterr().err == expected
+
+
 def test_the_page_lists_the_codes_of_signals() -> None:
     codes = {int(code) for code, _ in ROWS}
     assert {0, 1, 2, 128 + signal.SIGINT, 128 + signal.SIGTERM} == codes

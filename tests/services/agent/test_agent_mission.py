@@ -141,7 +141,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
 
 
 def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
-    options = settings(tmp_path, "--handover")
+    options = settings(tmp_path, "--handover", "--fusion", "localhost:1")
     with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents

@@ -276,7 +276,7 @@ def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:
     assert 0 < kappas[0] < kappas[1]
     assert revisions == sorted(set(revisions))
     assert agent.gaussians > 0
-    fixed_settings = parse_arguments(command[3:]).fixed_settings
+    fixed_settings = parse_arguments([*command[3:], "--fusion", "localhost:1"]).fixed_settings
     assert SavedMission.read(tmp_path / "a.state", *fixed_settings).checkpoint == MissionCheckpoint(
         5, RuleParser().parse("Pick up the cup"), "Pick up the cup", revisions[-1]
     )
