@@ -162,5 +162,5 @@ class BrowserDetail:
 def _note_html(count: int) -> str:
     return (
         f'<div style="padding:0 0.75em;font-size:0.85em">This browser draws {count:,} of them: more would be slow. '
-        f"To draw all, clear the box below.</div>"
+        f"To draw all, clear the box above.</div>"
     )
