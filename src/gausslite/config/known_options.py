@@ -78,7 +78,18 @@ KNOWN_OPTIONS: Final = frozenset(
         ),
         *("save-scores", "segmenter", "sentences", "shares", "simd", "size", "sizes", "skip-stages", "source", "spool"),
         *("state", "store", "store-max-mb", "strict", "task", "task-a", "task-at", "task-b", "test-every"),
-        *("threads", "timed", "tls-ca", "tls-cert", "tls-key", "track-motion", "unlimited", "up", "uplink-interval"),
+        *(
+            "threads",
+            "tiles",
+            "timed",
+            "tls-ca",
+            "tls-cert",
+            "tls-key",
+            "track-motion",
+            "unlimited",
+            "up",
+            "uplink-interval",
+        ),
         *("uplink-kbps", "view", "views", "vocabulary", "voxel-size", "world-frame"),
     }
 )

@@ -26,6 +26,8 @@ from gausslite.mission.settings import (
     PerceptionSettings,
     PoseMode,
 )
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.tiles import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
 from gausslite.render.choose import BACKENDS
 from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
 
@@ -77,6 +79,13 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
     )
     add_switch(group, "--resegment", "run the segmenter on every frame (slower)")
     add_switch(group, "--accept-similar", "also map objects of a class that is only similar to the task's noun")
+    add(
+        "--tiles",
+        metavar="N",
+        type=Number("tiles", int, 1, MAX_TILES_PER_SIDE),
+        default=DEFAULT_TILES_PER_SIDE,
+        help="also detect in NxN enlarged parts of each keyframe, as time allows; 1: off (default: %(default)s)",
+    )
 
 
 def add_policy(
@@ -213,6 +222,9 @@ def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
         segmenter=options.segmenter,
         vocabulary=options.vocabulary,
         accept_similar=options.accept_similar,
+        tiles=options.tiles,
+        # the next keyframe comes at the latest after this time
+        detection_time_s=None if options.rate is None else RelevanceTrackerSettings().max_frames / options.rate,
     )
 
 
@@ -247,6 +259,7 @@ def perception_options(settings: PerceptionSettings) -> dict[str, OptionValue]:
         "vocabulary": None if settings.vocabulary is None else str(settings.vocabulary.absolute()),
         "resegment": settings.resegment,
         "accept-similar": settings.accept_similar,
+        "tiles": settings.tiles,
     }
 
 

@@ -8,6 +8,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.motion_model import MotionModel
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.mission.settings import PoseMode
+from gausslite.perception.tiles import DEFAULT_TILES_PER_SIDE
 from gausslite.task.backends import RESPONSE_FORMATS, Backend
 
 NO_TEAM_MAP = "none"
@@ -33,6 +34,8 @@ def require_effect(options: argparse.Namespace) -> None:
         _refuse("--vocabulary", _DETECTOR)
     if options.resegment:
         _refuse("--resegment", _DETECTOR)
+    if options.tiles != DEFAULT_TILES_PER_SIDE:
+        _refuse("--tiles", _DETECTOR)
 
 
 def _require_default_schedule(options: argparse.Namespace) -> None:

@@ -32,6 +32,8 @@ SURFACE: Final = frozenset(
 )  # fmt: skip
 # parts of a large one look like a small one: a sofa's end like an armchair
 SEAT: Final = frozenset({"chair", "armchair", "stool", "couch", "sofa", "loveseat", "bench", "ottoman"})
+# seats that stand up: a flat surface is none of them
+BACKED_SEAT: Final = frozenset({"chair", "armchair", "couch", "sofa", "loveseat"})
 # open vessels and boxes: what they hold belongs to them
 CONTAINER: Final = frozenset(
     {"bowl", "basket", "box", "crate", "bin", "tray", "dish", "bucket", "tub", "basin", "pot", "pan", "carton"}
@@ -116,6 +118,11 @@ def is_furniture(phrase: str) -> bool:
 def is_seat(phrase: str) -> bool:
     """Return True for chairs, sofas, benches and the like."""
     return head_of(phrase) in SEAT
+
+
+def has_back(phrase: str) -> bool:
+    """Return True for chairs, sofas and other seats with a back."""
+    return head_of(phrase) in BACKED_SEAT
 
 
 def is_container(phrase: str) -> bool:

@@ -21,6 +21,7 @@ from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.tiles import Tiling
 from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
@@ -49,9 +50,11 @@ def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
         return None
     from gausslite.perception.models.model_registry import ModelRegistry
 
+    tiling = Tiling(perception.tiles, perception.detection_time_s)
     return ModelRegistry(
-        perception.model, perception.segmenter, perception.vocabulary, perception.threads, perception.accept_similar
-    )
+        perception.model, perception.segmenter, perception.vocabulary, perception.threads, perception.accept_similar,
+        tiling,
+    )  # fmt: skip
 
 
 def region_estimator(regions: Sequence[Region]) -> RelevanceEstimator:

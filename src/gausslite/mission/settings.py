@@ -22,6 +22,7 @@ from gausslite.mapping.policies import TASK, UNIFORM, disable, follows_task, pol
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
+from gausslite.perception.tiles import DEFAULT_TILES_PER_SIDE
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000
@@ -129,6 +130,9 @@ class PerceptionSettings:
     re-projected boxes, which on a real kitchen is as accurate at a third of the time. asynchronous: mapping does not
     wait for detections; they run on their own thread and take effect when they are finished. accept_similar: also map
     objects of a class that is only similar to the task's noun.
+
+    tiles: the detector also runs in tiles x tiles parts of each keyframe, which finds small, distant objects; 1: off.
+    detection_time_s: no further tile is started if it would end later than this; None for no limit.
     """
 
     model: Path | None = field(default=None, metadata={"flag": "--detector", **FILE})
@@ -138,6 +142,8 @@ class PerceptionSettings:
     segmenter: str | None = field(default=None, metadata=FILE)
     vocabulary: Path | None = field(default=None, metadata=FILE)
     accept_similar: bool = False
+    tiles: int = DEFAULT_TILES_PER_SIDE
+    detection_time_s: float | None = field(default=None, metadata=MAY_CHANGE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,10 @@ _MIN_SHARED: Final = 0.3
 _MIN_COUNT_SHARE: Final = 0.15
 _MIN_RELIABLE_SHARE: Final = 0.25
 _MAX_CELLS: Final = 4000
+# the outermost points of a mask are often of other things
+_INNER_PERCENTILES: Final = (10.0, 90.0)
+_MIN_FLAT_WIDTH_M: Final = 0.4
+_MAX_FLAT_SLOPE: Final = 0.1
 _MAX_OBJECTS: Final = 500
 MAX_SUPPORTS: Final = 50
 
@@ -71,6 +75,15 @@ class Observation:
     def distance_m(self) -> float:
         """Distance from the camera to the centroid; infinite without a camera."""
         return np.inf if self.camera_m is None else float(np.linalg.norm(self.centroid_m - self.camera_m))
+
+    def is_flat(self, up: Float64[ndarray, "3"]) -> bool:
+        """Return True if the cells cover a wide area at nearly one height, as those of a rug. up: in the world."""
+        centres_m = _CELL_GRID.centres_m(self.cells).astype(np.float64)
+        heights_m = centres_m @ up
+        across_m = np.ptp(np.percentile(centres_m - heights_m[:, None] * up, _INNER_PERCENTILES, axis=0), axis=0)
+        width_m = float(np.linalg.norm(across_m))
+        height_m = float(np.ptp(np.percentile(heights_m, _INNER_PERCENTILES)))
+        return width_m >= _MIN_FLAT_WIDTH_M and height_m <= _MAX_FLAT_SLOPE * width_m
 
 
 @dataclass(slots=True, eq=False)

@@ -238,6 +238,7 @@ class RelevanceTracker:
         localised = [
             (detection, self._filter.with_support(observation, detection, frame))
             for detection, observation in lift_detections(kept, depth_m, frame)
+            if self._filter.is_possible(observation)
         ]
         self._filter.observe_floor(frame)
         self._filter.observe([observation for _, observation in localised], VisibilityCheck(frame, frame.depth_m))

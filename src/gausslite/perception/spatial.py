@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
+from gausslite.domain.object_names import has_back
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
@@ -102,6 +103,10 @@ class SpatialFilter:
     def floor(self) -> FloorLevel:
         """The points observed so far, by their height; none if no relation needs them."""
         return self._floor
+
+    def is_possible(self, observation: Observation) -> bool:
+        """Return False for a seat with a back that is flat: detectors take rugs for chairs."""
+        return not (has_back(observation.phrase) and observation.is_flat(self._up))
 
     def with_support(self, observation: Observation, detection: Detection, frame: Frame) -> Observation:
         """Return the observation with the level of the plane under it, if a relation needs it."""

@@ -22,6 +22,7 @@ from gausslite.domain.object_names import head_of, same_kind
 from gausslite.domain.region import Region
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.perception.detect import Detector
+from gausslite.perception.tiles import Tiling
 from gausslite.task.rules import RuleParser
 from gausslite_bench.perception.absent_nouns import AbsentSummary, absent_queries, choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
@@ -73,7 +74,14 @@ def run_perception(options: argparse.Namespace) -> int:
     source, _ = open_with_warnings(options.source, options.up, options.register_depth)
     positions, size = select_frames(source, options.frames), frame_size(options.size, source)
     regions = _regions(options, source)
-    models = ModelRegistry(options.detector, options.segmenter, options.vocabulary, options.threads)
+    models = ModelRegistry(
+        options.detector,
+        options.segmenter,
+        options.vocabulary,
+        options.threads,
+        options.accept_similar,
+        Tiling(options.tiles),
+    )
     absent = _absent_queries(options, models.detector, regions)
     queries = [*_task_queries(options.task, regions), *absent]
     if options.pictures is not None:

@@ -49,11 +49,16 @@ def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
     ],
 )
 def test_an_agent_restores_the_settings_of_its_configuration_file(tmp_path: Path, mission: MissionSettings) -> None:
-    perception = PerceptionSettings(tmp_path / "a.onnx", resegment=True, segmenter="depth", vocabulary=tmp_path / "v")
+    perception = PerceptionSettings(
+        tmp_path / "a.onnx", resegment=True, segmenter="depth", vocabulary=tmp_path / "v", tiles=3
+    )
     config = tmp_path / "config.toml"
     config.write_text(to_toml({**mission_options(mission), **perception_options(perception)}))
     settings = parse_arguments(["--config", str(config)])
     assert settings.mission == mission
     at_rate = mission.rate_hz is not None
     threads = 1 if at_rate else mission.threads
-    assert settings.perception == replace(perception, threads=threads, asynchronous=at_rate)
+    detection_time_s = None if mission.rate_hz is None else 5 / mission.rate_hz
+    assert settings.perception == replace(
+        perception, threads=threads, asynchronous=at_rate, detection_time_s=detection_time_s
+    )

@@ -166,3 +166,18 @@ def test_relations_separate_two_targets_of_one_noun():
     on, beside = small_object("mug", 0.4, -0.4, 0.1), small_object("mug", 2.0, -0.4, 0.1)
     spatial.observe([TABLE, on, beside])
     assert (spatial.target_of(on), spatial.target_of(beside)) == ("mug", "mug_2")
+
+
+@pytest.mark.parametrize(
+    ("phrase", "size_m", "is_possible"),
+    [
+        ("chair", (1.5, 0.02, 1.0), False),  # a rug
+        ("chair", (0.5, 0.9, 0.5), True),
+        ("sofa", (2.0, 0.8, 0.9), True),
+        ("chair", (0.3, 0.02, 0.3), True),  # a part of a chair that the table does not hide
+        ("stool", (0.6, 0.02, 0.5), True),
+        ("table", (1.5, 0.02, 1.0), True),
+    ],
+)
+def test_a_seat_with_a_back_is_not_flat(phrase, size_m, is_possible):
+    assert filter_of().is_possible(box(phrase, (0.0, 0.8, 0.0), size_m)) == is_possible

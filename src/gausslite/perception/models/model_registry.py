@@ -9,6 +9,7 @@ from typing import Final
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.perception.detect import BoxDetector, Detector, SegmentedDetector, Segmenter
 from gausslite.perception.models.model_file import OpenModel, open_model
+from gausslite.perception.tiles import TiledDetector, Tiling
 from gausslite.perception.yolo_decode import MASK_COEFFICIENTS
 
 VOCABULARY: Final = "vocab.txt"
@@ -63,19 +64,21 @@ class ModelRegistry:
 
     def __init__(
         self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None,
-        accept_similar: bool = False,
+        accept_similar: bool = False, tiling: Tiling | None = None,
     ) -> None:  # fmt: skip
         """Open the detector's file and build the segmenter.
 
         segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour), or the path of a FastSAM file. None
         selects the detector's own masks if it has them, else "depth". vocabulary: the text encoder's, by default next
-        to the detector. accept_similar: also detect classes that are only similar to a noun. Raises ModelFileError,
-        InvalidInputError, KernelError.
+        to the detector. accept_similar: also detect classes that are only similar to a noun. tiling: tiles in which the
+        detector also runs; by default none. Raises ModelFileError, InvalidInputError, KernelError.
         """
         model = open_model(detector, threads)
         family = identify_family(model)
         if family is ModelFamily.TEXT_ENCODER:
             raise ModelFileError(f"model {detector}: expected a detector, got a {family}, which belongs beside one")
+        self._segmenter: Segmenter
+        self._tiling = tiling or Tiling(1)
         if family is ModelFamily.YOLO_SEG:
             self._use_yolo_masks(model, segmenter, threads, accept_similar)
             return
@@ -83,7 +86,7 @@ class ModelRegistry:
             raise InvalidInputError(
                 f"segmenter: {model.path} finds boxes only; expected depth or a FastSAM file, got {OWN_MASKS}"
             )
-        self._segmenter: Segmenter = _segmenter(segmenter or DEPTH, threads)
+        self._segmenter = _segmenter(segmenter or DEPTH, threads)
         if family is ModelFamily.YOLO_BOXES:
             from gausslite.perception.yolo import load_yolo
 
@@ -95,7 +98,7 @@ class ModelRegistry:
     @property
     def detector(self) -> Detector:
         """The detector of the task's nouns, with masks."""
-        return self._detector
+        return self._detector if self._tiling.per_side == 1 else TiledDetector(self._detector, self._tiling)
 
     @property
     def segmenter(self) -> Segmenter:
