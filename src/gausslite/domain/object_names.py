@@ -34,6 +34,7 @@ SURFACE: Final = frozenset(
 SEAT: Final = frozenset({"chair", "armchair", "stool", "couch", "sofa", "loveseat", "bench", "ottoman"})
 # seats that stand up: a flat surface is none of them
 BACKED_SEAT: Final = frozenset({"chair", "armchair", "couch", "sofa", "loveseat"})
+PLANT: Final = frozenset({"plant", "houseplant", "tree", "bush", "shrub", "fern", "flower", "bouquet", "ivy", "palm"})
 # open vessels and boxes: what they hold belongs to them
 CONTAINER: Final = frozenset(
     {"bowl", "basket", "box", "crate", "bin", "tray", "dish", "bucket", "tub", "basin", "pot", "pan", "carton"}
@@ -123,6 +124,11 @@ def is_seat(phrase: str) -> bool:
 def has_back(phrase: str) -> bool:
     """Return True for chairs, sofas and other seats with a back."""
     return head_of(phrase) in BACKED_SEAT
+
+
+def is_plant(phrase: str) -> bool:
+    """Return True for plants and flowers: other things show between their leaves."""
+    return head_of(phrase) in PLANT
 
 
 def is_container(phrase: str) -> bool:

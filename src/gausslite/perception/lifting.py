@@ -13,6 +13,7 @@ from gausslite.domain.camera import lift
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import Detection
+from gausslite.perception.background_planes import without_background_planes
 from gausslite.perception.contents import with_contents
 from gausslite.perception.foreground import foreground_mask
 from gausslite.perception.object_map import Observation
@@ -65,13 +66,16 @@ def lift_detections(
     detections: Sequence[Detection], depth_m: Float32[ndarray, "h w"], frame: Frame
 ) -> list[tuple[Detection, Observation]]:
     """Return the detections with improved masks and their observations, without those that have too little depth."""
-    improved = [
-        replace(each, mask=with_contents(each.phrase, foreground_mask(each.mask, depth_m), depth_m))
-        for each in detections
-    ]
+    improved = [replace(each, mask=_improved_mask(each, depth_m, frame)) for each in detections]
     of_noun: dict[str, Bool[ndarray, "h w"]] = {}
     for each in improved:
         if not each.is_weak:
             of_noun[each.phrase] = of_noun.get(each.phrase, False) | each.mask
     lifted = [(each, lift_observation(each, depth_m, frame, of_noun.get(each.phrase))) for each in improved]
     return [(detection, observation) for detection, observation in lifted if observation is not None]
+
+
+def _improved_mask(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Bool[ndarray, "h w"]:
+    mask = foreground_mask(detection.mask, depth_m)
+    mask = without_background_planes(detection.phrase, mask, depth_m, frame.camera)
+    return with_contents(detection.phrase, mask, depth_m)
