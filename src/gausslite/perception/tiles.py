@@ -83,11 +83,14 @@ class TiledDetector:
         size_px = frame.depth_m.shape
         in_tiles: list[Detection] = []
         for tile in self._tiles_in_time(size_px, start_s):
-            in_tiles += [
-                _in_image(each, tile, size_px)
+            whole = [
+                each
                 for each in self._detector.detect(crop(frame, tile), queries)
                 if _is_whole_and_small(each, tile, size_px)
             ]
+            # detections of several nouns that share a mask share it in the image too: they show one object
+            masks = {id(each.mask): _mask_in_image(each.mask, tile, size_px) for each in whole}
+            in_tiles += [_in_image(each, tile, masks[id(each.mask)]) for each in whole]
         for detection in sorted(in_tiles, key=lambda each: -each.score):
             found = _merged(found, detection)
         return sorted(found, key=lambda each: -each.score)
@@ -159,10 +162,14 @@ def _is_whole_and_small(detection: Detection, tile: Tile, size_px: tuple[int, ..
     return not is_cut and max((right - left) / width, (bottom - top) / height) <= _MAX_SIDE_SHARE
 
 
-def _in_image(detection: Detection, tile: Tile, size_px: tuple[int, ...]) -> Detection:
-    """Return a tile's detection in the pixels of the image."""
-    mask = np.zeros(size_px, np.bool_)
-    mask[tile.top_px : tile.bottom_px, tile.left_px : tile.right_px] = detection.mask
+def _mask_in_image(mask: Bool[ndarray, "h w"], tile: Tile, size_px: tuple[int, ...]) -> Bool[ndarray, "H W"]:
+    in_image = np.zeros(size_px, np.bool_)
+    in_image[tile.top_px : tile.bottom_px, tile.left_px : tile.right_px] = mask
+    return in_image
+
+
+def _in_image(detection: Detection, tile: Tile, mask: Bool[ndarray, "h w"]) -> Detection:
+    """Return a tile's detection in the pixels of the image, whose mask is given."""
     left, top, right, bottom = detection.box_px
     box_px = (left + tile.left_px, top + tile.top_px, right + tile.left_px, bottom + tile.top_px)
     is_weak = detection.is_weak or detection.score < _MIN_NEW_SCORE

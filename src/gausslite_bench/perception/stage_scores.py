@@ -23,6 +23,7 @@ from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings, merge_detections
 from gausslite_bench.perception.past_frames import PastFrames
+from gausslite_bench.perception.shared_detections import SharedDetections
 
 _MIN_FOUND_SHARE = 0.25
 
@@ -130,6 +131,9 @@ class PerceptionBench:
                 known = ", ".join(sorted(regions)) or "none"
                 raise InvalidInputError(f"objects: expected names among {known}; got {', '.join(unknown)}")
         names = dict.fromkeys(name for query in queries for name in query.objects)
+        detector = SharedDetections(
+            detector, tuple(dict.fromkeys(noun for query in queries for noun in query.graph.queries))
+        )
         self._regions = {name: regions[name] for name in names}
         self._evaluations = [_TaskEvaluation(query, detector, up_axis, segmenter) for query in queries]
 

@@ -126,6 +126,11 @@ def test_a_tile_replaces_a_weak_detection_and_keeps_those_of_other_nouns():
     assert [(each.phrase, each.is_weak) for each in found] == [("mug", False), ("bottle", False)]
 
 
+def test_detections_that_share_a_mask_share_it_in_the_image():
+    mug, thing = TiledDetector(RedDetector(), Tiling(2)).detect(frame_with((62, 8, 8)), ["mug", "thing"])
+    assert mug.mask is thing.mask
+
+
 def test_a_time_limit_leaves_tiles_to_the_next_detection():
     detector = RedDetector()
     # a detection takes a second, in a tile and in the whole image; after three of them a fourth would exceed 3.5 s
