@@ -6,6 +6,7 @@ from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.graph_draft import RelationTerms
 from gausslite.task.noun_phrase import NounPhrase, adjectives_only
+from gausslite.task.verbs import HANDLING_VERBS
 
 
 class Clause:
@@ -44,7 +45,7 @@ class Clause:
         self.verb_since_negation = False
 
 
-def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None) -> bool:
+def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None, verb: str | None) -> bool:
     """Return False for names of the robot, and for places, routes and measures that stand for another noun."""
     if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES:
         return False
@@ -53,6 +54,8 @@ def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None) -> 
     of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
     if compound and noun.head in lexicon.PLACES and not of_follows:
+        return True
+    if noun.head in lexicon.PAPERS and verb in HANDLING_VERBS and pending is None and not of_follows:
         return True
     unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
     if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):

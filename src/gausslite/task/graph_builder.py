@@ -215,7 +215,7 @@ class GraphBuilder:
         if adjectives_only(noun.words) and not (of_follows and noun.head in lexicon.PLACES):
             self._lone_adjectives(noun, pending, after)
             return
-        if not names_object(noun, pending, after):
+        if not names_object(noun, pending, after, self._clause.verb):
             self._skip_noun(noun, pending, conjoined, after)
             return
         if pending is not None and lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS:

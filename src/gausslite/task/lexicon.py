@@ -77,6 +77,8 @@ MEASURES: Final = word_set(
     "section suit bit heap batch handful slice lump chunk strip loaf record inventory close-up closeup overview "
     "weight"
 )
+# measures and places that a robot can also be asked to handle: "bring me the list"
+PAPERS: Final = word_set("picture photo photograph map list model record sample copy")
 # places that are also physical objects, unless "in" or "to" precedes them
 PHYSICAL_PLACES: Final = word_set("home corner site front back")
 BUILDINGS: Final = word_set("building house apartment")

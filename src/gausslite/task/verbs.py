@@ -84,6 +84,11 @@ COVERING_VERBS: Final = (
     | TOOL_VERBS
     | word_set("map reconstruct photograph capture record film model digitize monitor declutter tour roam watch empty")
 )
+# their object is a thing that exists: "fetch the map", unlike "make a map" and "take a picture"
+HANDLING_VERBS: Final = word_set(
+    "find locate fetch bring grab pick grasp retrieve collect carry move put place hand pass give deliver lift remove "
+    "hang"
+)
 _OTHER_VERBS: Final = word_set(
     # manipulation
     "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "

@@ -264,3 +264,20 @@ def test_the_validator_refuses_relations_between_unknown_nouns():
     graph = TaskGraph("id", "mug", ("mug",), (), (Relation(Predicate.ON, "mug", "table"),))
     with pytest.raises(TaskError, match="expected one of the anchors last, got 'table'"):
         require_graph(graph)
+
+
+@pytest.mark.parametrize(
+    ("text", "targets", "anchors"),
+    [
+        ("Find the map on the wall", ("map",), ("wall",)),
+        ("Bring me the photo on the shelf", ("photo",), ("shelf",)),
+        ("Fetch the list from the fridge", ("list",), ("fridge",)),
+        ("Make a map of the table", ("table",), ()),
+        ("Take a picture of the mug", ("mug",), ()),
+        ("Find the model of the car", ("car",), ()),
+        ("Extend the map around the sofa", ("sofa",), ()),
+    ],
+)
+def test_pictures_maps_and_lists_are_objects_where_the_robot_handles_them(text, targets, anchors):
+    graph = RuleParser().parse(text)
+    assert (graph.targets, graph.anchors) == (targets, anchors)
