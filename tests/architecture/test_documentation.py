@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -102,6 +103,19 @@ def test_files_named_in_pages_exist() -> None:
     assert not missing
 
 
+# in one process: most of a command's start are imports
+_PRINT_HELPS = """
+import importlib, json, sys
+for module, *arguments in json.loads(sys.argv[1]):
+    sys.argv = [module, *arguments]
+    print()
+    try:
+        importlib.import_module(f"{module}.__main__").main()
+    except SystemExit as end:
+        assert not end.code, (module, arguments, end.code)
+"""
+
+
 @pytest.fixture(scope="module")
 def known_flags() -> set[str]:
     """Return all flags in the --help of all programs."""
@@ -110,14 +124,13 @@ def known_flags() -> set[str]:
     commands += [["gausslite", "models", name, "--help"] for name in ("fetch", "verify", "list", "source", "inspect")]
     commands += [[program, "--help"] for program in PROGRAMS if program != "gausslite"]
     commands.append(["gausslite-fusion-server", "verify", "--help"])
-    flags: set[str] = set()
-    for program, *arguments in commands:
-        done = subprocess.run(
-            [sys.executable, "-m", PROGRAMS[program], *arguments], capture_output=True, text=True, timeout=60
-        )
-        assert done.returncode == 0, done.stderr
-        flags |= set(re.findall(r"--[a-z][\w-]*", done.stdout))
-    return flags
+    runs = [[PROGRAMS[program], *arguments] for program, *arguments in commands]
+    done = subprocess.run(
+        [sys.executable, "-c", _PRINT_HELPS, json.dumps(runs)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("\nusage: ") == len(runs)
+    return set(re.findall(r"--[a-z][\w-]*", done.stdout))
 
 
 def test_flags_named_in_pages_exist(known_flags: set[str]) -> None:
