@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import html
+import importlib
+import io
 import os
 import posixpath
 import re
-import subprocess
-import sys
 import tomllib
+from contextlib import redirect_stdout
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
+from unittest.mock import patch
 
 from latex2mathml.converter import convert as mathml
 from mkdocs.structure.files import File, Files
@@ -109,10 +111,17 @@ def _site_link(link: re.Match[str], page: Page) -> str:
 
 
 def _help(module: str, *arguments: str) -> str:
-    command = [sys.executable, "-m", module, *arguments, "--help"]
-    return subprocess.run(
-        command, check=True, capture_output=True, text=True, env={**os.environ, "COLUMNS": "110"}
-    ).stdout
+    """Return a help text. The programs run in this process: most of a command's start are imports."""
+    where, name = ("gausslite.cli.main", "main") if module == "gausslite" else (f"{module}.program", "run")
+    program = getattr(importlib.import_module(where), name)
+    text = io.StringIO()
+    with patch.dict(os.environ, COLUMNS="110"), redirect_stdout(text):
+        try:
+            program([*arguments, "--help"])
+        except SystemExit as end:
+            if end.code:
+                raise RuntimeError(f"{module} {' '.join(arguments)} --help ended with {end.code}") from None
+    return text.getvalue()
 
 
 def _sub_commands(help_text: str) -> list[str]:
