@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from gausslite.config.options_without_effect import NO_TEAM_MAP
+from gausslite.config.values import NONE
 from gausslite.domain.pose import unit_up_axis
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.frame_stream import FrameStream, region_file_note
@@ -183,7 +183,7 @@ def _open_uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bo
 def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: ExitStack) -> None:
     """Insert teammates' voxels of the task's region into the map, if --team-map is set."""
     link = settings.link
-    if link.fusion is None or link.team_map == NO_TEAM_MAP:
+    if link.fusion is None or link.team_map == NONE:
         return
     follower = TeamMapFollower(
         FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls),

@@ -21,12 +21,12 @@ from gausslite.config.mapping_options import (
     perception_settings,
 )
 from gausslite.config.numbers import Number
-from gausslite.config.options_without_effect import NO_TEAM_MAP, require_effect, require_fusion_server
+from gausslite.config.options_without_effect import require_effect, require_fusion_server
 from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
 from gausslite.config.traces_option import add_traces
-from gausslite.config.values import read_rigid_transform
+from gausslite.config.values import NONE, read_rigid_transform
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_identifier, require_name
@@ -68,7 +68,7 @@ class ConnectionSettings:
     grace_s: float = 5.0
     keyframes: int = _KEYFRAMES
     keyframes_during_mission: bool = False
-    team_map: str = NO_TEAM_MAP
+    team_map: str = NONE
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +273,8 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
     add("--spool", metavar="FILE", type=Path, help="store unsent data here, across restarts (default: in memory)")
     add(
         "--team-map",
-        choices=[NO_TEAM_MAP, "vote", "refined"],
-        default=NO_TEAM_MAP,
+        choices=[NONE, "vote", "refined"],
+        default=NONE,
         help="insert teammates' voxels of the task's region, voted or refined (default: %(default)s)",
     )
     add_switch(

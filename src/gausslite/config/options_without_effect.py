@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from gausslite.config.values import NONE
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.motion_model import MotionModel
 from gausslite.mission.frame_scheduler import SchedulerSettings
@@ -11,7 +12,6 @@ from gausslite.mission.settings import PoseMode
 from gausslite.perception.tiles import DEFAULT_TILES_PER_SIDE
 from gausslite.task.backends import RESPONSE_FORMATS, Backend
 
-NO_TEAM_MAP = "none"
 _DETECTOR, _RATE, _FUSION = "--detector FILE.onnx", "--rate HZ", "--fusion ADDRESS"
 _MODEL, _HTTP = "--backend onnx or http", "--backend http"
 
@@ -59,7 +59,7 @@ def require_fusion_server(options: argparse.Namespace) -> None:
         "--spool": options.spool is not None,
         "--handover": options.handover,
         "--keyframes": bool(options.keyframes),
-        "--team-map": options.team_map != NO_TEAM_MAP,
+        "--team-map": options.team_map != NONE,
     }
     for flag, is_set in values.items():
         if is_set:

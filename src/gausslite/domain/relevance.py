@@ -40,11 +40,12 @@ class Detection:
 
 @dataclass(frozen=True, slots=True)
 class DetectedBox:
-    """A detection without its mask, for a person; see Detection."""
+    """A detection without a mask; see Detection."""
 
     phrase: str
     score: float
     box_px: tuple[float, float, float, float]
+    rival: Rival | None = None
     is_weak: bool = False
 
 
@@ -62,7 +63,7 @@ class DetectedImage:
         return cls(
             frame.index,
             frame.rgb,
-            tuple(DetectedBox(each.phrase, each.score, each.box_px, each.is_weak) for each in detections),
+            tuple(DetectedBox(each.phrase, each.score, each.box_px, each.rival, each.is_weak) for each in detections),
         )
 
 

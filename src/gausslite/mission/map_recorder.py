@@ -20,7 +20,7 @@ _MAX_SNAPSHOTS, _LEAST_GAP_NS = 48, 250_000_000
 class MapRecorder:
     """Keeps at most 48 snapshots, at most 11 MB.
 
-    One takes about 25 ms. There are at most four a second of the recording, fewer as the mission goes on.
+    One takes about 25 ms. There are at most four a second of the recording, fewer in a longer mission.
     """
 
     _snapshots: EvenHistory[MapSnapshot] = field(default_factory=lambda: EvenHistory(_MAX_SNAPSHOTS, _LEAST_GAP_NS))

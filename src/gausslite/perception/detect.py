@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.relevance import Detection, Rival
+from gausslite.domain.relevance import DetectedBox, Detection
 
 
 @runtime_checkable
@@ -26,20 +25,6 @@ class Detector(Protocol):
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return what this detector searches for each query."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class DetectedBox:
-    """A detection without a mask; box_px is (left, top, right, bottom). rival: the class detected in the same box.
-
-    is_weak: the score is below the detector's threshold.
-    """
-
-    phrase: str
-    score: float
-    box_px: tuple[float, float, float, float]
-    rival: Rival | None = None
-    is_weak: bool = False
 
 
 @runtime_checkable

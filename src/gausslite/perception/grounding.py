@@ -15,8 +15,8 @@ from numpy import ndarray
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import MatchBasis, NounMatch
+from gausslite.domain.relevance import DetectedBox
 from gausslite.perception.box_size import BoxSizeLimits
-from gausslite.perception.detect import DetectedBox
 from gausslite.perception.grounding_text import PhraseInput, Tokenizer, encode_phrase
 from gausslite.perception.models.model_file import OpenModel, run_once
 

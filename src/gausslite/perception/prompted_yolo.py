@@ -14,8 +14,8 @@ from numpy import ndarray
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
+from gausslite.domain.relevance import DetectedBox
 from gausslite.perception.box_size import BoxSizeLimits
-from gausslite.perception.detect import DetectedBox
 from gausslite.perception.models.model_file import OpenModel, run_once
 from gausslite.perception.phrase_vectors import PhraseVectors
 from gausslite.perception.yolo_decode import Letterbox, decode, letterbox, suppress

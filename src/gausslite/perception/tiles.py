@@ -46,7 +46,7 @@ class Tiling:
     """How an image is divided: per_side x per_side tiles; 1 detects in the whole image alone.
 
     time_limit_s: no further tile is started if it would end later than this after the detection began; the next
-    detection goes on with the tiles that were left out. None detects in all tiles, so results do not depend on time.
+    detection starts with the tiles that were left out. None detects in all tiles, so results do not depend on time.
     """
 
     per_side: int = DEFAULT_TILES_PER_SIDE

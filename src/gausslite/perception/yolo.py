@@ -13,10 +13,10 @@ from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.object_names import is_generic, is_seat, same_kind
-from gausslite.domain.relevance import Detection, Rival
+from gausslite.domain.relevance import DetectedBox, Detection, Rival
 from gausslite.perception.box_size import BoxSizeLimits
 from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
-from gausslite.perception.detect import DetectedBox, box_iou
+from gausslite.perception.detect import box_iou
 from gausslite.perception.models.model_file import OpenModel
 from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
 from gausslite.perception.yolo_decode import Candidates, suppress

@@ -55,7 +55,7 @@ def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None, ver
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
     if compound and noun.head in lexicon.PLACES and not of_follows:
         return True
-    if noun.head in lexicon.PAPERS and verb in HANDLING_VERBS and pending is None and not of_follows:
+    if noun.head in lexicon.PHYSICAL_MEASURES and verb in HANDLING_VERBS and pending is None and not of_follows:
         return True
     unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
     if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):

@@ -78,7 +78,7 @@ MEASURES: Final = word_set(
     "weight"
 )
 # measures and places that a robot can also be asked to handle: "bring me the list"
-PAPERS: Final = word_set("picture photo photograph map list model record sample copy")
+PHYSICAL_MEASURES: Final = word_set("picture photo photograph map list model record sample copy")
 # places that are also physical objects, unless "in" or "to" precedes them
 PHYSICAL_PLACES: Final = word_set("home corner site front back")
 BUILDINGS: Final = word_set("building house apartment")

@@ -65,7 +65,7 @@ class MapPage:
         return f"http://{LOOPBACK}:{self.server.get_port()}"
 
     def show(self, contents: ViewContents) -> None:
-        """Replace the newest contents. A page that shows an earlier time goes on showing it."""
+        """Replace the newest contents. A page that shows an earlier time still shows it."""
         with self._lock:
             self._contents = contents
             self._scrub.extend_to(contents)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from gausslite.codec.map_history import MAX_GAUSSIANS
 from gausslite.domain.even_history import EvenHistory
 from gausslite.domain.important_gaussians import choose_gaussians
 from gausslite.view.contents import ViewContents
 
 _MAX_STATES = 64
-_MAX_GAUSSIANS = 20_000
-"""Of an earlier map, so that 64 of them take at most 91 MB."""
+"""Earlier maps: 91 MB at most, with MAX_GAUSSIANS each."""
 _NS_PER_S = 1e9
 _STEP_S = 0.01
 
@@ -88,7 +88,7 @@ class TimeScrub:
         if past is None:
             return "no earlier map is known: the splats are those of the newest map"
         earliest = " (the first one that is known)" if past.time_ns > time_ns else ""
-        coarse = ", coarse" if past.total > _MAX_GAUSSIANS else ""
+        coarse = ", coarse" if past.total > MAX_GAUSSIANS else ""
         return f"the map as it was after {self._seconds_of(past.time_ns):.1f} s{earliest}{coarse}"
 
     def show_note(self, content: str) -> None:
@@ -102,7 +102,7 @@ class TimeScrub:
 
 def _coarse(contents: ViewContents) -> ViewContents:
     """Return the most important Gaussians. The trajectory is left out: the newest one is a better estimate."""
-    rows = choose_gaussians(contents.gaussians, _MAX_GAUSSIANS)
+    rows = choose_gaussians(contents.gaussians, MAX_GAUSSIANS)
     return replace(
         contents,
         gaussians=contents.gaussians.take(rows),

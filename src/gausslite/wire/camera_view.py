@@ -124,7 +124,7 @@ def _detected_from_message(message: pb.DetectedImage) -> DetectedImage:
         box_px = each.left_px, each.top_px, each.right_px, each.bottom_px
         if not all(math.isfinite(value) for value in (*box_px, each.score)):
             raise InvalidInputError("detected boxes: expected finite numbers, got others")
-        boxes.append(DetectedBox(each.phrase, each.score, box_px, each.is_weak))
+        boxes.append(DetectedBox(each.phrase, each.score, box_px, is_weak=each.is_weak))
     rgb = decode_colour(message.colour_jpeg, message.width_px, message.height_px)
     return DetectedImage(message.frame_index, rgb, tuple(boxes))
 

@@ -15,7 +15,7 @@ from tiny_yolo import write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.perception.detect import DetectedBox
+from gausslite.domain.relevance import DetectedBox
 from gausslite.perception.grounding import GroundingDino, GroundingSettings, corners_px, phrase_scores, preprocess
 from gausslite.perception.grounding_text import BertTokenizer, encode_phrase
 from gausslite.perception.models.model_file import open_model

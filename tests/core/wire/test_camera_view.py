@@ -22,7 +22,10 @@ def view(poses: int) -> CameraView:
     roi = np.zeros((24, 32), np.bool_)
     roi[5:9, 6:20] = True
     rgb = np.full((24, 32, 3), 120, np.uint8)
-    boxes = (DetectedBox("mug", 0.9, (3.0, 4.5, 10.0, 12.0)), DetectedBox("mug", 0.2, (-1.0, 0.0, 5.0, 5.0), True))
+    boxes = (
+        DetectedBox("mug", 0.9, (3.0, 4.5, 10.0, 12.0)),
+        DetectedBox("mug", 0.2, (-1.0, 0.0, 5.0, 5.0), is_weak=True),
+    )
     detected = DetectedImage(5, rgb, boxes)
     return CameraView(rgb, roi, CAMERA, 7, path[-1], np.arange(poses, dtype=np.int64), path, path, detected)
 
