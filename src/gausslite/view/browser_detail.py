@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import threading
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -40,9 +41,12 @@ class BrowserDetail:
     The thread draws more splats when the camera rests, measures the answers, and goes back one step if they are slow.
     """
 
-    def __init__(self, client: Any, folder: Any, is_adaptive: bool) -> None:
-        """client: the browser's handle in viser. folder: where its number of splats is shown if it is slow."""
-        self._client = client
+    def __init__(self, client: Any, folder: Any, is_adaptive: bool, is_connected: Callable[[], bool]) -> None:
+        """client: the browser's handle in viser. folder: where its number of splats is shown if it is slow.
+
+        is_connected: says whether the server still lists the browser.
+        """
+        self._client, self._is_connected = client, is_connected
         with folder:
             self._note = client.gui.add_html("")
         self._changed = threading.Condition()
@@ -88,6 +92,10 @@ class BrowserDetail:
                     self._draw(splats, self._count if self._is_adaptive else len(splats))
         except (ConnectionError, TimeoutError):
             return
+        except RuntimeError:
+            # viser removes the handles of a browser that leaves at any moment, and refuses to write to them
+            if self._is_connected():
+                raise
 
     def _wait_for_work(self) -> Splats | None:
         """Return splats to draw, or those that are drawn if more of them can be tried; None at the end."""

@@ -74,8 +74,11 @@ class SplatLayer:
 
     def _connect(self, client: Any) -> None:
         with self._lock:
-            browser = BrowserDetail(client, self._folder, self._is_adaptive)
-            self._browsers[client.client_id] = browser
+            browser_id = client.client_id
+            browser = BrowserDetail(
+                client, self._folder, self._is_adaptive, lambda: browser_id in self._server.get_clients()
+            )
+            self._browsers[browser_id] = browser
             if self._splats is not None:
                 browser.show(self._splats)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from browser import open_browser
 from sample_gaussians import plain_gaussians, random_gaussians
 
 from gausslite.view import browser_detail
-from gausslite.view.browser_detail import PREVIEW_COUNT, RESPONSE_LIMIT_S, next_count
+from gausslite.view.browser_detail import PREVIEW_COUNT, RESPONSE_LIMIT_S, BrowserDetail, next_count
 from gausslite.view.contents import ViewContents
 from gausslite.view.level_of_detail import spread_order
 
@@ -86,4 +87,34 @@ def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_mor
             page.show(ViewContents.of_one_agent(points(PREVIEW_COUNT // 2)))
             tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT // 2}")
     finally:
+        page.close()
+
+
+def test_a_browser_that_leaves_while_its_answer_is_used_ends_the_thread_quietly(monkeypatch):
+    measured, has_left = threading.Event(), threading.Event()
+    failures: list[object] = []
+
+    def answer_then_leave(_: BrowserDetail) -> float:
+        measured.set()
+        has_left.wait()
+        return 2 * RESPONSE_LIMIT_S
+
+    monkeypatch.setattr(BrowserDetail, "_response_s", answer_then_leave)
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+    page = open_page(0, "test")
+    try:
+        page.show(ViewContents.of_one_agent(points(3 * PREVIEW_COUNT)))
+        with open_browser() as browser:
+            tab = browser.new_page()
+            tab.goto(page.url)
+            while not measured.is_set():  # the browser needs this thread to load the page
+                tab.wait_for_timeout(50)
+            worker = next(thread for thread in threading.enumerate() if thread.name == "browser-detail")
+        while page.server.get_clients():
+            pass
+        has_left.set()
+        worker.join()
+        assert not failures
+    finally:
+        has_left.set()
         page.close()
