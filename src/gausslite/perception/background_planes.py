@@ -1,4 +1,4 @@
-"""Remove walls and boards that show between the leaves of a plant, where depth has no clear gap."""
+"""Remove what shows between the leaves of a plant or the legs of a seat, where depth has no clear gap."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, back_project
-from gausslite.domain.object_names import is_plant
+from gausslite.domain.object_names import is_plant, is_seat
 
 _RING_PX: Final = (2, 9)
 _MAX_PLANES: Final = 3
@@ -26,12 +26,12 @@ _MIN_LEFT_SHARE: Final = 0.2
 def without_background_planes(
     phrase: str, mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"], camera: Camera
 ) -> Bool[ndarray, "h w"]:
-    """Return a plant's mask without pixels on planes that also surround it; other objects' masks unchanged.
+    """Return the mask of a plant or seat without pixels on planes that also surround it; other masks unchanged.
 
     A plane has a fifth of the points in a ring around the mask. If it has more than four fifths of the mask, the mask
     is unchanged: then the plane is the object.
     """
-    if not is_plant(phrase) or not mask.any():
+    if not (is_plant(phrase) or is_seat(phrase)) or not mask.any():
         return mask
     rows, columns = np.nonzero(mask)
     margin_px = _RING_PX[1]

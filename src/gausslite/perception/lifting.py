@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from gausslite.perception.object_masks import mask_colours, mask_votes
 
 _MIN_PIXELS = 8
 _MAX_PIXELS = 4000
+_MIN_OWN_SHARE = 0.5
 
 
 def best_depth_m(
@@ -36,14 +37,16 @@ def lift_observation(
     detection: Detection,
     depth_m: Float32[ndarray, "h w"],
     frame: Frame,
-    siblings: Bool[ndarray, "h w"] | None = None,
+    siblings: Bool[ndarray, "h w"] | None,
+    own_pixels: Bool[ndarray, "h w"],
 ) -> Observation | None:
     """Lift a detection's mask to an observation in the world; None if too few of its pixels have depth.
 
     The paper lifts the pixel at the 2D centroid, which may lie outside the object; this lifts all pixels.
-    siblings: pixels of the frame's detections of the same noun. A weak detection has no votes and colours.
+    siblings: pixels of the frame's detections of the same noun. own_pixels: the part of the mask that locates the
+    object. A weak detection has no votes and colours.
     """
-    rows, columns = np.nonzero(detection.mask & (depth_m > 0))
+    rows, columns = np.nonzero(own_pixels & (depth_m > 0))
     if len(rows) < _MIN_PIXELS:
         return None
     step = max(1, len(rows) // _MAX_PIXELS)
@@ -71,8 +74,23 @@ def lift_detections(
     for each in improved:
         if not each.is_weak:
             of_noun[each.phrase] = of_noun.get(each.phrase, False) | each.mask
-    lifted = [(each, lift_observation(each, depth_m, frame, of_noun.get(each.phrase))) for each in improved]
+    lifted = [
+        (each, lift_observation(each, depth_m, frame, of_noun.get(each.phrase), _own_pixels(each, of_noun)))
+        for each in improved
+    ]
     return [(detection, observation) for detection, observation in lifted if observation is not None]
+
+
+def _own_pixels(detection: Detection, of_noun: Mapping[str, Bool[ndarray, "h w"]]) -> Bool[ndarray, "h w"]:
+    """Return the mask's pixels that no other noun claims, or all if those are less than half.
+
+    The mask of a chair spills over to the leg of a table beside it, and would locate the chair at the table.
+    """
+    own = detection.mask.copy()
+    for noun, claimed in of_noun.items():
+        if noun != detection.phrase:
+            own &= ~claimed
+    return own if np.count_nonzero(own) >= _MIN_OWN_SHARE * np.count_nonzero(detection.mask) else detection.mask
 
 
 def _improved_mask(detection: Detection, depth_m: Float32[ndarray, "h w"], frame: Frame) -> Bool[ndarray, "h w"]:

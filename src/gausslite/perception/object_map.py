@@ -13,6 +13,7 @@ from numpy import ndarray
 from gausslite.domain.relevance import Rival
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.perception.colours import no_colours
+from gausslite.perception.fitted_plane import FittedPlane
 from gausslite.perception.surface_votes import SurfaceVotes
 
 _CELL_GRID: Final = VoxelGrid(0.05)
@@ -39,6 +40,7 @@ class Observation:
     capture time. rival: a different thing detected in the same place. votes: which voxels the mask
     shows inside and outside the object. colours: `colour_counts` of the mask's pixels.
     supports_m: the levels of planes seen under it, along up in the world. is_weak: of a weak detection.
+    plane: fits the mask's points; None for a whole object.
     """
 
     phrase: str
@@ -53,6 +55,7 @@ class Observation:
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
     supports_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     is_weak: bool = False
+    plane: FittedPlane | None = None
 
     @classmethod
     def from_points(
@@ -69,7 +72,7 @@ class Observation:
         radius_m = 2.0 * float(np.median(distances))
         inliers = points_m[distances <= 2.0 * max(radius_m, _MIN_MATCH_DISTANCE_M)]
         cells = np.unique(_CELL_GRID.keys(inliers.astype(np.float32)))
-        return cls(phrase, centroid, radius_m, cells, camera_m, score, time_ns)
+        return cls(phrase, centroid, radius_m, cells, camera_m, score, time_ns, plane=FittedPlane.of(inliers))
 
     @property
     def distance_m(self) -> float:
@@ -84,6 +87,10 @@ class Observation:
         width_m = float(np.linalg.norm(across_m))
         height_m = float(np.ptp(np.percentile(heights_m, _INNER_PERCENTILES)))
         return width_m >= _MIN_FLAT_WIDTH_M and height_m <= _MAX_FLAT_SLOPE * width_m
+
+    def is_panel(self, up: Float64[ndarray, "3"]) -> bool:
+        """Return True if the points are thin and upright, as those of a screen. up: in the world."""
+        return self.plane is not None and self.plane.is_panel(up)
 
 
 @dataclass(slots=True, eq=False)

@@ -105,8 +105,9 @@ class SpatialFilter:
         return self._floor
 
     def is_possible(self, observation: Observation) -> bool:
-        """Return False for a seat with a back that is flat: detectors take rugs for chairs."""
-        return not (has_back(observation.phrase) and observation.is_flat(self._up))
+        """Return False for a seat with a back that is flat: detectors take rugs and screens for chairs."""
+        is_flat = observation.is_flat(self._up) or observation.is_panel(self._up)
+        return not (is_flat and has_back(observation.phrase))
 
     def with_support(self, observation: Observation, detection: Detection, frame: Frame) -> Observation:
         """Return the observation with the level of the plane under it, if a relation needs it."""

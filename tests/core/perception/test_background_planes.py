@@ -1,4 +1,4 @@
-"""Planes around a plant are removed from its mask; what is not a plant, or is the plane itself, stays."""
+"""Planes around a plant or seat are removed from its mask; other objects, and what is the plane itself, stay."""
 
 from __future__ import annotations
 
@@ -41,6 +41,22 @@ def test_two_walls_of_a_corner_are_removed():
     found = without_background_planes("plant", mask, depth_m, CAMERA)
     assert (found & leaves).sum() > 0.9 * leaves.sum()
     assert (found & ~leaves).sum() < 0.1 * mask.sum()
+
+
+@pytest.mark.parametrize("seat", ["chair", "bar stool"])
+def test_the_floor_between_the_legs_of_a_seat_is_removed(seat):
+    rows = np.broadcast_to(np.arange(120)[:, None] + 0.5, (120, 160))
+    columns = np.broadcast_to(np.arange(160)[None, :], (120, 160))
+    # the camera looks down by 45 degrees from 1.5 m above the floor
+    below = (rows - CAMERA.cy_px) / CAMERA.fy_px
+    floor_m = 1.5 * np.sqrt(2.0) / (1.0 + below)
+    mask = (np.abs(columns - 80) < 24) & (np.abs(rows - 60) < 24)
+    legs = mask & (np.abs(columns - 80) > 18)
+    noise_m = np.random.default_rng(1).normal(0.0, NOISE_M, floor_m.shape)
+    depth_m = (np.where(legs, floor_m - 0.15, floor_m) + noise_m).astype(np.float32)
+    found = without_background_planes(seat, mask, depth_m, CAMERA)
+    assert (found & legs).sum() > 0.97 * legs.sum()
+    assert (found & ~legs).sum() < 0.03 * mask.sum()
 
 
 def test_masks_of_other_objects_are_unchanged():

@@ -175,9 +175,21 @@ def test_relations_separate_two_targets_of_one_noun():
         ("chair", (0.5, 0.9, 0.5), True),
         ("sofa", (2.0, 0.8, 0.9), True),
         ("chair", (0.3, 0.02, 0.3), True),  # a part of a chair that the table does not hide
+        ("chair", (0.5, 0.4, 0.012), False),  # a screen
+        ("chair", (0.5, 0.4, 0.08), True),  # the back of a chair
+        ("chair", (0.15, 0.15, 0.004), True),
         ("stool", (0.6, 0.02, 0.5), True),
         ("table", (1.5, 0.02, 1.0), True),
+        ("monitor", (0.5, 0.4, 0.012), True),
     ],
 )
 def test_a_seat_with_a_back_is_not_flat(phrase, size_m, is_possible):
     assert filter_of().is_possible(box(phrase, (0.0, 0.8, 0.0), size_m)) == is_possible
+
+
+@pytest.mark.parametrize(("lean_deg", "is_possible"), [(2.0, False), (12.0, True)])
+def test_a_thin_back_of_a_chair_leans_and_a_screen_does_not(lean_deg, is_possible):
+    along, across = np.meshgrid(np.linspace(0.0, 0.4, 40), np.linspace(0.0, 0.5, 40))
+    lean = np.deg2rad(lean_deg)
+    points_m = np.column_stack([across.ravel(), -np.cos(lean) * along.ravel(), np.sin(lean) * along.ravel()])
+    assert filter_of().is_possible(Observation.from_points("chair", points_m)) == is_possible
