@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
@@ -106,7 +105,7 @@ class EstimatorFactory:
         It uses the user's models or, without any, the scene's ground truth. Raises InvalidInputError without both.
         """
         accept_similar = self._perception.accept_similar
-        evidence = EvidenceSettings(max_rival_ratio=math.inf) if accept_similar else EvidenceSettings()
+        evidence = EvidenceSettings.accept_similar() if accept_similar else EvidenceSettings()
         settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
         if self._models is None:
             return TaskRelevanceEstimator(graph, self._ground_truth_detector(), settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,7 +32,9 @@ class EvidenceSettings:
 
     Of the frames that should show it, at least min_seen_fraction must have detected it. Its scores must sum to
     at least 1 / max_rival_ratio of those of any different thing detected in its place: the nearest class of a detector
-    is not always the class of the object. After min_seen_known detections, earlier frames get its mask too.
+    is not always the class of the object. Its best score must be at least min_score_share of the best score among the
+    objects of its target: jars are detected as bottles, with lower scores than the bottles. After min_seen_known
+    detections, earlier frames get its mask too.
     """
 
     min_seen: int = 2
@@ -39,12 +42,13 @@ class EvidenceSettings:
     confident_score: float = 0.6
     min_seen_fraction: float = 0.25
     max_rival_ratio: float = 1.3
+    min_score_share: float = 0.45
 
     def __post_init__(self) -> None:
         for name in ("min_seen", "min_seen_known"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"evidence {name}: expected at least 1, got {getattr(self, name)}")
-        for name in ("confident_score", "min_seen_fraction"):
+        for name in ("confident_score", "min_seen_fraction", "min_score_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidInputError(f"evidence {name}: expected 0 to 1, got {getattr(self, name)}")
         if not self.max_rival_ratio > 0:
@@ -53,7 +57,12 @@ class EvidenceSettings:
     @classmethod
     def accept_all(cls) -> EvidenceSettings:
         """Return settings that confirm every detection."""
-        return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0, max_rival_ratio=np.inf)
+        return cls(min_seen=1, confident_score=0.0, min_seen_fraction=0.0, max_rival_ratio=np.inf, min_score_share=0.0)
+
+    @classmethod
+    def accept_similar(cls) -> EvidenceSettings:
+        """Return settings that also confirm objects that are rather a different thing."""
+        return cls(max_rival_ratio=np.inf, min_score_share=0.0)
 
     def is_confirmed(self, landmark: Landmark) -> bool:
         """Return True if the landmark has enough evidence to exist."""
@@ -66,6 +75,11 @@ class EvidenceSettings:
         """Return the different thing that the landmark rather is by the sums of the scores; None if there is none."""
         name, score = max(landmark.rival_scores.items(), key=lambda each: each[1], default=("", 0.0))
         return name if score > self.max_rival_ratio * landmark.score_sum else None
+
+    def comparable(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
+        """Return those of one target's landmarks whose best scores are not far below the best of all."""
+        limit = self.min_score_share * max((each.best_score for each in landmarks), default=0.0)
+        return [each for each in landmarks if each.best_score >= limit]
 
     def is_reliable(self, landmark: Landmark) -> bool:
         """Return True if a confident detection, or three times min_seen detections, confirm the landmark.

@@ -96,13 +96,17 @@ class RelevanceTracker:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What colours decided, different things, and anchors that no frame has shown yet."""
+        """What colours decided, different things, low scores, and anchors that no frame has shown yet."""
         rivals = (
             f"what looks like {each.phrase!r} is rather {rival!r}: not activated; --accept-similar accepts it"
             for each, rival in self._filter.rivals
         )
+        doubtful = (
+            f"{count} {noun!r} objects scored far below the best: not activated; --accept-similar accepts them"
+            for noun, count in self._filter.doubtful
+        )
         unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
-        return (*self._filter.colour_notes, *self._filter.height_notes, *dict.fromkeys(rivals), *unseen)
+        return (*self._filter.colour_notes, *self._filter.height_notes, *dict.fromkeys(rivals), *doubtful, *unseen)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:

@@ -70,6 +70,15 @@ class SpatialFilter:
         return tuple((each, rival) for each, rival in rivals if rival is not None)
 
     @property
+    def doubtful(self) -> tuple[tuple[str, int], ...]:
+        """Nouns of targets, and how many of their objects have scores far below the best of them."""
+        counts = []
+        for noun in self._names:
+            seen = [each for each in self.confirmed_landmarks if each.phrase == noun]
+            counts.append((noun, len(seen) - len(self._evidence.comparable(seen))))
+        return tuple((noun, count) for noun, count in counts if count)
+
+    @property
     def unseen_anchors(self) -> tuple[str, ...]:
         """Anchors of relations that no frame has shown yet, with their colours."""
         needed = dict.fromkeys(
@@ -133,13 +142,13 @@ class SpatialFilter:
     def targets(self, T_world_camera: Float64[ndarray, "4 4"]) -> list[tuple[Landmark, str]]:
         """Return the confirmed landmarks that satisfy the relations of a target, with the target's name.
 
-        A superlative selects one of them, before those are left out that are no longer present. T_world_camera: the
-        viewpoint of relations such as left_of.
+        A superlative selects one of them, before those are left out that are no longer present. Those whose scores are
+        far below that of another are left out too. T_world_camera: the viewpoint of relations such as left_of.
         """
         named = [(each, self.target_of(each.seen_from(T_world_camera[:3, 3]))) for each in self.confirmed_landmarks]
         chosen = []
         for target, superlative in self._superlatives.items():
-            candidates = [landmark for landmark, name in named if name == target]
+            candidates = self._evidence.comparable([landmark for landmark, name in named if name == target])
             if candidates and superlative is not None:
                 reliable = [each for each in candidates if self._evidence.is_reliable(each)]
                 candidates = [select_extreme(reliable or candidates, superlative, self._up, T_world_camera)]

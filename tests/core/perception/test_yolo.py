@@ -156,7 +156,7 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     task = TaskGraph("id", "find the laptop", ("laptop",), (), ())
     strict = TaskRelevanceEstimator(task, detector)
     lenient = TaskRelevanceEstimator(
-        task, detector, RelevanceTrackerSettings(evidence=EvidenceSettings(max_rival_ratio=float("inf")))
+        task, detector, RelevanceTrackerSettings(evidence=EvidenceSettings.accept_similar())
     )
     frames = [replace(frame_with_red_square(), index=index) for index in range(7)]
     assert not any(strict.estimate(frame).relevance.roi.any() for frame in frames)
@@ -168,6 +168,27 @@ def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
     restored = TaskRelevanceEstimator(task, detector)
     restored.restore(strict.state())
     assert restored.nouns == strict.nouns
+
+
+@pytest.mark.parametrize(("score", "marked"), [(0.3, {True, False}), (0.5, {True})])
+def test_an_object_with_a_far_lower_score_than_another_is_left_out(tmp_path, score, marked):
+    high, low = (24.0, 32.0, 16.0, 16.0, 0, 0.9), (48.0, 32.0, 16.0, 16.0, 0, score)
+    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", ("bottle",), [high, low]))
+    task = TaskGraph("id", "find the bottles", ("bottle",), (), ())
+    strict = TaskRelevanceEstimator(task, detector, RelevanceTrackerSettings(max_frames=1))
+    settings = RelevanceTrackerSettings(max_frames=1, evidence=EvidenceSettings.accept_similar())
+    lenient = TaskRelevanceEstimator(task, detector, settings)
+    frame = frame_with_red_square()
+    frame.rgb[16:48, 80:112, 0] = 255
+    for index in range(2):
+        strict_roi, lenient_roi = (
+            each.estimate(replace(frame, index=index)).relevance.roi for each in (strict, lenient)
+        )
+    left, right = slice(0, strict_roi.shape[1] // 2), slice(strict_roi.shape[1] // 2, None)
+    assert {bool(strict_roi[:, half].any()) for half in (left, right)} == marked
+    assert all(lenient_roi[:, half].any() for half in (left, right))
+    left_out = ("1 'bottle' objects scored far below the best: not activated; --accept-similar accepts them",)
+    assert strict.notes == (left_out if False in marked else ())
 
 
 def test_segmenter_matches_instances_of_any_class_to_boxes(tmp_path):
