@@ -17,6 +17,7 @@ from gausslite.domain.pose import inverse, transform_points
 from gausslite.perception.object_map import Landmark
 
 _RELIABLE_FACTOR: Final = 3
+_WEAK_SHARE: Final = 0.5
 # slightly below a third: two misses for each detection are accepted
 _MIN_PRESENT_SHARE: Final = 0.33
 _NEAR_M: Final = 0.05
@@ -91,8 +92,12 @@ class EvidenceSettings:
         return has_evidence and self.is_confirmed(landmark)
 
     def is_known(self, landmark: Landmark) -> bool:
-        """Return True if the landmark is confirmed and detected so often that earlier frames get its mask."""
-        return landmark.seen_count >= self.min_seen_known and self.is_confirmed(landmark)
+        """Return True if the landmark is confirmed and detected so often that earlier frames get its mask.
+
+        A weak detection counts half.
+        """
+        found = landmark.seen_count + _WEAK_SHARE * landmark.weak_count
+        return found >= self.min_seen_known and self.is_confirmed(landmark)
 
     def is_present(self, landmark: Landmark) -> bool:
         """Return True if the latest frame with detections found the landmark, or few frames missed a known one."""

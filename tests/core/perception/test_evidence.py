@@ -127,6 +127,11 @@ def test_a_known_target_survives_missed_detections_without_a_high_score():
     assert target_marked([0.4, 0.4, 0.4, *[None] * 7], 10) == [False] + [True] * 8 + [False]
 
 
+def test_two_weak_detections_make_an_object_known_like_a_third_detection():
+    assert target_marked([0.4, 0.4, 0.2, None], 4) == [False, True, True, False]
+    assert target_marked([0.4, 0.4, 0.2, 0.2, None, None], 6) == [False] + [True] * 5
+
+
 def test_an_object_missed_by_most_frames_is_not_confirmed():
     assert not any(target_marked([0.4, *[None] * 9, 0.4], 11))
 
