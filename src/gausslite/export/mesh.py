@@ -29,7 +29,7 @@ _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 
 
 @runtime_checkable
-class RenderedView(Protocol):
+class MapRendering(Protocol):
     """A rendering of the map: colours in [0, 1], opacity in [0, 1], expected depth in metres (0 where unknown)."""
 
     @property
@@ -47,7 +47,7 @@ class RenderedView(Protocol):
         ...
 
 
-Render = Callable[[Camera, Float64[ndarray, "4 4"]], RenderedView]
+Render = Callable[[Camera, Float64[ndarray, "4 4"]], MapRendering]
 """Renders the whole map from a camera pose (camera, T_world_camera)."""
 
 
@@ -75,7 +75,7 @@ class TsdfVolume:
         indices = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1).reshape(-1, 3)
         self._centres_m = (self.origin_m + (indices + 0.5) * self.voxel_m).astype(np.float32)
 
-    def integrate(self, view: KeyframeView, rendering: RenderedView) -> None:
+    def integrate(self, view: KeyframeView, rendering: MapRendering) -> None:
         """Add one rendered view."""
         rows, pixels, depth_m = self._visible(view)
         surface_m = rendering.expected_depth_m()[pixels]
