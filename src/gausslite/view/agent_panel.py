@@ -41,7 +41,7 @@ class AgentPanel:
             self._assign = gui.add_button("Assign task")
             self._end = gui.add_button("End mission", color="red")
             self._message = gui.add_html("")
-        self._camera = CameraPanel(gui)
+        self._camera = CameraPanel(page)
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
@@ -81,9 +81,10 @@ class AgentPanel:
 
     def _show_images(self, view: CameraView, objects: tuple[ObjectLandmark, ...]) -> None:
         image = with_objects(with_region(view.rgb, view.roi), objects, view.camera, view.T_world_camera)
-        self._camera.show_keyframe(image)
+        time_ns = int(view.times_ns[-1]) if len(view.times_ns) else None
+        self._camera.show_keyframe(view.frame_index, image, time_ns)
         if view.detected is not None:
-            self._camera.show_detections(view.detected)
+            self._camera.show_detections(view.detected, time_ns)
 
     def _show_status(self, status: Any) -> None:
         now_s, uplink = time.monotonic(), status.uplink

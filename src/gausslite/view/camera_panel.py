@@ -2,38 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from jaxtyping import UInt8
 from numpy import ndarray
 
 from gausslite.domain.relevance import DetectedImage
 from gausslite.view.camera_image import with_detections
+from gausslite.view.camera_images import CameraImage, CameraImages
+from gausslite.view.map_page import MapPage
+
+_KEYFRAME, _DETECTION = "1 keyframe", "2 detection"
+"""The names decide the order."""
 
 
 class CameraPanel:
-    """Owns the images. Use it from one thread."""
+    """Owns the images. Use it from one thread. time_ns: the time of the map that belongs to the image."""
 
-    def __init__(self, gui: Any) -> None:
-        self._gui = gui
-        with gui.add_folder("Camera", order=0) as self._folder:
+    def __init__(self, page: MapPage) -> None:
+        with page.server.gui.add_folder("Camera", order=0) as folder:
             pass
-        self._keyframe: Any = None
-        self._detected: Any = None
+        self._images = CameraImages(page, folder)
 
-    def show_keyframe(self, image: UInt8[ndarray, "h w 3"]) -> None:
-        """Show the newest keyframe with its region and objects."""
-        label = "Newest keyframe: the task's region in red, objects in green"
-        self._keyframe = self._show(self._keyframe, image, label)
+    def show_keyframe(self, index: int, image: UInt8[ndarray, "h w 3"], time_ns: int | None) -> None:
+        """Show the newest keyframe, which is this frame, with its region and objects."""
+        detail = f"frame {index}, the task's region in red, objects in green"
+        self._images.show(_KEYFRAME, CameraImage(image, "Newest keyframe", detail), time_ns)
 
-    def show_detections(self, detected: DetectedImage) -> None:
+    def show_detections(self, detected: DetectedImage, time_ns: int | None) -> None:
         """Show the boxes of the newest detection."""
-        label = f"Newest detection, frame {detected.index}: boxes with scores, too low ones in grey"
-        self._detected = self._show(self._detected, with_detections(detected), label)
-
-    def _show(self, handle: Any, image: UInt8[ndarray, "h w 3"], label: str) -> Any:
-        if handle is None:
-            with self._folder:
-                return self._gui.add_image(image, label=label, format="jpeg")
-        handle.image, handle.label = image, label
-        return handle
+        detail = f"frame {detected.index}, boxes with scores, too low ones in grey"
+        self._images.show(_DETECTION, CameraImage(with_detections(detected), "Newest detection", detail), time_ns)

@@ -34,7 +34,7 @@ class FusionPanel:
             self._status = gui.add_html("")
             self._refine = gui.add_button("Start refinement")
             self._message = gui.add_html("")
-        self._keyframes, self._cameras = TeamKeyframes(client), TeamCameras(page.server, client)
+        self._keyframes, self._cameras = TeamKeyframes(client), TeamCameras(page, client)
         with gui.add_folder("History", expand_by_default=False):
             self._plots = TeamPlots(gui, client)
         self._refine.on_click(lambda _: self._run_refinement())
@@ -62,12 +62,13 @@ class FusionPanel:
         self._plots.add_keyframes(time_s, self._keyframes.newest, revision)
         targets = {each.agent_id: tuple(each.targets) for each in status.agents}
         objects = tuple(each.landmark for each in self._client.query_objects())
+        state_ns = round(time_s * _NS_PER_S)
         fused = replace(
             followed.contents(targets),
             objects=objects,
-            keyframes=self._cameras.draw(objects),
+            keyframes=self._cameras.draw(objects, state_ns),
             paths=self._keyframes.paths(),
-            state_ns=round(time_s * _NS_PER_S),
+            state_ns=state_ns,
         )
         # the slider goes back in the fused map, whichever map is shown now
         self._page.remember(fused)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -43,6 +43,7 @@ class MapPage:
         self._contents: ViewContents | None = None
         self._drawn_past: PastMap | None = None
         self._viewed_count = 0
+        self._time_listeners: list[Callable[[int | None], None]] = []
         gui = self.server.gui
         highest = _MAX_SHOWN // _THOUSAND
         self._problem = gui.add_html("", order=-1)
@@ -85,6 +86,10 @@ class MapPage:
                 self._scrub.add(each)
             self.show(contents)
 
+    def on_time(self, listener: Callable[[int | None], None]) -> None:
+        """Call this whenever the time slider moves, with the chosen time in ns; None at its end, the newest state."""
+        self._time_listeners.append(listener)
+
     def show_problem(self, text: str) -> None:
         """Show why the page is out of date; an empty text removes it."""
         shown = text_html([f"Not up to date: {text}"]) if text else ""
@@ -117,6 +122,9 @@ class MapPage:
                 self._scrub.show_note(_paragraph(self._scrub.describe(past)))
             else:
                 self._draw_time()
+            chosen_ns = self._scrub.chosen_ns
+        for listener in self._time_listeners:
+            listener(chosen_ns)
 
     def _draw_time(self) -> None:
         """Draw the map and the markers of the chosen time."""

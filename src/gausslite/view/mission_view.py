@@ -39,7 +39,7 @@ class MissionView:
         self._drawn_s = -_INTERVAL_S
         self._detected: DetectedImage | None = None
         gui = page.server.gui
-        self._camera = CameraPanel(gui)
+        self._camera = CameraPanel(page)
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
@@ -53,15 +53,15 @@ class MissionView:
             return
         self._drawn_s = now_s
         keyframes = self._mapper.keyframes()
+        contents = self._contents(outcome.index, keyframes)
         if keyframes:
-            self._show_image(keyframes[-1])
+            self._show_image(keyframes[-1], contents.newest_ns)
             self._add_quality(now_s - self._started_s, keyframes[-1])
         if self._detected is not None:
-            self._camera.show_detections(self._detected)
+            self._camera.show_detections(self._detected, contents.newest_ns)
         if outcome.timing.seconds > 0:
             self._rate.add(now_s - self._started_s, [1 / outcome.timing.seconds])
         self._roi.add(now_s - self._started_s, [100 * outcome.roi_share])
-        contents = self._contents(outcome.index, keyframes)
         self._page.remember(contents)
         self._page.show(contents)
 
@@ -80,11 +80,11 @@ class MissionView:
         rendered = np.clip(self._mapper.render(keyframe.frame), 0.0, 1.0)
         self._quality.add(time_s, rendered, keyframe.frame.rgb, keyframe.relevance.roi)
 
-    def _show_image(self, keyframe: Keyframe) -> None:
+    def _show_image(self, keyframe: Keyframe, time_ns: int | None) -> None:
         frame = keyframe.frame
         image = with_region(frame.rgb, keyframe.relevance.roi)
         image = with_objects(image, self._mapper.objects, frame.camera, frame.T_world_camera)
-        self._camera.show_keyframe(image)
+        self._camera.show_keyframe(frame.index, image, time_ns)
 
 
 @contextmanager

@@ -8,7 +8,8 @@ from typing import Any
 from gausslite.codec.keyframe_views import KeyframeView
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.view.camera_image import with_objects, with_region
-from gausslite.view.local_server import LocalServer
+from gausslite.view.camera_images import CameraImage, CameraImages
+from gausslite.view.map_page import MapPage
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.stored_keyframe import StoredKeyframe
 
@@ -19,11 +20,11 @@ MAX_IMAGES = 6
 class TeamCameras:
     """Owns the agents' images. `read` and `draw` are called on one thread."""
 
-    def __init__(self, server: LocalServer, client: FusionClient) -> None:
-        self._server, self._client = server, client
-        with server.gui.add_folder("Cameras", order=0, visible=False) as self._folder:
-            self._age: Any = server.gui.add_slider("Keyframes back", 0, 1, 1, 0, order=0)
-        self._images: dict[str, Any] = {}
+    def __init__(self, page: MapPage, client: FusionClient) -> None:
+        self._client, gui = client, page.server.gui
+        with gui.add_folder("Cameras", order=0, visible=False) as self._folder:
+            self._age: Any = gui.add_slider("Keyframes back", 0, 1, 1, 0, order=0)
+        self._images = CameraImages(page, self._folder)
         self._chosen: dict[str, StoredKeyframe] = {}
 
     @property
@@ -43,10 +44,13 @@ class TeamCameras:
         self._folder.visible = most > 0
         self._age.max = max(1, most - 1)
 
-    def draw(self, objects: Sequence[ObjectLandmark]) -> tuple[KeyframeView, ...]:
-        """Draw the images with these objects; return the views for the scene's frusta."""
-        for agent_id in self._images.keys() - self._chosen.keys():
-            self._images.pop(agent_id).remove()
+    def draw(self, objects: Sequence[ObjectLandmark], state_ns: int) -> tuple[KeyframeView, ...]:
+        """Draw the images with these objects; return the views for the scene's frusta.
+
+        state_ns: the time of the page's slider. The newest keyframes are kept for it.
+        """
+        self._images.keep(frozenset(self._chosen))
+        time_ns = None if self.keyframes_back else state_ns
         views = []
         for number, (agent_id, keyframe) in enumerate(self._chosen.items()):
             image, note = keyframe.rgb, "objects in green"
@@ -54,17 +58,7 @@ class TeamCameras:
                 image, note = with_region(image, keyframe.roi), f"region in red, {note}"
             if keyframe.T_world_camera is not None:
                 image = with_objects(image, objects, keyframe.camera, keyframe.T_world_camera)
-                time_ns = keyframe.capture_time_ns
-                views.append(KeyframeView(number, time_ns, keyframe.camera, keyframe.T_world_camera, 0))
-            self._show(agent_id, image, f"{agent_id}: keyframe {keyframe.index}, {note}")
+                taken_ns = keyframe.capture_time_ns
+                views.append(KeyframeView(number, taken_ns, keyframe.camera, keyframe.T_world_camera, 0))
+            self._images.show(agent_id, CameraImage(image, agent_id, f"keyframe {keyframe.index}, {note}"), time_ns)
         return tuple(views)
-
-    def _show(self, agent_id: str, image: Any, label: str) -> None:
-        if agent_id in self._images:
-            self._images[agent_id].image, self._images[agent_id].label = image, label
-        else:
-            with self._folder:
-                self._images[agent_id] = self._server.gui.add_image(image, label=label, format="jpeg")
-            # an agent whose first keyframe came late keeps its place in the order of the names
-            for number, name in enumerate(sorted(self._images)):
-                self._images[name].order = number + 1

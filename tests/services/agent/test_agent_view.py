@@ -65,7 +65,7 @@ def test_the_newest_detection_is_drawn_over_its_image_in_a_browser():
         assert (detected.index, [box.phrase for box in detected.boxes]) == (0, ["mug"])
         tab = browser.new_page()
         tab.goto(url)
-        tab.get_by_text("Newest detection, frame 0").wait_for()
+        tab.get_by_text("Newest detection: frame 0").wait_for()
         image = tab.locator("img").last
         image.scroll_into_view_if_needed()
         for _ in range(240):

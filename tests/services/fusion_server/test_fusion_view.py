@@ -88,15 +88,15 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one():
         try:
             wait_for_map(panel._follower)
             panel.poll()
-            images = panel._cameras._images
+            images = panel._cameras._images._shown
             assert list(images) == ["a"]
-            assert images["a"].label.startswith("a: keyframe 8")
-            assert abs(int(images["a"].image.mean()) - 200) < 3
+            assert images["a"].handle.label.startswith("a: keyframe 8")
+            assert abs(int(images["a"].handle.image.mean()) - 200) < 3
             (view,) = page._contents.keyframes
             np.testing.assert_allclose(view.T_world_camera[:3, 3], [0.8, 0.0, 0.0])
             panel._cameras._age.value = 1
             panel.poll()
-            assert images["a"].label.startswith("a: keyframe 3")
+            assert images["a"].handle.label.startswith("a: keyframe 3")
         finally:
             panel.close()
             page.close()
@@ -140,15 +140,18 @@ def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality():
             page.close()
 
 
-def test_the_time_slider_shows_the_earlier_fused_map():
+def test_the_time_slider_shows_the_earlier_fused_map_and_keyframe():
     with fusion_server() as running:
         contribute(running, "a", "Pick up the mug", [0.0], kappa=5)
+        session = running.client.join("a", GRID).session_id
+        assert running.client.contribute_keyframes(session, [coloured_frame(3, 40)]) == 1
         page, client = open_page(0, "test"), FusionClient(running.client.address)
         panel = FusionPanel(page, client)
         try:
             wait_for_map(panel._follower)
             panel.poll()
             contribute(running, "b", "Find the chair", [1.0, 2.0], kappa=9)
+            assert running.client.contribute_keyframes(session, [coloured_frame(8, 200)]) == 1
             for _ in range(int(WAIT_S / 0.05)):
                 if len(panel._follower.newest().batch) == 3:
                     break
@@ -159,6 +162,12 @@ def test_the_time_slider_shows_the_earlier_fused_map():
             past = page._drawn_past.load()
             assert (len(past.gaussians), [past.agents[i] for i in past.agent]) == (1, ["a"])
             assert [each.noun for each in past.objects] == []
+            shown = panel._cameras._images._shown["a"].handle
+            assert shown.label.startswith("a at the chosen time: keyframe 3")
+            assert abs(int(shown.image.mean()) - 40) < 3
+            page._scrub._seconds.value = page._scrub._seconds.max
+            assert shown.label.startswith("a: keyframe 8")
+            assert abs(int(shown.image.mean()) - 200) < 3
         finally:
             panel.close()
             page.close()
