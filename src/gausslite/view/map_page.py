@@ -17,7 +17,7 @@ from gausslite.view.level_of_detail import DEFAULT_LIMIT, covariances_m2, spread
 from gausslite.view.local_server import LOOPBACK, LocalServer
 from gausslite.view.scene_markers import SceneMarkers
 from gausslite.view.splat_layer import SplatLayer, Splats
-from gausslite.view.start_view import start_view
+from gausslite.view.start_view import StartView, start_view
 from gausslite.view.time_scrub import PastMap, TimeScrub
 
 _THOUSAND = 1000
@@ -43,6 +43,7 @@ class MapPage:
         self._contents: ViewContents | None = None
         self._drawn_past: PastMap | None = None
         self._viewed_count = 0
+        self._start_view: StartView | None = None
         self._time_listeners: list[Callable[[int | None], None]] = []
         gui = self.server.gui
         highest = _MAX_SHOWN // _THOUSAND
@@ -104,6 +105,7 @@ class MapPage:
     def _set_start_view(self, contents: ViewContents) -> None:
         """Set where the camera of a new browser starts; browsers that saw no map before start there too."""
         view, is_first = start_view(contents), not self._viewed_count
+        self._start_view = view
         self._viewed_count = len(contents.gaussians)
         self.server.scene.set_up_direction(view.up)
         clients = self.server.get_clients().values() if is_first else ()
@@ -139,7 +141,7 @@ class MapPage:
                 self._draw_splats()
             shown = newest if past is None else past.load()
             with_path = replace(shown, times_ns=newest.times_ns, T_world_camera=newest.T_world_camera)
-            self._markers.show(with_path, self._scrub.chosen_ns)
+            self._markers.show(with_path, self._start_view, self._scrub.chosen_ns)
 
     def _draw_splats(self) -> None:
         with self._lock:

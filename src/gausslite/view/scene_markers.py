@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from itertools import combinations, product
 from typing import Any
 
@@ -14,7 +15,9 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.view.colours import category_colour
 from gausslite.view.contents import AgentPath, ViewContents
+from gausslite.view.label_layout import label_positions_m, label_text
 from gausslite.view.local_server import LocalServer
+from gausslite.view.start_view import StartView
 
 _MAX_FRUSTA = 60
 _MAX_TEAM_FRUSTA = 20
@@ -33,6 +36,7 @@ class SceneMarkers:
         self._server = server
         self._lock = threading.RLock()
         self._contents: ViewContents | None = None
+        self._view: StartView | None = None
         self._until_ns: int | None = None
         self._drawn: dict[str, list[Any]] = {}
         gui = server.gui
@@ -41,10 +45,10 @@ class SceneMarkers:
         for switch in self._switches.values():
             switch.on_update(lambda _: self._draw_all())
 
-    def show(self, contents: ViewContents, until_ns: int | None = None) -> None:
-        """Replace the markers. until_ns: the trajectory ends at this time; None for all of it."""
+    def show(self, contents: ViewContents, view: StartView | None, until_ns: int | None = None) -> None:
+        """Replace the markers. view: where browsers start; until_ns: the trajectory's end, None for all of it."""
         with self._lock:
-            self._contents, self._until_ns = contents, until_ns
+            self._contents, self._view, self._until_ns = contents, view, until_ns
             self._draw_all()
 
     def end_trajectory(self, until_ns: int | None) -> None:
@@ -59,7 +63,7 @@ class SceneMarkers:
             if contents is None:
                 return
             objects = contents.objects if self._switches["Objects"].value else ()
-            self._replace("objects", [handle for i, each in enumerate(objects) for handle in self._object(i, each)])
+            self._replace("objects", self._objects(objects))
             views = contents.keyframes if self._switches["Keyframes"].value else ()
             views = views[:: max(1, -(-len(views) // _MAX_FRUSTA))]
             frusta = [self._frustum(f"/keyframes/{v.index}", v.camera, v.T_world_camera, _KEYFRAME_RGB) for v in views]
@@ -103,20 +107,24 @@ class SceneMarkers:
         segments = np.stack([points_m[:-1], points_m[1:]], axis=1)
         return [self._server.scene.add_line_segments(name, segments, colour, thickness=0.008)]
 
-    def _object(self, index: int, landmark: ObjectLandmark) -> list[Any]:
+    def _objects(self, objects: Sequence[ObjectLandmark]) -> list[Any]:
+        if self._view is None:
+            return []
+        labels_m = label_positions_m(objects, self._view)
+        return [handle for i, each in enumerate(objects) for handle in self._object(i, each, labels_m[i])]
+
+    def _object(self, index: int, landmark: ObjectLandmark, label_m: Float64[ndarray, "3"]) -> list[Any]:
+        """Draw an object's box and its name, with a line between them if the name had to move up."""
         colour = _TARGET_RGB if landmark.role is ObjectRole.TARGET else _ANCHOR_RGB
         low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
         high = np.maximum(high, low + _MIN_BOX_M)
         scene, name = self._server.scene, f"/objects/{index}"
+        inside_m = np.clip(label_m, low, high)
+        edges_m = np.concatenate([_box_edges_m(low, high), np.stack([inside_m, label_m])[None].astype(np.float32)])
         # a label is drawn as text, never as HTML
         return [
-            scene.add_line_segments(f"{name}/box", _box_edges_m(low, high), colour, thickness=0.004),
-            scene.add_label(
-                f"{name}/label",
-                f"{landmark.noun} {landmark.confidence:.2f}",
-                position=(low + high) / 2,
-                anchor="bottom-center",
-            ),
+            scene.add_line_segments(f"{name}/box", edges_m, colour, thickness=0.004),
+            scene.add_label(f"{name}/label", label_text(landmark), position=label_m, anchor="bottom-center"),
         ]
 
     def _frustum(

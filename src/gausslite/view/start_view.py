@@ -14,6 +14,8 @@ from gausslite.view.contents import ViewContents
 _BEHIND_M = 0.6
 _BESIDE, _ABOVE = 0.5, 0.4
 """Distances from the map's centre along the horizontal axes and upwards, as shares of its extent."""
+_MIN_EXTENT_M = 0.1
+"""Of a map that is a point: the camera is never at the point that it looks at."""
 Vector = tuple[float, float, float]
 
 
@@ -37,7 +39,8 @@ def start_view(contents: ViewContents) -> StartView:
         centre = 0.5 * (low + high)
         first_axis, second_axis = np.eye(3)[np.flatnonzero(up == 0)]
         offset = _BESIDE * (first_axis - second_axis) + _ABOVE * up
-        return StartView(_vector(centre + float(np.linalg.norm(high - low)) * offset), _vector(centre), _vector(up))
+        extent_m = max(_MIN_EXTENT_M, float(np.linalg.norm(high - low)))
+        return StartView(_vector(centre + extent_m * offset), _vector(centre), _vector(up))
     first = poses[0]
     forward = first[:3, 2]
     position = first[:3, 3] - _BEHIND_M * forward + 0.5 * _BEHIND_M * up

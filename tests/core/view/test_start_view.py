@@ -24,6 +24,11 @@ def test_a_map_alone_is_seen_from_beside_with_z_up():
     assert (offset_m * [1, -1, 1] > 0.5).all()
 
 
+def test_a_map_of_one_gaussian_is_seen_from_a_distance():
+    view = start_view(ViewContents.of_one_agent(plain_gaussians([[1.0, 2.0, 3.0]])))
+    assert np.linalg.norm(np.subtract(view.position_m, view.look_at_m)) > 0.05
+
+
 def test_the_keyframes_of_a_team_give_the_up_direction():
     # a camera that looks along z with y down: up is -y
     view = start_view(replace(MAP, keyframes=[KeyframeView(0, 0, CAMERA, np.eye(4), 0)]))
