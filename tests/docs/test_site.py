@@ -70,6 +70,16 @@ def test_the_reference_has_the_public_names_and_all_commands(site: Path) -> None
         assert f'id="{heading}"' in commands
 
 
+def test_commands_are_seen_whole_on_a_laptop(site: Path) -> None:
+    with open_browser((1280, 900)) as browser:
+        tab = browser.new_page()
+        tab.goto((site / "index.html").as_uri())
+        widths = "blocks => blocks.map(block => [block.scrollWidth, block.clientWidth])"
+        sizes = tab.locator(".language-sh pre > code").evaluate_all(widths)
+        assert len(sizes) > 3
+        assert all(scroll <= client for scroll, client in sizes)
+
+
 def test_no_page_is_wider_than_a_phone(site: Path) -> None:
     with open_browser((390, 844)) as browser:
         tab = browser.new_page()

@@ -37,7 +37,7 @@ _OPEN_VIEWS = 2
 _BARS = (("region PSNR", SCORES[0]), ("image PSNR", SCORES[2]), ("Gaussians", MAP_SIZE[0]), ("frame rate", TIMES[4]))
 _LINES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("time of each frame", "seconds", as_seconds),
-    ("Gaussians", "gaussians", as_count),
+    ("Gaussians after each frame", "gaussians", as_count),
     ("region's share of the pixels", "roi_share", as_percent),
     ("training iterations of each frame", "iterations", as_count),
 )

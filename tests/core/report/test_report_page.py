@@ -91,6 +91,8 @@ def test_runs_are_side_by_side_at_the_same_views(tmp_path):
     assert captions.count("first: kappa") == captions.count("second: kappa") == 2  # at the view and from above
     assert "Frame 3" in page.texts
     assert page.tags.count("polyline") > 4
+    # one plot has the size of the final maps, one their growth
+    assert page.texts.count("Gaussians after each frame") == 1
 
 
 def test_a_damaged_evaluation_is_one_line_and_leaves_out_the_scores(tmp_path, capsys):
