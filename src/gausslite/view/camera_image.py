@@ -17,6 +17,8 @@ from gausslite.domain.relevance import DetectedImage
 
 _REGION_RGB, _BOX_RGB = (255, 60, 60), (60, 230, 90)
 _DETECTION_RGB, _WEAK_RGB = (255, 210, 40), (150, 150, 150)
+_GROUND_RGB = (30, 30, 30)
+_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.4
 _MAX_PX = 1 << 14
 _REGION_WEIGHT = 0.45
 _NEAR_M = 0.1
@@ -69,5 +71,9 @@ def _write(image: UInt8[ndarray, "h w 3"], text: str, corner_px: tuple[int, int]
     """Write above the top left corner of a box, inside of the image."""
     # the font has ASCII characters only
     ascii_text = text.encode("ascii", "replace").decode()
-    origin = (max(corner_px[0], 0) + 2, max(corner_px[1] - 3, 9))
-    cv2.putText(image, ascii_text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.35, colour, 1, cv2.LINE_AA)
+    origin = (max(corner_px[0], 0) + 2, max(corner_px[1] - 4, 9))
+    (width_px, height_px), _ = cv2.getTextSize(ascii_text, _FONT, _FONT_SCALE, 1)
+    # a dark ground, as the image may be as light as the text
+    ground = (origin[0] - 1, origin[1] - height_px - 1), (origin[0] + width_px, origin[1] + 3)
+    cv2.rectangle(image, *ground, _GROUND_RGB, cv2.FILLED)
+    cv2.putText(image, ascii_text, origin, _FONT, _FONT_SCALE, colour, 1, cv2.LINE_AA)

@@ -90,8 +90,9 @@ class FusionPanel:
         )
 
     def _show_status(self, status: Any) -> None:
+        mission = f"mission {status.mission_id!r}" if status.mission_id else "unnamed mission"
         lines = [
-            f"mission {status.mission_id or '(unnamed)'}: {status.fused_gaussians:,} Gaussians in "
+            f"{mission}: {status.fused_gaussians:,} Gaussians in "
             f"{status.fused_voxels:,} voxels, {status.keyframes} keyframes",
             *(
                 f"{each.agent_id}{'' if each.joined else ' (left)'}: wins {each.won_voxels:,} of {each.voxels:,} "
