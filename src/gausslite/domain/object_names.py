@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 GENERIC: Final = frozenset(
@@ -145,3 +146,13 @@ def same_kind(phrase: str, name: str) -> bool:
         return True
     canonical = SYNONYMS.get(normalised_phrase, SYNONYMS.get(head_of(normalised_phrase)))
     return canonical is not None and canonical == SYNONYMS.get(other, SYNONYMS.get(head_of(other)))
+
+
+def meant_by(phrase: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of objects that a task's phrase means: those with its head, or its synonyms if there are none.
+
+    "table" means a coffee table and not the counter, but a counter where there is no table; "chair" includes armchairs.
+    """
+    kin = tuple(name for name in names if same_kind(phrase, name))
+    head = head_of(normalised_noun(phrase))
+    return tuple(name for name in kin if head_of(normalised_noun(name)).endswith(head)) or kin

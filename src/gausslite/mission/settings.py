@@ -14,7 +14,7 @@ from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.motion_model import MotionModel
-from gausslite.domain.object_names import same_kind
+from gausslite.domain.object_names import meant_by
 from gausslite.domain.pose import UpAxis, require_up_axis
 from gausslite.domain.pose_exposure_prior import TRACKED_PRIOR, PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
@@ -80,7 +80,8 @@ class SceneInfo:
 
     def regions_of(self, targets: Collection[str]) -> dict[str, Region]:
         """Return the regions of the objects that these nouns of a task mean."""
-        return {name: roi for name, roi in self.regions.items() if any(same_kind(target, name) for target in targets)}
+        meant = {name for target in targets for name in meant_by(target, self.regions)}
+        return {name: roi for name, roi in self.regions.items() if name in meant}
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import MatchBasis, NounMatch
-from gausslite.domain.object_names import same_kind
+from gausslite.domain.object_names import meant_by
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
 from gausslite.perception.detect import bounding_box
@@ -21,7 +21,7 @@ class RegionDetector:
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return the regions that match each query."""
         known = tuple(self._regions)
-        return tuple(NounMatch(query, MatchBasis.REGION, tuple(self._names(query)), known=known) for query in queries)
+        return tuple(NounMatch(query, MatchBasis.REGION, self._names(query), known=known) for query in queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return the visible regions of each query, with score 1 and exact masks."""
@@ -36,5 +36,5 @@ class RegionDetector:
                     found.append(Detection(query, 1.0, box, masks[name]))
         return found
 
-    def _names(self, query: str) -> list[str]:
-        return [name for name in self._regions if same_kind(query, name)]
+    def _names(self, query: str) -> tuple[str, ...]:
+        return meant_by(query, self._regions)
