@@ -101,9 +101,10 @@ class RelevanceTracker:
             f"what looks like {each.phrase!r} is rather {rival!r}: not activated; --accept-similar accepts it"
             for each, rival in self._filter.rivals
         )
+        viewpoint = self._T_world_keyframe
         doubtful = (
-            f"{count} {noun!r} objects scored far below the best: not activated; --accept-similar accepts them"
-            for noun, count in self._filter.doubtful
+            f"{target!r}: {count} scored far below the best, so not activated; --accept-similar accepts all"
+            for target, count in ({} if viewpoint is None else self._filter.doubtful(viewpoint)).items()
         )
         unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
         return (*self._filter.colour_notes, *self._filter.height_notes, *dict.fromkeys(rivals), *doubtful, *unseen)

@@ -70,15 +70,6 @@ class SpatialFilter:
         return tuple((each, rival) for each, rival in rivals if rival is not None)
 
     @property
-    def doubtful(self) -> tuple[tuple[str, int], ...]:
-        """Nouns of targets, and how many of their objects have scores far below the best of them."""
-        counts = []
-        for noun in self._names:
-            seen = [each for each in self.confirmed_landmarks if each.phrase == noun]
-            counts.append((noun, len(seen) - len(self._evidence.comparable(seen))))
-        return tuple((noun, count) for noun, count in counts if count)
-
-    @property
     def unseen_anchors(self) -> tuple[str, ...]:
         """Anchors of relations that no frame has shown yet, with their colours."""
         needed = dict.fromkeys(
@@ -145,15 +136,27 @@ class SpatialFilter:
         A superlative selects one of them, before those are left out that are no longer present. Those whose scores are
         far below that of another are left out too. T_world_camera: the viewpoint of relations such as left_of.
         """
-        named = [(each, self.target_of(each.seen_from(T_world_camera[:3, 3]))) for each in self.confirmed_landmarks]
         chosen = []
-        for target, superlative in self._superlatives.items():
-            candidates = self._evidence.comparable([landmark for landmark, name in named if name == target])
-            if candidates and superlative is not None:
-                reliable = [each for each in candidates if self._evidence.is_reliable(each)]
-                candidates = [select_extreme(reliable or candidates, superlative, self._up, T_world_camera)]
-            chosen += [(landmark, target) for landmark in candidates if self._evidence.is_present(landmark)]
+        for target, candidates in self._candidates(T_world_camera).items():
+            selected, superlative = self._evidence.comparable(candidates), self._superlatives[target]
+            if selected and superlative is not None:
+                reliable = [each for each in selected if self._evidence.is_reliable(each)]
+                selected = [select_extreme(reliable or selected, superlative, self._up, T_world_camera)]
+            chosen += [(landmark, target) for landmark in selected if self._evidence.is_present(landmark)]
         return chosen
+
+    def doubtful(self, T_world_camera: Float64[ndarray, "4 4"]) -> dict[str, int]:
+        """Return how many objects of each target `targets` leaves out for their scores, without targets of none."""
+        counts = {
+            target: len(candidates) - len(self._evidence.comparable(candidates))
+            for target, candidates in self._candidates(T_world_camera).items()
+        }
+        return {target: count for target, count in counts.items() if count}
+
+    def _candidates(self, T_world_camera: Float64[ndarray, "4 4"]) -> dict[str, list[Landmark]]:
+        """Return the confirmed landmarks that satisfy the relations of each target."""
+        named = [(each, self.target_of(each.seen_from(T_world_camera[:3, 3]))) for each in self.confirmed_landmarks]
+        return {target: [landmark for landmark, name in named if name == target] for target in self._superlatives}
 
     def landmark_of(self, observation: Observation) -> Landmark | None:
         """Return the landmark that an observation shows."""

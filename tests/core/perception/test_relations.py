@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -131,6 +133,19 @@ def test_a_negated_relation_keeps_the_objects_that_do_not_satisfy_it():
     spatial.observe([TABLE, on, beside])
     assert spatial.target_of(on) is None
     assert spatial.target_of(beside) is not None
+
+
+def test_scores_are_compared_only_among_objects_that_satisfy_the_relation():
+    on, second, beside = (
+        replace(small_object("mug", x_m, -0.4, 0.1), score=score)
+        for x_m, score in ((0.4, 0.3), (-0.4, 0.8), (2.0, 0.9))
+    )
+    for seen, targets, doubtful in (([on, beside], 1, {}), ([on, second, beside], 1, {"mug": 1})):
+        spatial = filter_of(Relation(Predicate.ON, "mug", "table"))
+        for _ in range(2):
+            spatial.observe([TABLE, *seen])
+        assert len(spatial.targets(np.eye(4))) == targets
+        assert spatial.doubtful(np.eye(4)) == doubtful
 
 
 @given(st.floats(0.7, 6.0), st.floats(0.3, 4.0), st.floats(0.0, 3.0))

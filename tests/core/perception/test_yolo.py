@@ -187,7 +187,7 @@ def test_an_object_with_a_far_lower_score_than_another_is_left_out(tmp_path, sco
     left, right = slice(0, strict_roi.shape[1] // 2), slice(strict_roi.shape[1] // 2, None)
     assert {bool(strict_roi[:, half].any()) for half in (left, right)} == marked
     assert all(lenient_roi[:, half].any() for half in (left, right))
-    left_out = ("1 'bottle' objects scored far below the best: not activated; --accept-similar accepts them",)
+    left_out = ("'bottle': 1 scored far below the best, so not activated; --accept-similar accepts all",)
     assert strict.notes == (left_out if False in marked else ())
 
 
