@@ -153,6 +153,6 @@ def meant_by(phrase: str, names: Iterable[str]) -> tuple[str, ...]:
 
     "table" means a coffee table and not the counter, but a counter where there is no table; "chair" includes armchairs.
     """
-    kin = tuple(name for name in names if same_kind(phrase, name))
+    same = tuple(name for name in names if same_kind(phrase, name))
     head = head_of(normalised_noun(phrase))
-    return tuple(name for name in kin if head_of(normalised_noun(name)).endswith(head)) or kin
+    return tuple(name for name in same if head_of(normalised_noun(name)).endswith(head)) or same

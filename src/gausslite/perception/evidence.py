@@ -77,7 +77,7 @@ class EvidenceSettings:
         name, score = max(landmark.rival_scores.items(), key=lambda each: each[1], default=("", 0.0))
         return name if score > self.max_rival_ratio * landmark.score_sum else None
 
-    def comparable(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
+    def without_low_scores(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
         """Return those of one target's landmarks whose best scores are not far below the best of all."""
         limit = self.min_score_share * max((each.best_score for each in landmarks), default=0.0)
         return [each for each in landmarks if each.best_score >= limit]

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 # the outermost points of a mask are often of other things
-_INNER_PERCENTILES: Final = (10.0, 90.0)
+INNER_PERCENTILES: Final = (10.0, 90.0)
 _MIN_PANEL_EXTENT_M: Final = 0.25
 _MAX_PANEL_THICKNESS: Final = 0.06
 _MAX_PANEL_LEAN: Final = 0.1
@@ -18,7 +18,7 @@ _MAX_PANEL_LEAN: Final = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedPlane:
-    """A plane through points: its unit normal, the points' extent along it, and their thickness across it."""
+    """A plane through points: its unit normal, the extent of the points in it, and their thickness across it."""
 
     normal: Float64[ndarray, "3"]
     extent_m: float
@@ -32,7 +32,7 @@ class FittedPlane:
         """
         offsets_m = points_m - points_m.mean(axis=0)
         _, axes = np.linalg.eigh(offsets_m.T @ offsets_m)
-        sides_m = np.ptp(np.percentile(offsets_m @ axes, _INNER_PERCENTILES, axis=0), axis=0)
+        sides_m = np.ptp(np.percentile(offsets_m @ axes, INNER_PERCENTILES, axis=0), axis=0)
         return cls(axes[:, 0], float(np.hypot(sides_m[1], sides_m[2])), float(sides_m[0]))
 
     def is_panel(self, up: Float64[ndarray, "3"]) -> bool:

@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.domain.relevance import Rival
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.perception.colours import no_colours
-from gausslite.perception.fitted_plane import FittedPlane
+from gausslite.perception.fitted_plane import INNER_PERCENTILES, FittedPlane
 from gausslite.perception.surface_votes import SurfaceVotes
 
 _CELL_GRID: Final = VoxelGrid(0.05)
@@ -23,8 +23,6 @@ _MIN_SHARED: Final = 0.3
 _MIN_COUNT_SHARE: Final = 0.15
 _MIN_RELIABLE_SHARE: Final = 0.25
 _MAX_CELLS: Final = 4000
-# the outermost points of a mask are often of other things
-_INNER_PERCENTILES: Final = (10.0, 90.0)
 _MIN_FLAT_WIDTH_M: Final = 0.4
 _MAX_FLAT_SLOPE: Final = 0.1
 _MAX_OBJECTS: Final = 500
@@ -83,9 +81,9 @@ class Observation:
         """Return True if the cells cover a wide area at nearly one height, as those of a rug. up: in the world."""
         centres_m = _CELL_GRID.centres_m(self.cells).astype(np.float64)
         heights_m = centres_m @ up
-        across_m = np.ptp(np.percentile(centres_m - heights_m[:, None] * up, _INNER_PERCENTILES, axis=0), axis=0)
+        across_m = np.ptp(np.percentile(centres_m - heights_m[:, None] * up, INNER_PERCENTILES, axis=0), axis=0)
         width_m = float(np.linalg.norm(across_m))
-        height_m = float(np.ptp(np.percentile(heights_m, _INNER_PERCENTILES)))
+        height_m = float(np.ptp(np.percentile(heights_m, INNER_PERCENTILES)))
         return width_m >= _MIN_FLAT_WIDTH_M and height_m <= _MAX_FLAT_SLOPE * width_m
 
     def is_panel(self, up: Float64[ndarray, "3"]) -> bool:

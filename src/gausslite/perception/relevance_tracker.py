@@ -102,12 +102,12 @@ class RelevanceTracker:
             for each, rival in self._filter.rivals
         )
         viewpoint = self._T_world_keyframe
-        doubtful = (
+        low_scores = (
             f"{target!r}: {count} scored far below the best, so not activated; --accept-similar accepts all"
-            for target, count in ({} if viewpoint is None else self._filter.doubtful(viewpoint)).items()
+            for target, count in ({} if viewpoint is None else self._filter.low_score_counts(viewpoint)).items()
         )
         unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
-        return (*self._filter.colour_notes, *self._filter.height_notes, *dict.fromkeys(rivals), *doubtful, *unseen)
+        return (*self._filter.colour_notes, *self._filter.height_notes, *dict.fromkeys(rivals), *low_scores, *unseen)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:

@@ -138,17 +138,17 @@ class SpatialFilter:
         """
         chosen = []
         for target, candidates in self._candidates(T_world_camera).items():
-            selected, superlative = self._evidence.comparable(candidates), self._superlatives[target]
+            selected, superlative = self._evidence.without_low_scores(candidates), self._superlatives[target]
             if selected and superlative is not None:
                 reliable = [each for each in selected if self._evidence.is_reliable(each)]
                 selected = [select_extreme(reliable or selected, superlative, self._up, T_world_camera)]
             chosen += [(landmark, target) for landmark in selected if self._evidence.is_present(landmark)]
         return chosen
 
-    def doubtful(self, T_world_camera: Float64[ndarray, "4 4"]) -> dict[str, int]:
+    def low_score_counts(self, T_world_camera: Float64[ndarray, "4 4"]) -> dict[str, int]:
         """Return how many objects of each target `targets` leaves out for their scores, without targets of none."""
         counts = {
-            target: len(candidates) - len(self._evidence.comparable(candidates))
+            target: len(candidates) - len(self._evidence.without_low_scores(candidates))
             for target, candidates in self._candidates(T_world_camera).items()
         }
         return {target: count for target, count in counts.items() if count}

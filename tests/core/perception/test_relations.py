@@ -140,12 +140,12 @@ def test_scores_are_compared_only_among_objects_that_satisfy_the_relation():
         replace(small_object("mug", x_m, -0.4, 0.1), score=score)
         for x_m, score in ((0.4, 0.3), (-0.4, 0.8), (2.0, 0.9))
     )
-    for seen, targets, doubtful in (([on, beside], 1, {}), ([on, second, beside], 1, {"mug": 1})):
+    for seen, targets, low_scores in (([on, beside], 1, {}), ([on, second, beside], 1, {"mug": 1})):
         spatial = filter_of(Relation(Predicate.ON, "mug", "table"))
         for _ in range(2):
             spatial.observe([TABLE, *seen])
         assert len(spatial.targets(np.eye(4))) == targets
-        assert spatial.doubtful(np.eye(4)) == doubtful
+        assert spatial.low_score_counts(np.eye(4)) == low_scores
 
 
 @given(st.floats(0.7, 6.0), st.floats(0.3, 4.0), st.floats(0.0, 3.0))
