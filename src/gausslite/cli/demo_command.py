@@ -38,6 +38,7 @@ from gausslite.domain.names import require_name
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.team import TeamScores, score_team
 from gausslite.evaluation.views import HeldOutView, view_maps
+from gausslite.export.packages import import_extra
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_models
 from gausslite.mission.frame_stream import CorruptFrames
@@ -133,6 +134,8 @@ def _require_valid(options: argparse.Namespace) -> None:
         raise InvalidInputError(
             f"--refine-iterations: expected 0 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
         )
+    if options.view is not None:
+        import_extra("viser", "view", "--view")
     require_effect(options)
     mission_settings(options)
     VoxelGrid(options.voxel_size)

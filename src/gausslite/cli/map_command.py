@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from gausslite.cli.depth_check import depth_notes, require_mappable_depth
@@ -25,6 +27,7 @@ from gausslite.domain.state import State, encode_text
 from gausslite.domain.task import TaskGraph
 from gausslite.evaluation.preview import render_preview
 from gausslite.evaluation.views import view_map
+from gausslite.export.packages import import_extra
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.folder_lock import locked_folder
@@ -48,7 +51,6 @@ from gausslite.mission.timeline import Timeline
 from gausslite.process.interrupts import DeferredInterrupt
 from gausslite.process.messages import print_message
 from gausslite.render.choose import choose_rasterizer
-from gausslite.view.mission_view import mission_view
 
 _NOT_RESUMED = -1
 _WORLD_FRAME_HELP = (
@@ -95,6 +97,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results. Errors in the options are raised before the work starts."""
     require_name("--world-frame", options.world_frame or "")
+    if options.view is not None:
+        import_extra("viser", "view", "--view")
     if options.resume is None and not options.overwrite:
         require_no_map(options.out)
     with locked_folder(options.out):
@@ -157,7 +161,7 @@ class _Run:
         stream, schedule = inputs.stream.after(resumed_after), inputs.schedule
         scheduled = ScheduledTaskMapper(self._mapper, schedule, estimators, schedule.at(resumed_after))
         frames = stream.frames(None if options.strict else self._corrupt)
-        with mission_view(options.view, self._mapper, schedule.at) as draw, MappingBar(len(stream)) as bar:
+        with _view(options.view, self._mapper, schedule.at) as draw, MappingBar(len(stream)) as bar:
 
             def report(outcome: FrameOutcome) -> None:
                 bar.count(outcome)
@@ -266,6 +270,18 @@ def _report_search(options: argparse.Namespace, inputs: MapInputs, estimators: E
     for scheduled in inputs.schedule.graphs():
         for match in estimators.noun_matches(scheduled):
             print_message(match.describe())
+
+
+def _view(
+    port: int | None, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]
+) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
+    """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
+    if port is None:
+        return nullcontext(lambda _outcome: None)
+    # the page needs an extra
+    from gausslite.view.mission_view import mission_view
+
+    return mission_view(port, mapper, task_at)
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str:

@@ -89,15 +89,12 @@ class MissionView:
 
 @contextmanager
 def mission_view(
-    port: int | None, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]
+    port: int, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]
 ) -> Iterator[Callable[[FrameOutcome], None]]:
-    """Serve a page during a mission, none without a port; yield what to call after each frame.
+    """Serve a page during a mission; yield what to call after each frame.
 
     Raises InvalidInputError for a port in use.
     """
-    if port is None:
-        yield lambda _outcome: None
-        return
     page = open_page(port, "GaussLite map")
     try:
         print_message(f"the page is at {page.url}")

@@ -1,0 +1,118 @@
+"""Import all modules, and run commands and programs, in a process that sees no optional package; print JSON.
+
+Arguments: a folder for results, and the import names of the packages of the extra `sim`, which the runs may use.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import pkgutil
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import sitecustomize
+
+PACKAGES = ("gausslite", "gausslite_sim", "gausslite_bench")
+PROGRAMS = ("gausslite_agent", "gausslite_fusion_server", "gausslite_parser")
+TASK = "Pick up the mug on the table"
+SOURCE, FRAMES = "sim:home", ("--frames", "0:3", "--size", "160x120")
+
+
+def failed_imports() -> dict[str, str]:
+    """Return the missing package, or the error, of each module that cannot be imported."""
+    failed: dict[str, str] = {}
+    for package in (*PACKAGES, *PROGRAMS):
+        for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}."):
+            try:
+                importlib.import_module(module.name)
+            except ModuleNotFoundError as error:
+                failed[module.name] = str(error.name)
+            except Exception as error:
+                failed[module.name] = repr(error)
+    api = importlib.import_module("gausslite.api")
+    for name in api.__all__:
+        getattr(importlib.import_module("gausslite"), name)
+    return failed
+
+
+def run(program: str, arguments: Sequence[str]) -> dict[str, object]:
+    """Run a command line in this process. Returns its exit code, and what it writes to stderr."""
+    messages = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(messages):
+        try:
+            code: object = _main(program)(list(arguments))
+        except SystemExit as end:
+            code = end.code
+        except BaseException:
+            traceback.print_exc()
+            code = None
+    return {"arguments": [program, *arguments], "code": code, "messages": messages.getvalue().splitlines()}
+
+
+def _main(program: str) -> Callable[[list[str]], object]:
+    if program == "gausslite":
+        return importlib.import_module("gausslite.cli.main").main  # type: ignore[no-any-return]
+    return importlib.import_module(f"{program}.program").run  # type: ignore[no-any-return]
+
+
+def default_paths(out: Path) -> list[dict[str, object]]:
+    """Run what README and the help promise without any extra but `sim`."""
+    run_folder, map_file = str(out / "map"), str(out / "map" / "map.ply")
+    halves = ("--frames-a", "0:6:3", "--frames-b", "0:6:3")
+    commands = (
+        ("map", SOURCE, "--task", TASK, *FRAMES, "--out", run_folder),
+        ("map", SOURCE, *FRAMES, "--out", str(out / "uniform")),
+        ("eval", map_file, SOURCE, *FRAMES),
+        ("fuse", map_file, str(out / "uniform" / "map.ply"), "--out", str(out / "fused.ply")),
+        ("parse", TASK),
+        ("report", run_folder),
+        ("objects", run_folder),
+        ("export", run_folder, "--to", "ply"),
+        ("calibrate", "sim:home?frames=12&size=160x120"),
+        ("models", "list"),
+        ("doctor", "--json"),
+        ("demo", *halves, "--size", "160x120", "--refine-iterations", "5", "--out", str(out / "demo")),
+        *((command, "--help") for command in importlib.import_module("gausslite.cli.commands").SUMMARIES),
+    )
+    results = [run("gausslite", arguments) for arguments in commands]
+    return results + [run(program, ("--help",)) for program in PROGRAMS]
+
+
+def missing_extras(out: Path) -> list[dict[str, object]]:
+    """Run what needs an extra; each result has the extra."""
+    run_folder = str(out / "map")
+    cases = [
+        ("view", "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / "view"), "--view", "0")),
+        ("view", "gausslite", ("demo", "--out", str(out / "view"), "--view", "0")),
+        ("view", "gausslite", ("view", run_folder, "--port", "0")),
+        ("view", "gausslite_agent", ("--listen", "127.0.0.1:50099", "--view", "0")),
+        ("view", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--view", "0")),
+        ("metrics", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--metrics", "127.0.0.1:0")),
+        ("completion", "gausslite", ("completion", "bash")),
+        *(("export", "gausslite", ("export", run_folder, "--to", kind)) for kind in ("spz", "las", "octomap", "mesh")),
+        *(
+            (backend, "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / backend), "--rasterizer", backend))
+            for backend in ("cuda", "reference")
+        ),
+    ]
+    return [{"extra": extra, **run(program, arguments)} for extra, program, arguments in cases]
+
+
+def main() -> None:
+    """Print what fails to import, and the results of all runs."""
+    out, sim = Path(sys.argv[1]), sys.argv[2].split(",")
+    imports = failed_imports()
+    without_sim = {"extra": "sim", **run("gausslite", ("map", SOURCE, "--task", TASK, "--out", str(out / "no")))}
+    sitecustomize.show_packages(sim)
+    results = default_paths(out)
+    missing = [without_sim, *missing_extras(out)]
+    print(json.dumps({"imports": imports, "default_paths": results, "missing_extras": missing}))
+
+
+if __name__ == "__main__":
+    main()
