@@ -121,7 +121,7 @@ def known_flags() -> set[str]:
     """Return all flags in the --help of all programs."""
     commands = [["gausslite", name, "--help"] for name in SUB_COMMANDS]
     commands += [["gausslite", "bench", name, "--help"] for name in BENCHMARKS]
-    commands += [["gausslite", "models", name, "--help"] for name in ("fetch", "verify", "list", "source", "inspect")]
+    commands += [["gausslite", "models", name, "--help"] for name in ("list", "source", "inspect")]
     commands += [[program, "--help"] for program in PROGRAMS if program != "gausslite"]
     commands.append(["gausslite-fusion-server", "verify", "--help"])
     runs = [[PROGRAMS[program], *arguments] for program, *arguments in commands]

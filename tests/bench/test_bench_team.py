@@ -26,7 +26,6 @@ def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.Captur
     assert set(task["roi_psnr"]) == {
         "concatenation",
         "vote",
-        "free-space vote",
         "vote of shared regions",
         "refine",
     }
@@ -36,7 +35,7 @@ def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.Captur
     assert task["bytes_sent"] > 0
     # a policy without a task has no region to send
     assert uniform["share_percent"] == 0
-    assert (tmp_path / "team.md").read_text().count("| home-4 x 2 |") == 10
+    assert (tmp_path / "team.md").read_text().count("| home-4 x 2 |") == 8
 
 
 def test_four_agents_of_a_home_see_different_views() -> None:

@@ -23,7 +23,6 @@ from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
-from gausslite.wire.tracing import tracing
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.agent_mission import NO_DETECTOR, AgentMission
 from gausslite_agent.keyframe_upload import KeyframeUpload
@@ -78,7 +77,6 @@ async def _serve(settings: AgentSettings) -> int:
     saved = _read_saved(settings)
     loop, changes = asyncio.get_running_loop(), ChangeNotifier()
     with ExitStack() as stack:
-        stack.enter_context(tracing(settings.traces, "gausslite-agent"))
         parser = _open_parser(settings, stack)
         uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
         estimators = _estimators(settings, stream)

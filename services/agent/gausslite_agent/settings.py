@@ -25,7 +25,6 @@ from gausslite.config.options_without_effect import require_effect, require_fusi
 from gausslite.config.source_options import add_camera_correction, add_frames
 from gausslite.config.switches import add_switch, set_dependent_default
 from gausslite.config.tls_options import add_tls, read_server_tls
-from gausslite.config.traces_option import add_traces
 from gausslite.config.values import NONE, read_rigid_transform
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import InvalidInputError
@@ -86,7 +85,6 @@ class AgentSettings:
     source: the sequence that replaces the robot's camera, None for frames by IngestFrames. strict: end the mission at a
     frame of the source that cannot be read. state: file of the saved mission; it is saved every save_interval_s seconds
     (0: only at the end). view: port of the page that shows the agent, None for no page.
-    traces: address of an OTLP collector, None for no traces.
     """
 
     listen: str
@@ -105,7 +103,6 @@ class AgentSettings:
     strict: bool = False
     save_interval_s: float = 0.0
     view: int | None = None
-    traces: str | None = None
 
     @property
     def fixed_settings(self) -> tuple[Any, ...]:
@@ -169,7 +166,6 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         options.strict,
         options.save_interval,
         options.view,
-        options.traces,
     )
 
 
@@ -227,7 +223,6 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_switch(parser, "--exit-when-done", "exit after the mission (default: continue to serve)")
     add_view(parser, "the agent")
-    add_traces(parser)
     _add_replay(parser)
     add_frames(parser)
     add_camera_correction(parser)
@@ -280,8 +275,7 @@ def _add_connections(parser: argparse.ArgumentParser) -> None:
     add_switch(
         group,
         "--free-space",
-        "send what the camera has observed as free: it shows frames that do not fit, and counts in the free-space vote "
-        "(default: --free-space)",
+        "send what the camera has observed as free: it shows frames that do not fit (default: --free-space)",
         default=True,
     )
     add_switch(group, "--handover", "at the end also send the map outside the ROI")

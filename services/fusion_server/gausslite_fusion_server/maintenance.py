@@ -1,4 +1,4 @@
-"""`gausslite-fusion-server backup | restore | verify | compact | check-claims`: maintain and check a store's file."""
+"""`gausslite-fusion-server backup | restore | verify | compact`: maintain and check a store's file."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ from collections.abc import Sequence
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.fusion import store_maintenance
-from gausslite.fusion.claim_check import ClaimReport, ClaimVerdict
 from gausslite.fusion.store_maintenance import StoreReport
 from gausslite.process.messages import print_message
 from gausslite_fusion_server.settings import PROGRAM, MaintenanceSettings, parse_maintenance
-from gausslite_fusion_server.stored_claims import check_stored_claims
 
 
 def run_command(arguments: Sequence[str]) -> int:
     """Run one of MAINTENANCE_COMMANDS and print what it did.
 
-    Returns 0, 1 for damaged rows or claims that are not confirmed, or 2 with one line on stderr.
+    Returns 0, 1 for damaged rows, or 2 with one line on stderr.
     """
     options = parse_maintenance(arguments)
     try:
@@ -45,11 +43,6 @@ def _run(options: MaintenanceSettings) -> int:
             text = f"{options.store}: {_summary(report)}, {report.damaged_rows} damaged rows{done}"
             _print(options, text, dataclasses.asdict(report))
             return int(report.damaged_rows > 0 and not options.repair)
-        case "check-claims":
-            reports = check_stored_claims(options.store)
-            values = [dataclasses.asdict(each) | {"verdict": str(each.verdict)} for each in reports]
-            _print(options, "\n".join(map(_claim_line, reports)) or f"{options.store}: no agents", {"agents": values})
-            return int(any(each.verdict is ClaimVerdict.NOT_CONFIRMED for each in reports))
         case _:
             before, after = store_maintenance.compact(options.store)
             _print(
@@ -60,14 +53,6 @@ def _run(options: MaintenanceSettings) -> int:
 
 def _summary(report: StoreReport) -> str:
     return f"{report.agents} agents, {report.voxels} voxels, {report.gaussians} Gaussians, {report.keyframes} keyframes"
-
-
-def _claim_line(report: ClaimReport) -> str:
-    return (
-        f"{report.agent_id}: {report.verdict}; {report.contested_voxels} contested voxels won, "
-        f"{report.worse_keyframes} of {report.keyframes} keyframes of other agents clearly worse with them "
-        f"(error {report.error:.3f}, without {report.error_without:.3f})"
-    )
 
 
 def _print(options: MaintenanceSettings, text: str, values: dict[str, object]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -13,8 +13,6 @@ from gausslite.fusion.traffic import AgentContribution, MissionStatus
 from gausslite.wire.address import host_and_port
 
 _log = logging.getLogger(__name__)
-Engines = Callable[[], Sequence[FusionEngine]]
-"""Returns the engines of the server's missions."""
 
 
 class _AgentMetric(NamedTuple):
@@ -44,7 +42,7 @@ _OF_AGENTS = (
 )
 
 
-_OF_MISSIONS: tuple[tuple[str, str, Callable[[MissionStatus, bool], float]], ...] = (
+_OF_MISSION: tuple[tuple[str, str, Callable[[MissionStatus, bool], float]], ...] = (
     ("revision", "revision of the fused map", lambda status, _: status.revision),
     ("fused_voxels", "voxels of the fused map", lambda status, _: status.fused_voxels),
     ("fused_gaussians", "Gaussians of the fused map", lambda status, _: status.fused_gaussians),
@@ -57,30 +55,29 @@ _OF_MISSIONS: tuple[tuple[str, str, Callable[[MissionStatus, bool], float]], ...
 class MissionCollector:
     """Reads the figures when Prometheus asks for them; counters start at 0 with the server."""
 
-    def __init__(self, engines: Engines) -> None:
-        self._engines = engines
+    def __init__(self, engine: FusionEngine) -> None:
+        self._engine = engine
 
     def collect(self) -> Iterator[Any]:
-        """Yield the metrics of each mission and of each agent, with the ids as the labels `mission` and `agent`."""
+        """Yield the metrics of the mission and of each agent, with the ids as the labels `mission` and `agent`."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        figures = [(engine.status(), engine.storage.is_writable) for engine in self._engines()]
-        for name, help_text, value in _OF_MISSIONS:
-            of_missions = GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, labels=["mission"])
-            for status, is_writable in figures:
-                of_missions.add_metric([status.mission_config.mission_id], value(status, is_writable))
-            yield of_missions
+        status, is_writable = self._engine.status(), self._engine.storage.is_writable
+        mission_id = status.mission_config.mission_id
+        for name, help_text, value in _OF_MISSION:
+            of_mission = GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, labels=["mission"])
+            of_mission.add_metric([mission_id], value(status, is_writable))
+            yield of_mission
         for metric in _OF_AGENTS:
             kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
             family = kind(f"gausslite_agent_{metric.name}", metric.help_text, labels=["mission", "agent"])
-            for status, _ in figures:
-                for agent in status.agents:
-                    family.add_metric([status.mission_config.mission_id, agent.agent_id], metric.value(agent))
+            for agent in status.agents:
+                family.add_metric([mission_id, agent.agent_id], metric.value(agent))
             yield family
 
 
 @contextmanager
-def metrics_server(address: str | None, engines: Engines) -> Iterator[int]:
+def metrics_server(address: str | None, engine: FusionEngine) -> Iterator[int]:
     """Serve /metrics on HOST:PORT while the context is open, with the figures of the process; gives the actual port.
 
     None serves nothing and gives 0. Raises InvalidInputError without prometheus-client or for another address,
@@ -96,7 +93,7 @@ def metrics_server(address: str | None, engines: Engines) -> Iterator[int]:
         raise InvalidInputError("--metrics: needs prometheus-client; pip install 'gausslite[metrics]'") from error
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
-    registry.register(MissionCollector(engines))
+    registry.register(MissionCollector(engine))
     try:
         server, thread = start_http_server(port, host.strip("[]"), registry)
     except OSError as error:

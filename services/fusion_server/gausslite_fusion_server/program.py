@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import secrets
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.joint_refinement import rasterizer_of_backend
-from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
@@ -22,15 +21,12 @@ from gausslite.view.live_page import own_page
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
-from gausslite.wire.tracing import tracing
 from gausslite_fusion_server.maintenance import run_command
 from gausslite_fusion_server.metrics import metrics_server
-from gausslite_fusion_server.mission_router import MissionRouter
-from gausslite_fusion_server.missions import Mission, Missions, mission_file, stored_missions
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import MAINTENANCE_COMMANDS, PROGRAM, ServerSettings, parse_arguments
-from gausslite_fusion_server.store_follower import ServerLeadership
+from gausslite_fusion_server.store_follower import ServerLeadership, follow_store
 
 if TYPE_CHECKING:
     from gausslite.cluster.ray_store import RayStore
@@ -55,40 +51,21 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return run_service(PROGRAM, serve)
 
 
-def _open_missions(settings: ServerSettings) -> Missions:
-    """Open the stored missions. Raises InvalidInputError, QuotaError, StorageError."""
-
-    def open_mission(mission_id: str) -> Mission:
-        fusion = replace(settings.fusion, mission_id=mission_id) if mission_id else settings.fusion
-        if settings.store is not None and settings.shards is not None:
-            ray_store = _open_ray_store(settings.store, settings.shards, settings)
-            return _open_mission(settings, fusion, ray_store, leadership=ray_store)
-        store, file = _open_store(settings, mission_id), _file_of(settings, mission_id)
-        return _open_mission(settings, fusion, store, file)
-
-    has_folder = settings.max_missions > 1 and settings.store is not None
-    stored = stored_missions(settings.store) if has_folder and settings.store is not None else ()
-    return Missions(open_mission, settings.max_missions, stored)
+def _open_store(settings: ServerSettings) -> tuple[FusionStore, ServerLeadership | None]:
+    """Return the store and, of a store that servers share, who leads. Raises InvalidInputError, StorageError."""
+    if settings.store is None:
+        return MemoryStore(), None
+    if settings.shards is None:
+        return SqliteStore(settings.store, settings.store_max_bytes), None
+    ray_store = _open_ray_store(settings.store, settings.shards, settings)
+    return ray_store, ray_store
 
 
-def _open_mission(
-    settings: ServerSettings,
-    fusion: FusionSettings,
-    store: FusionStore,
-    file: Path | None = None,
-    leadership: ServerLeadership | None = None,
-) -> Mission:
-    try:
-        if leadership is None:
-            engine = FusionEngine(store, fusion, decode_keyframe=decode_frame)
-        else:
-            leadership.renew()
-            engine = FusionEngine(store, fusion, _revision_of_one_server(), decode_frame, leadership.leads)
-    except BaseException:
-        store.close()
-        raise
-    refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
-    return Mission(store, engine, FusionServicer(engine, refinement), file, leadership)
+def _open_engine(settings: ServerSettings, store: FusionStore, leadership: ServerLeadership | None) -> FusionEngine:
+    if leadership is None:
+        return FusionEngine(store, settings.fusion, decode_keyframe=decode_frame)
+    leadership.renew()
+    return FusionEngine(store, settings.fusion, _revision_of_one_server(), decode_frame, leadership.leads)
 
 
 def _revision_of_one_server() -> int:
@@ -98,17 +75,6 @@ def _revision_of_one_server() -> int:
     would need 4096 revisions in each microsecond to reach those of one that started later.
     """
     return (time.time_ns() // 1000 << 12) + secrets.randbelow(1 << 12)
-
-
-def _open_store(settings: ServerSettings, mission_id: str) -> FusionStore:
-    if settings.store is None:
-        return MemoryStore()
-    return SqliteStore(_file_of(settings, mission_id) or settings.store, settings.store_max_bytes)
-
-
-def _file_of(settings: ServerSettings, mission_id: str) -> Path | None:
-    """Return the file of one of several missions; None in memory and for the only mission."""
-    return mission_file(settings.store, mission_id) if mission_id and settings.store is not None else None
 
 
 def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> RayStore:
@@ -123,22 +89,35 @@ def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> RayS
 
 
 async def _serve(settings: ServerSettings) -> None:
-    missions = _open_missions(settings)
-    service = missions.only.servicer.service() if settings.max_missions == 1 else MissionRouter(missions).service()
+    store, leadership = _open_store(settings)
+    with contextlib.closing(store):
+        engine = _open_engine(settings, store, leadership)
+        refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
+        servicer = FusionServicer(engine, refinement)
+        try:
+            await _serve_mission(settings, engine, servicer, leadership)
+        finally:
+            servicer.close()
+            # a full disk is in the log already
+            with contextlib.suppress(StorageError):
+                engine.save_counters()
 
+
+async def _serve_mission(
+    settings: ServerSettings, engine: FusionEngine, servicer: FusionServicer, leadership: ServerLeadership | None
+) -> None:
     async def work_until_stopped() -> None:
         try:
-            # a store that servers share holds one mission
-            await (missions.only.follow_others() if settings.max_missions == 1 else asyncio.Event().wait())
+            if leadership is None:
+                await asyncio.Event().wait()
+            else:
+                await follow_store(engine, leadership, servicer.publish_changes)
         finally:
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
-            missions.drain()
+            servicer.drain()
 
-    try:
-        page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
-        with tracing(settings.traces, PROGRAM), metrics_server(settings.metrics, missions.engines), page:
-            await serve_until_stopped(
-                settings.listen, [service], work_until_stopped, settings.tls, settings.limits, settings.health
-            )
-    finally:
-        missions.close()
+    page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
+    with metrics_server(settings.metrics, engine), page:
+        await serve_until_stopped(
+            settings.listen, [servicer.service()], work_until_stopped, settings.tls, settings.limits, settings.health
+        )

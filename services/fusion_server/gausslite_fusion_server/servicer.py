@@ -40,7 +40,6 @@ from gausslite.wire.convert_task import graph_from_message
 from gausslite.wire.digest_messages import digests_to_messages
 from gausslite.wire.rejection_log import RejectionLog
 from gausslite.wire.server import Service
-from gausslite.wire.tracing import start_span
 from gausslite_fusion_server.change_blocks import ChangeBlocks, WatchedPart
 from gausslite_fusion_server.contributions import (
     agent_of_session,
@@ -167,13 +166,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         acknowledged, caller, loop = 0, Caller.of(context), asyncio.get_running_loop()
         async for request in self._gate.admit(request_iterator):
             self._gate.require_open()
-            with start_span("contribution") as span:
-                queued = await loop.run_in_executor(self._decoder, enqueue_subset, self._engine, request, caller)
-                span.mark("decoded")
-                if not queued.put.done():
-                    self._committer.submit(self._engine.commit_updates)
-                outcome = await outcome_of(self._engine, queued)
-                span.set(agent=queued.agent_id, bytes=len(request.subset), voxels=outcome.accepted_voxels)
+            queued = await loop.run_in_executor(self._decoder, enqueue_subset, self._engine, request, caller)
+            if not queued.put.done():
+                self._committer.submit(self._engine.commit_updates)
+            outcome = await outcome_of(self._engine, queued)
             if outcome.status == pb.SUBSET_STATUS_REJECTED:
                 self._rejections.record(caller.key, outcome.reason, outcome.message)
             self.publish_changes()
@@ -274,7 +270,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     ) -> pb.ContributeFreeSpaceResponse:
         """Replace what an agent observed as free in some blocks of voxels."""
         free_voxels = await self._work(store_free_space, self._engine, request, Caller.of(context))
-        self._map_changes.notify()
         return pb.ContributeFreeSpaceResponse(free_voxels=free_voxels)
 
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
@@ -301,7 +296,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             agents=[contribution_to_message(agent) for agent in status.agents],
             keyframes=status.keyframes,
             refined=status.refined,
-            vote=str(self._engine.settings.vote),
             banned_agents=status.banned_agents,
         )
 

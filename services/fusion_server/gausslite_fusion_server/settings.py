@@ -13,13 +13,12 @@ from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
-from gausslite.config.traces_option import add_traces
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings
-from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas, VoteRule
+from gausslite.fusion.limits import MAX_REFINE_ITERATIONS, FusionSettings, Quotas
 from gausslite.process.messages import print_message
 from gausslite.wire.address import host_and_port
 from gausslite.wire.call_limits import CallLimits
@@ -31,7 +30,6 @@ MEMORY = "memory"
 STORE_SUFFIX = ".sqlite"
 RAY_LOCAL = "local"
 MAX_SHARDS = 1024
-MAX_MISSIONS = 256
 _CORRECT, _TRUST = "correct", "trust"
 _MAX_STORE_MB = 1 << 24
 _MAINTENANCE = (
@@ -39,12 +37,6 @@ _MAINTENANCE = (
     ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
     ("verify", ("store",), "check every row; a server may be using the store"),
     ("compact", ("store",), "rewrite the file without unused space; no server may be using it"),
-    (
-        "check-claims",
-        ("store",),
-        "compare the voxels that each agent wins with the other agents' keyframes; no server may be using the "
-        "store: check a backup",
-    ),
 )
 MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 
@@ -53,10 +45,8 @@ MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 class ServerSettings:
     """Address, storage (None: in memory) and limits of the server, and the mission that it serves.
 
-    shards: the storage is a folder, for shards on Ray; None for a file. max_missions: above one, the storage is a
-    folder with a file for each.
-    view: port of the page that shows the server, None for no page. health: own address for health checks, None for
-    none. traces: address of an OTLP collector, None for no traces.
+    shards: the storage is a folder, for shards on Ray; None for a file. view: port of the page that shows the server,
+    None for no page. health: own address for health checks, None for none.
     """
 
     listen: str = FUSION_ADDRESS
@@ -64,7 +54,6 @@ class ServerSettings:
     store_max_bytes: int | None = None
     shards: int | None = None
     ray_address: str = RAY_LOCAL
-    max_missions: int = 1
     fusion: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
@@ -74,7 +63,6 @@ class ServerSettings:
     metrics: str | None = None
     view: int | None = None
     health: str | None = None
-    traces: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +81,6 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     options = parse_options(build_parser(), arguments, warn=print_message)
     if options.shards is not None and options.store == MEMORY:
         raise InvalidInputError("--shards: expected a folder as --store, got none")
-    _require_one_mission(options)
     _require_store(options)
     if options.health is not None:
         host_and_port("--health", options.health)
@@ -112,13 +99,11 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         None if options.store_max_mb is None else options.store_max_mb << 20,
         options.shards,
         options.ray_address,
-        options.max_missions,
         FusionSettings(
             VoxelGrid(options.voxel_size),
             options.mission,
             options.world_frame,
             quotas,
-            vote=VoteRule(options.vote),
             alignment=None if options.frame_alignment == _TRUST else AlignmentSettings(),
         ),
         RefineSettings(iterations=options.refine_iterations),
@@ -129,7 +114,6 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
         options.metrics,
         options.view,
         options.health,
-        options.traces,
     )
 
 
@@ -138,27 +122,14 @@ def _require_store(options: argparse.Namespace) -> None:
     if options.store == MEMORY or options.shards is not None:
         return
     path = Path(options.store)
-    has_suffix = path.suffix == STORE_SUFFIX
-    if options.max_missions > 1:
-        if has_suffix and not path.is_dir():
-            raise InvalidInputError(f"--store {path}: expected a folder with --max-missions, got the name of a file")
-    elif path.is_dir():
-        raise InvalidInputError(f"--store {path}: expected a file; a folder needs --shards or --max-missions")
-    elif not has_suffix and not path.exists():
+    if path.is_dir():
+        missions = f"; start one server for each mission in the folder: --store FILE{STORE_SUFFIX}"
+        has_missions = any(path.glob(f"*{STORE_SUFFIX}"))
+        raise InvalidInputError(
+            f"--store {path}: expected a file; a folder needs --shards{missions if has_missions else ''}"
+        )
+    if path.suffix != STORE_SUFFIX and not path.exists():
         raise InvalidInputError(f"--store {path}: expected {MEMORY} or the name of a file that ends in {STORE_SUFFIX}")
-
-
-def _require_one_mission(options: argparse.Namespace) -> None:
-    """Raise InvalidInputError for options that several missions cannot share."""
-    for name, value, default in (
-        ("mission", options.mission, ""),
-        ("shards", options.shards, None),
-        ("view", options.view, None),
-    ):
-        if options.max_missions > 1 and value != default:
-            raise InvalidInputError(
-                f"--{name}: expected a server of one mission, got --max-missions {options.max_missions}"
-            )
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -186,21 +157,8 @@ def build_parser() -> argparse.ArgumentParser:
     max_mb = Number("store-max-mb", int, 1, _MAX_STORE_MB)
     add("--store-max-mb", type=max_mb, metavar="MB", help="largest size of the SQLite file (default: no limit)")
     add_voxel_size(parser)
-    add("--mission", default="", metavar="ID", help="the only mission to serve (default: the first agent's)")
-    add(
-        "--max-missions",
-        type=Number("max-missions", int, 1, MAX_MISSIONS),
-        default=defaults.max_missions,
-        metavar="N",
-        help="largest number of missions; above 1, agents name theirs, and --store is a folder (default: %(default)s)",
-    )
+    add("--mission", default="", metavar="ID", help="the mission to serve (default: the first agent's)")
     add("--world-frame", default="", metavar="NAME", help="frame of all maps (default: the first agent's)")
-    add(
-        "--vote",
-        choices=[str(each) for each in VoteRule],
-        default=str(VoteRule.PAPER),
-        help="rule of the vote; free-space leaves out voxels that an agent observed as free (default: %(default)s)",
-    )
     add(
         "--frame-alignment",
         choices=[_CORRECT, _TRUST],
@@ -247,7 +205,6 @@ def build_parser() -> argparse.ArgumentParser:
     add("--metrics", metavar="HOST:PORT", help="serve figures for Prometheus there over HTTP (default: no)")
     add("--health", metavar="HOST:PORT", help="answer health checks also there, without encryption (default: no)")
     add_view(parser, "the fused map")
-    add_traces(parser)
     add_tls(parser)
     return parser
 

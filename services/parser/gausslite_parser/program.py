@@ -9,7 +9,6 @@ from gausslite.process.messages import print_message
 from gausslite.task.backends import open_parser
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
-from gausslite.wire.tracing import tracing
 from gausslite_parser.servicer import parser_service
 from gausslite_parser.settings import parse_arguments
 
@@ -24,8 +23,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return 2
 
     async def serve() -> int:
-        with tracing(settings.traces, "gausslite-parser"):
-            await serve_until_stopped(settings.listen, [parser_service(parser)], tls=settings.tls)
+        await serve_until_stopped(settings.listen, [parser_service(parser)], tls=settings.tls)
         return 0
 
     return run_service("gausslite-parser", serve)

@@ -12,7 +12,6 @@ from gausslite.config.default_addresses import PARSER_ADDRESS
 from gausslite.config.layers import parse_options
 from gausslite.config.task_parser_options import add_backend, backend_settings
 from gausslite.config.tls_options import add_tls, read_server_tls
-from gausslite.config.traces_option import add_traces
 from gausslite.process.messages import print_message
 from gausslite.task.backends import BackendSettings
 from gausslite.wire.tls import Tls
@@ -20,23 +19,17 @@ from gausslite.wire.tls import Tls
 
 @dataclass(frozen=True, slots=True)
 class ParserSettings:
-    """Address of the service, HOST:PORT (port 0: any free one) or unix:PATH, and the backend that parses tasks.
-
-    traces: address of an OTLP collector, None for no traces.
-    """
+    """Address of the service, HOST:PORT (port 0: any free one) or unix:PATH, and the backend that parses tasks."""
 
     listen: str = PARSER_ADDRESS
     backend: BackendSettings = field(default_factory=BackendSettings)
     tls: Tls | None = None
-    traces: str | None = None
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     """Return the settings of the options. Ends the process with code 2 for wrong flags. Raises InvalidInputError."""
     options = parse_options(build_parser(), arguments, warn=print_message)
-    return ParserSettings(
-        options.listen, backend_settings(options, os.environ), read_server_tls(options), options.traces
-    )
+    return ParserSettings(options.listen, backend_settings(options, os.environ), read_server_tls(options))
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -52,5 +45,4 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add_backend(parser)
     add_tls(parser)
-    add_traces(parser)
     return parser

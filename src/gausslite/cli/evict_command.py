@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from gausslite.cli.team_options import add_address, add_mission, fusion_client
+from gausslite.cli.team_options import add_address, fusion_client
 from gausslite.domain.names import require_identifier
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite evict`."""
     add_address(parser, "the fusion server")
-    add_mission(parser)
     parser.add_argument("agent", metavar="AGENT", help="id of the agent, as `gausslite status` prints it")
     parser.add_argument("--ban", action="store_true", help="also refuse later joins under this id")
     parser.set_defaults(run=run)

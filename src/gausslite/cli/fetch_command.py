@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gausslite.cli.team_options import add_address, add_mission, fusion_client
+from gausslite.cli.team_options import add_address, fusion_client
 from gausslite.codec.files import write_atomic
 from gausslite.config.paths import read_path
 from gausslite.mission.results import MAP_FILE, prepare_file
@@ -16,7 +16,6 @@ _STRATEGIES = ("vote", "refined", "concatenation")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite fetch`."""
     add_address(parser, "the fusion server")
-    add_mission(parser)
     add = parser.add_argument
     add("--out", metavar="FILE.ply", type=read_path, required=True, help="the file to write")
     add(

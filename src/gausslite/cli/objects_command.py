@@ -23,7 +23,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
     add("noun", metavar="NOUN", nargs="?", default="", help='a noun phrase such as "mug" (default: all objects)')
-    add("--mission", metavar="ID", default="", help="mission of the server (default: its only one)")
     add("--json", action="store_true", help="print JSON for scripts")
     add_tls(parser)
     parser.set_defaults(run=run)
@@ -50,7 +49,7 @@ def _query(options: argparse.Namespace) -> Sequence[TeamObject]:
     from gausslite.wire.clients import FusionClient
 
     require_callable("a fusion server or the output folder of a run", options.place)
-    with FusionClient(options.place, mission_id=options.mission, tls=read_tls(options)) as client:
+    with FusionClient(options.place, tls=read_tls(options)) as client:
         return client.query_objects(options.noun)
 
 

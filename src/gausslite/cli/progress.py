@@ -15,17 +15,13 @@ from gausslite.process.messages import printable
 _TERMINAL_INTERVAL_S, _LOG_INTERVAL_S = 0.2, 10.0
 
 
-def progress_bar(total: int | None, label: str, unit: str, row: int = 0) -> tqdm[Any]:
-    """Return a bar on stderr; if stderr is not a terminal, it writes one line every ten seconds.
-
-    total: None if it is unknown. unit: bytes ("B") are shown in kB, MB or GB.
-    """
+def progress_bar(total: int, label: str, unit: str, row: int = 0) -> tqdm[Any]:
+    """Return a bar on stderr; if stderr is not a terminal, it writes one line every ten seconds."""
     on_terminal = sys.stderr.isatty()
     return tqdm(
         total=total,
         desc=printable(label),
         unit=unit,
-        unit_scale=unit == "B",
         position=row if on_terminal else 0,
         mininterval=_TERMINAL_INTERVAL_S if on_terminal else _LOG_INTERVAL_S,
         dynamic_ncols=on_terminal,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gausslite.cli.progress import progress_bar
-from gausslite.cli.team_options import add_address, add_mission, fusion_client
+from gausslite.cli.team_options import add_address, fusion_client
 from gausslite.codec.files import write_atomic
 from gausslite.config.numbers import Number
 from gausslite.config.paths import read_path
@@ -18,7 +18,6 @@ _MAX_ITERATIONS, _MAX_SEED = 1_000_000, (1 << 63) - 1
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite refine`."""
     add_address(parser, "the fusion server")
-    add_mission(parser)
     add = parser.add_argument
     add(
         "--iterations",

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from gausslite.cli.team_options import add_address, add_json, add_mission
+from gausslite.cli.team_options import add_address, add_json
 from gausslite.config.tls_options import read_tls
 from gausslite.wire.service_status import query_status
 
@@ -17,14 +17,13 @@ _STATE_PREFIX = "AGENT_STATE_"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite status`."""
     add_address(parser, "an agent or a fusion server")
-    add_mission(parser)
     add_json(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the status. Returns the exit code. Raises UnavailableError, InvalidInputError."""
-    status = query_status(options.address, read_tls(options), options.mission)
+    status = query_status(options.address, read_tls(options))
     if options.json:
         print(json.dumps(status.values))
     else:

@@ -15,11 +15,6 @@ def add_address(parser: argparse.ArgumentParser, service: str) -> None:
     add_tls(parser)
 
 
-def add_mission(parser: argparse.ArgumentParser) -> None:
-    """Add --mission."""
-    parser.add_argument("--mission", metavar="ID", default="", help="mission of the server (default: its only one)")
-
-
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add --json."""
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
@@ -28,7 +23,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 def fusion_client(options: argparse.Namespace) -> FusionClient:
     """Return a client of the fusion server at the address. Raises InvalidInputError."""
     require_callable("address of the fusion server", options.address)
-    return FusionClient(options.address, mission_id=options.mission, tls=read_tls(options))
+    return FusionClient(options.address, tls=read_tls(options))
 
 
 def agent_client(options: argparse.Namespace) -> AgentClient:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_tls
-from gausslite.domain.errors import InvalidInputError
 from gausslite.process.messages import print_message
 from gausslite.view.level_of_detail import DEFAULT_LIMIT
 from gausslite.view.open_page import open_page
@@ -38,7 +37,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_LIMIT,
         help=f"draw the N most important Gaussians; a slider changes it (default: {DEFAULT_LIMIT})",
     )
-    add("--mission", metavar="ID", default="", help="mission of the fusion server (default: its only one)")
     add_tls(parser)
     parser.set_defaults(run=run)
 
@@ -55,8 +53,6 @@ def run(options: argparse.Namespace) -> int:
 @contextmanager
 def _show_files(options: argparse.Namespace) -> Iterator[str]:
     path = Path(options.place)
-    if options.mission:
-        raise InvalidInputError(f"--mission: expected the address of a fusion server with it, got {path}")
     contents = read_contents(path)
     past = read_past(path, contents)
     page = open_page(options.port, f"GaussLite {path.resolve().name}", options.max_shown)
@@ -73,10 +69,8 @@ def _follow(options: argparse.Namespace) -> AbstractContextManager[str]:
     from gausslite.wire.service_status import query_status
 
     tls = read_tls(options)
-    is_agent = query_status(options.place, tls, options.mission).is_agent
-    if is_agent and options.mission:
-        raise InvalidInputError(f"--mission: expected a fusion server with it, got the agent {options.place}")
-    return live_page(options.port, options.place, is_agent, tls, options.max_shown, options.mission)
+    is_agent = query_status(options.place, tls).is_agent
+    return live_page(options.port, options.place, is_agent, tls, options.max_shown)
 
 
 def _is_path(place: str) -> bool:

@@ -13,12 +13,10 @@ from gausslite.domain.errors import InvalidInputError
 PREFIX: Final = "GAUSSLITE_"
 CONFIG_VARIABLE: Final = "GAUSSLITE_CONFIG"
 KEY_VARIABLE: Final = "GAUSSLITE_LLM_API_KEY"
-MODELS_URL_VARIABLE: Final = "GAUSSLITE_MODELS_URL"
 _OTHER_VARIABLES: Final = frozenset(
     {
         CONFIG_VARIABLE,
         KEY_VARIABLE,
-        MODELS_URL_VARIABLE,
         "GAUSSLITE_SIMD",
         # of deploy/, of the native build and of the tests
         *("GAUSSLITE_AGENTS", "GAUSSLITE_CERTS", "GAUSSLITE_CERT_DAYS", "GAUSSLITE_EXTRAS", "GAUSSLITE_FUSION_PORT"),

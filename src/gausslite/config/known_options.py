@@ -10,7 +10,7 @@ KNOWN_OPTIONS: Final = frozenset(
         *("agents", "corpus", "held", "hostile", "kills", "messages", "seconds", "server", "servers", "watchers"),
         *("absent", "accept-similar", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps"),
         "changes",
-        *("traces", "deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
+        *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
         *("frame-alignment", "frame-error", "free-space", "homes", "late-joiner", "positions", "team-map"),
         *("external-rasterizer", "fit-views", "frames", "frames-a", "frames-b", "fusion", "gaussians"),
         *(
@@ -26,11 +26,10 @@ KNOWN_OPTIONS: Final = frozenset(
             "llm-format",
         ),
         *("limit-calls", "limit-connections", "limit-idle", "limit-kbps", "log-format", "metrics"),
-        *("fused-from-agent", "lens", "shutter", "speeds", "team-sizes", "vote"),
+        *("fused-from-agent", "lens", "shutter", "speeds", "team-sizes"),
         *("llm-key-variable", "llm-model", "llm-timeout", "llm-url", "loop", "lpips-weights", "map", "masks"),
         *(
             "max-gaussians",
-            "max-missions",
             "max-shown",
             "min-iterations",
             "mission",
@@ -65,7 +64,6 @@ KNOWN_OPTIONS: Final = frozenset(
             "reps",
         ),
         *(
-            "resegment",
             "resume",
             "reuse-other-code",
             "roi",

@@ -77,7 +77,6 @@ def add_detector(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="the text encoder's vocabulary (default: vocab.txt or tokenizer.json in the model's folder)",
     )
-    add_switch(group, "--resegment", "run the segmenter on every frame (slower)")
     add_switch(group, "--accept-similar", "also map objects of a class that is only similar to the task's noun")
     add(
         "--tiles",
@@ -216,8 +215,7 @@ def perception_settings(options: argparse.Namespace) -> PerceptionSettings:
     """Return the settings of `add_detector` and `add_budget`; at a rate, detection is asynchronous, on one thread."""
     return PerceptionSettings(
         options.detector,
-        options.resegment,
-        options.threads if options.rate is None else 1,
+        threads=options.threads if options.rate is None else 1,
         asynchronous=options.rate is not None,
         segmenter=options.segmenter,
         vocabulary=options.vocabulary,
@@ -257,7 +255,6 @@ def perception_options(settings: PerceptionSettings) -> dict[str, OptionValue]:
         "detector": None if settings.model is None else str(settings.model.absolute()),
         "segmenter": settings.segmenter,
         "vocabulary": None if settings.vocabulary is None else str(settings.vocabulary.absolute()),
-        "resegment": settings.resegment,
         "accept-similar": settings.accept_similar,
         "tiles": settings.tiles,
     }

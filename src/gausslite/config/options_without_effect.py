@@ -32,8 +32,6 @@ def require_effect(options: argparse.Namespace) -> None:
         _refuse("--segmenter", _DETECTOR)
     if options.vocabulary is not None:
         _refuse("--vocabulary", _DETECTOR)
-    if options.resegment:
-        _refuse("--resegment", _DETECTOR)
     if options.tiles != DEFAULT_TILES_PER_SIDE:
         _refuse("--tiles", _DETECTOR)
 

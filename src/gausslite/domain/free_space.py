@@ -59,12 +59,10 @@ class FreeSpace:
         found: UInt8[ndarray, " v"] = np.where(self.keys[place] == blocks, self.counts[place, cells], np.uint8(0))
         return found
 
-    def voxel_keys(self, grid: VoxelGrid, min_views: int) -> Int64[ndarray, " v"]:
-        """Return the keys of the grid's voxels with at least this many views, ascending."""
-        rows, cells = np.nonzero(self.counts >= min_views)
-        corners = block_grid(grid).indices(self.keys[rows]) * BLOCK_SIDE
-        offsets = np.stack(np.unravel_index(cells, (BLOCK_SIDE,) * 3), axis=1)
-        return np.sort(grid.keys(((corners + offsets + 0.5) * grid.size_m).astype(np.float32)))
+    def require_within(self, grid: VoxelGrid) -> None:
+        """Raise InvalidInputError for blocks outside the range of the voxels' grid."""
+        blocks = block_grid(grid)
+        grid.keys(((blocks.indices(self.keys) + 0.5) * blocks.size_m).astype(np.float32))
 
 
 def block_grid(grid: VoxelGrid) -> VoxelGrid:

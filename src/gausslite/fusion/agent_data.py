@@ -72,7 +72,7 @@ class AgentData:
         Where both have a voxel, the one with the higher Σkappa is kept. A crash in between leaves the same Gaussians
         under both names, and the next call merges them again.
         """
-        name, own = earlier_map_of(agent_id), self._votes.fused_batch(agent_id)
+        name, own = earlier_map_of(agent_id), self._votes.batch(agent_id)
         if int(own.counts.sum()) > 0:
             seq = self._store.totals(name).highest_update_seq + 1
             merged = fuse({agent_id: own, name: self._store.batch(name)}).batch

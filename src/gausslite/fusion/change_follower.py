@@ -130,12 +130,9 @@ class ChangeFollower:
         self._mark(agent_id, self._parts.votes.refresh(agent_id))
 
     def _follow_free_space(self, agent_id: str, data: bytes) -> None:
-        keys = self._parts.free_space.follow(agent_id, data)
+        self._parts.free_space.follow(agent_id, data)
         if self._leads():
             self._parts.aligner.record_free_space(agent_id)
-        if self._parts.votes.uses_free_space:
-            for name in self._parts.votes.agents():
-                self._mark(name, keys)
 
     def _mark(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
         self._fused.setdefault(agent_id, []).append(keys)

@@ -30,7 +30,7 @@ from gausslite.fusion.keyframes import (
     in_fused_frame,
     no_decoder,
 )
-from gausslite.fusion.limits import FusionSettings, VoteRule
+from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.mission_status import mission_status
 from gausslite.fusion.refined_map import save_refinement
@@ -105,12 +105,6 @@ class FusionEngine:
         """The mission's configuration, with default names in place of empty ones."""
         with self._lock:
             return self._parts.members.mission_config
-
-    @property
-    def is_unused(self) -> bool:
-        """Whether no agent has a lease, none has data, and none is banned."""
-        with self._lock:
-            return self._parts.members.is_unused
 
     @property
     def incarnation_id(self) -> str:
@@ -247,11 +241,8 @@ class FusionEngine:
             agent_id = self._parts.members.session(session_id).agent_id
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
-            keys = self._parts.free_space.contribute(agent_id, blocks)
+            self._parts.free_space.contribute(agent_id, blocks)
             self._parts.aligner.record_free_space(agent_id)
-            if self._settings.vote is VoteRule.FREE_SPACE:
-                for name in self._parts.votes.agents():
-                    self._parts.maps.record(name, keys)
             return self._parts.free_space.free_voxels(agent_id)
 
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:

@@ -11,7 +11,7 @@ from gausslite.fusion.frame_alignment import FrameAlignments
 from gausslite.fusion.free_space import FreeSpaceRecords
 from gausslite.fusion.fused_map import FusedMapLayers
 from gausslite.fusion.keyframes import FrameDecoder, KeyframePool
-from gausslite.fusion.limits import FusionSettings, VoteRule
+from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.refined_map import load_refinement
 from gausslite.fusion.store import FusionStore
@@ -47,7 +47,7 @@ class EngineParts:
         keyframes = KeyframePool(store, quotas.keyframe_limits, decode)
         objects, checks, traffic = TeamObjects(store), UpdateChecks(store, quotas), TrafficLog(store)
         alignments, free_space = FrameAlignments(store), FreeSpaceRecords(store, grid)
-        votes = VoteInput(store, alignments, grid, free_space if settings.vote is VoteRule.FREE_SPACE else None)
+        votes = VoteInput(store, alignments, grid)
         aligner = FrameAligner(store, alignments, votes, free_space, lock, settings.alignment)
         refined = load_refinement(store)
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)

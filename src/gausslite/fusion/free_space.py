@@ -1,4 +1,4 @@
-"""What the agents observed as free, and the updates that these observations contradict."""
+"""What the agents observed as free: evidence about the frames of agents whose maps do not overlap."""
 
 from __future__ import annotations
 
@@ -28,40 +28,22 @@ class FreeSpaceRecords:
         stored = store.records(RECORD).items()
         self._by_agent = {agent_id: decode_free_space(data, _STORED_BYTES)[0] for agent_id, data in stored}
 
-    def contribute(self, agent_id: str, blocks: FreeSpace) -> Int64[ndarray, " k"]:
-        """Replace these blocks of an agent; returns the voxels where its view may have changed. Raises QuotaError,
-        InvalidInputError for blocks outside the grid's range.
-        """
-        before = self._by_agent.get(agent_id, FreeSpace.empty())
-        after = before.replace_blocks(blocks)
+    def contribute(self, agent_id: str, blocks: FreeSpace) -> None:
+        """Replace these blocks of an agent. Raises QuotaError, InvalidInputError for blocks out of the grid's range."""
+        blocks.require_within(self.grid)
+        after = self._by_agent.get(agent_id, FreeSpace.empty()).replace_blocks(blocks)
         if len(after.keys) > MAX_BLOCKS:
             raise QuotaError(f"free space: expected at most {MAX_BLOCKS} blocks of an agent, got {len(after.keys)}")
-        # before it is stored, because blocks outside the grid's range raise here
-        earlier, now = (each.voxel_keys(self.grid, MIN_VIEWS) for each in (before, after))
         self._store.save_record(agent_id, RECORD, encode_free_space(after, self.grid))
         self._by_agent[agent_id] = after
-        return np.setxor1d(earlier, now)
 
-    def follow(self, agent_id: str, data: bytes) -> Int64[ndarray, " k"]:
-        """Apply what another server has stored of an agent; returns the voxels where its view may have changed.
-
-        Raises CodecError.
-        """
-        before, after = self._by_agent.get(agent_id, FreeSpace.empty()), decode_free_space(data, _STORED_BYTES)[0]
-        self._by_agent[agent_id] = after
-        earlier, now = (each.voxel_keys(self.grid, MIN_VIEWS) for each in (before, after))
-        return np.setxor1d(earlier, now)
+    def follow(self, agent_id: str, data: bytes) -> None:
+        """Apply what another server has stored of an agent. Raises CodecError."""
+        self._by_agent[agent_id] = decode_free_space(data, _STORED_BYTES)[0]
 
     def free_voxels(self, agent_id: str) -> int:
         """Return the number of voxels that the agent has observed as free."""
         return self._by_agent.get(agent_id, FreeSpace.empty()).free_voxels
-
-    def contradicts(self, keys: Int64[ndarray, " k"], frames_differ: set[str]) -> Bool[ndarray, " k"]:
-        """Return True for the voxels that an agent has observed as free in two views.
-
-        Agents in `frames_differ` do not count, because their voxels are not those of the fused map.
-        """
-        return self.seen_by(self._by_agent.keys() - frames_differ, keys)
 
     def seen_by(self, agents: Collection[str], keys: Int64[ndarray, " k"]) -> Bool[ndarray, " k"]:
         """Return True for the voxels that one of these agents has observed as free in two views."""

@@ -120,11 +120,6 @@ class FusedMapLayers:
             removed = np.setdiff1d(keys, won.batch.keys) if since_revision else np.zeros(0, np.int64)
             return FusedMapChanges(log.revision, since_revision == 0, won, removed)
 
-    def updates_by_agent(self) -> dict[str, VoxelBatch]:
-        """Return all updates as the vote reads them."""
-        with self._lock:
-            return self._votes.batches()
-
     def voted_map(self, only_agent: str = "") -> VoxelBatch:
         """Return the fused map, or its voxels that one agent wins."""
         fused = fuse(self._votes.batches())

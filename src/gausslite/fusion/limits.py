@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from enum import StrEnum
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_identifier, require_name
@@ -17,13 +16,6 @@ DEFAULT_LEASE_S = 60.0
 """Longer than a robot needs to notice a lost server and to reconnect, see wire/connection.py."""
 MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
-
-
-class VoteRule(StrEnum):
-    """FREE_SPACE leaves out updates of voxels that an agent has observed as free in two views."""
-
-    PAPER = "paper"
-    FREE_SPACE = "free-space"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +51,8 @@ class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
     max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
-    alignment: how agents' frames are estimated; None uses them as declared. vote: the rule of the vote. lease_s: time
-    after an agent's last call during which no other robot can take its name.
+    alignment: how agents' frames are estimated; None uses them as declared. lease_s: time after an agent's last call
+    during which no other robot can take its name.
     """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)
@@ -69,7 +61,6 @@ class FusionSettings:
     quotas: Quotas = field(default_factory=Quotas)
     max_removed_voxels: int = MAX_REMOVED_VOXELS
     alignment: AlignmentSettings | None = None
-    vote: VoteRule = VoteRule.PAPER
     lease_s: float = DEFAULT_LEASE_S
 
     def __post_init__(self) -> None:

@@ -46,11 +46,6 @@ class Membership:
         """The agents with a session or with data, and the names of earlier maps."""
         return self.joined | frozenset(self._store.agents())
 
-    @property
-    def is_unused(self) -> bool:
-        """Whether no agent has a lease, none has data, and none is banned."""
-        return not (self._store.agents() or self._sessions.live_agents or self._bans.agents)
-
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id, see SessionRegistry.get."""
         return self._sessions.get(session_id)

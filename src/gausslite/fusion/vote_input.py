@@ -1,7 +1,4 @@
-"""The voxel updates as the vote reads them: in the fused map's frame, without quarantined agents.
-
-The free-space vote also leaves out updates that the agents' views contradict.
-"""
+"""The voxel updates as the vote reads them: in the fused map's frame, without quarantined agents."""
 
 from __future__ import annotations
 
@@ -19,7 +16,6 @@ from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxel_operations import VoxelIndex, empty_batch, group_by_voxel, select_keys, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment, FrameAlignments
-from gausslite.fusion.free_space import FreeSpaceRecords
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import VoxelScoreTable
 
@@ -30,25 +26,13 @@ class VoteInput:
     Not thread-safe; FusionEngine holds a lock.
     """
 
-    def __init__(
-        self,
-        store: FusionStore,
-        alignments: FrameAlignments,
-        grid: VoxelGrid,
-        free_space: FreeSpaceRecords | None = None,
-    ) -> None:
-        """With free space, updates of voxels that an agent has observed as free are not read."""
-        self._store, self._alignments, self._grid, self._free_space = store, alignments, grid, free_space
+    def __init__(self, store: FusionStore, alignments: FrameAlignments, grid: VoxelGrid) -> None:
+        self._store, self._alignments, self._grid = store, alignments, grid
         self._moved: dict[str, VoxelBatch] = {}
         self._trackers: dict[str, VoxelChangeTracker] = {}
         for agent_id in store.agents():
             if not self._is_as_sent(agent_id):
                 self.refresh(agent_id)
-
-    @property
-    def uses_free_space(self) -> bool:
-        """Whether updates in observed free space are left out."""
-        return self._free_space is not None
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
@@ -56,13 +40,6 @@ class VoteInput:
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
-        table = self._fused_scores(keys)
-        if self._free_space is None:
-            return table
-        kept = ~self._free_space.contradicts(table.keys, self._alignments.in_other_frames())
-        return _merge_scores(table, kept, {})
-
-    def _fused_scores(self, keys: Int64[ndarray, " k"] | None) -> VoxelScoreTable:
         table = self._store.scores(keys)
         if not self._moved:
             return table
@@ -70,29 +47,17 @@ class VoteInput:
         moved = {i: _select(self._moved[name], keys) for i, name in enumerate(table.agents) if name in self._moved}
         return _merge_scores(table, kept, moved)
 
-    def batch(self, agent_id: str, keys: Int64[ndarray, " k"]) -> VoxelBatch:
-        """Return the updates of one agent on these voxels."""
+    def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
+        """Return the updates of one agent on these voxels, or on all; empty in quarantine."""
         is_moved = agent_id in self._moved
-        batch = _select(self._moved[agent_id], keys) if is_moved else self._store.batch(agent_id, keys)
-        if self._free_space is None:
-            return batch
-        return select_voxels(batch, ~self._free_space.contradicts(batch.keys, self._alignments.in_other_frames()))
-
-    def fused_batch(self, agent_id: str) -> VoxelBatch:
-        """Return all updates of one agent in the fused frame, also those in free space; empty in quarantine."""
-        return self._moved[agent_id] if agent_id in self._moved else self._store.batch(agent_id)
+        return _select(self._moved[agent_id], keys) if is_moved else self._store.batch(agent_id, keys)
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the updates of every agent on these voxels, or on all."""
         batches = self._store.batches(keys)
-        fused = {
+        return {
             name: _select(self._moved[name], keys) if name in self._moved else batch for name, batch in batches.items()
         }
-        if self._free_space is None:
-            return fused
-        differ = self._alignments.in_other_frames()
-        free = self._free_space
-        return {name: select_voxels(each, ~free.contradicts(each.keys, differ)) for name, each in fused.items()}
 
     def refresh(self, agent_id: str) -> Int64[ndarray, " k"]:
         """Recompute the agent's moved map after its updates or its alignment changed; returns the voxels to compare.

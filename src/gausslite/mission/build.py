@@ -110,11 +110,10 @@ class EstimatorFactory:
         if self._models is None:
             return TaskRelevanceEstimator(graph, self._ground_truth_detector(), settings)
         detector = self._models.detector
-        segmenter = self._models.segmenter if self._perception.resegment else None
         if not self._perception.asynchronous:
-            return TaskRelevanceEstimator(graph, detector, settings, segmenter)
+            return TaskRelevanceEstimator(graph, detector, settings)
         self._executor = self._executor or ThreadPoolExecutor(1, "detector")
-        return AsyncRelevanceEstimator(graph, detector, self._executor, settings, segmenter)
+        return AsyncRelevanceEstimator(graph, detector, self._executor, settings)
 
     def _ground_truth_detector(self) -> Detector:
         self.require_detector()

@@ -127,17 +127,14 @@ class PerceptionSettings:
     detector's masks), "depth" or a FastSAM file; None for the model's own masks, or depth if it has none. vocabulary:
     the text encoder's file; None for vocab.txt (Grounding DINO) or tokenizer.json (YOLO-World) next to the model.
 
-    resegment: also run the segmenter on frames between detections. Otherwise masks are cut by depth inside the
-    re-projected boxes, which on a real kitchen is as accurate at a third of the time. asynchronous: mapping does not
-    wait for detections; they run on their own thread and take effect when they are finished. accept_similar: also map
-    objects of a class that is only similar to the task's noun.
+    asynchronous: mapping does not wait for detections; they run on their own thread and take effect when they are
+    finished. accept_similar: also map objects of a class that is only similar to the task's noun.
 
     tiles: the detector also runs in tiles x tiles parts of each keyframe, which finds small, distant objects; 1: off.
     detection_time_s: no further tile is started if it would end later than this; None for no limit.
     """
 
     model: Path | None = field(default=None, metadata={"flag": "--detector", **FILE})
-    resegment: bool = False
     threads: int | None = field(default=None, metadata=MAY_CHANGE)
     asynchronous: bool = field(default=False, metadata=MAY_CHANGE)
     segmenter: str | None = field(default=None, metadata=FILE)

@@ -15,7 +15,7 @@ from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.relevance import DetectedImage, Detection, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
-from gausslite.perception.detect import Detector, Segmenter
+from gausslite.perception.detect import Detector
 from gausslite.perception.lifting import best_depth_m
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.relevance_tracker import RelevanceTracker, RelevanceTrackerSettings
@@ -99,13 +99,11 @@ class TaskRelevanceEstimator:
         graph: TaskGraph,
         detector: Detector,
         settings: RelevanceTrackerSettings | None = None,
-        segmenter: Segmenter | None = None,
     ) -> None:
-        """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._detector = detector
         by_height = nouns_known_by_height(detector.matches(graph.queries))
-        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter, by_height)
+        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), by_height)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -172,14 +170,12 @@ class AsyncRelevanceEstimator:
         detector: Detector,
         executor: Executor,
         settings: RelevanceTrackerSettings | None = None,
-        segmenter: Segmenter | None = None,
     ) -> None:
-        """Without a segmenter, masks are propagated by depth alone."""
         self._graph = graph
         self._detector = detector
         self._executor = executor
         by_height = nouns_known_by_height(detector.matches(graph.queries))
-        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), segmenter, by_height)
+        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), by_height)
         self._frames = 0
         self._skipped_keyframes = 0
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None

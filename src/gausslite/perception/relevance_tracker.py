@@ -25,7 +25,6 @@ from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.checkpoint import decode_floor, decode_landmark, encode_landmark
-from gausslite.perception.detect import Segmenter, bounding_box
 from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
 from gausslite.perception.lifting import lift_detections
 from gausslite.perception.object_map import Landmark
@@ -73,16 +72,11 @@ class RelevanceTracker:
         self,
         graph: TaskGraph,
         settings: RelevanceTrackerSettings,
-        segmenter: Segmenter | None,
         nouns_by_height: frozenset[str] = frozenset(),
     ) -> None:
-        """Without a segmenter, the masks of frames without detection are the objects' surfaces alone.
-
-        nouns_by_height: surfaces that the detector cannot find, whose height above the floor is known.
-        """
+        """nouns_by_height: surfaces that the detector cannot find, whose height above the floor is known."""
         self._graph = graph
         self._settings = settings
-        self._segmenter = segmenter
         self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial, settings.evidence, nouns_by_height)
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
@@ -223,17 +217,9 @@ class RelevanceTracker:
             if own:
                 mask = refined_mask(np.logical_or.reduce(own), landmark.votes, frame)
             else:
-                mask = self._resegmented(surface_mask(landmark.votes, frame), frame)
+                mask = surface_mask(landmark.votes, frame)
             masks.append((name, mask))
         return replace(merge_masks(masks, self._graph.targets, frame), known_objects=self.known_objects)
-
-    def _resegmented(self, mask: Bool[ndarray, "h w"], frame: Frame) -> Bool[ndarray, "h w"]:
-        """Return the segmenter's mask for the box of a mask; the mask itself if it finds nothing."""
-        box_px = bounding_box(mask)
-        if self._segmenter is None or box_px is None:
-            return mask
-        (segmented,) = self._segmenter.segment(frame, np.asarray([box_px], np.float32))
-        return mask if segmented is None else segmented
 
     def _observe(
         self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]

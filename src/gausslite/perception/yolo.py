@@ -15,7 +15,6 @@ from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.object_names import is_generic, is_seat, same_kind
 from gausslite.domain.relevance import DetectedBox, Detection, Rival
 from gausslite.perception.box_size import BoxSizeLimits
-from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
 from gausslite.perception.detect import box_iou
 from gausslite.perception.models.model_file import OpenModel
 from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
@@ -78,10 +77,6 @@ class YoloDetector:
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return the network's classes that match each query."""
         return tuple(self._match(query) for query in queries)
-
-    def segmenter(self) -> ClassAgnosticSegmenter:
-        """Return a Segmenter over the same network, which uses masks of all classes."""
-        return ClassAgnosticSegmenter(self._network)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return all instances of each query with masks, best first, without boxes too large for their class."""

@@ -801,7 +801,6 @@ class GetSessionStatusResponse(_message.Message):
     AGENTS_FIELD_NUMBER: _builtins.int
     KEYFRAMES_FIELD_NUMBER: _builtins.int
     REFINED_FIELD_NUMBER: _builtins.int
-    VOTE_FIELD_NUMBER: _builtins.int
     BANNED_AGENTS_FIELD_NUMBER: _builtins.int
     mission_id: _builtins.str
     world_frame: _builtins.str
@@ -811,8 +810,6 @@ class GetSessionStatusResponse(_message.Message):
     keyframes: _builtins.int
     refined: _builtins.bool
     """True when a refined map can be exported."""
-    vote: _builtins.str
-    """The rule of the vote: "paper" or "free-space"."""
     @_builtins.property
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
     @_builtins.property
@@ -833,12 +830,11 @@ class GetSessionStatusResponse(_message.Message):
         agents: _abc.Iterable[Global___AgentContribution] | None = ...,
         keyframes: _builtins.int = ...,
         refined: _builtins.bool = ...,
-        vote: _builtins.str = ...,
         banned_agents: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "banned_agents", b"banned_agents", "fused_gaussians", b"fused_gaussians", "fused_revision", b"fused_revision", "fused_voxels", b"fused_voxels", "grid", b"grid", "keyframes", b"keyframes", "mission_id", b"mission_id", "refined", b"refined", "vote", b"vote", "world_frame", b"world_frame"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "banned_agents", b"banned_agents", "fused_gaussians", b"fused_gaussians", "fused_revision", b"fused_revision", "fused_voxels", b"fused_voxels", "grid", b"grid", "keyframes", b"keyframes", "mission_id", b"mission_id", "refined", b"refined", "world_frame", b"world_frame"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

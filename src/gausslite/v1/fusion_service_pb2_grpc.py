@@ -195,7 +195,7 @@ class FusionServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ContributeFreeSpace(self, request, context):
-        """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote.
+        """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

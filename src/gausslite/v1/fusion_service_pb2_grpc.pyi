@@ -64,7 +64,7 @@ class FusionServiceStub:
     QueryObjects: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.QueryObjectsRequest, _fusion_service_pb2.QueryObjectsResponse]
     """The team's objects, each merged over the agents that observed it, or those that a noun names."""
     ContributeFreeSpace: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.ContributeFreeSpaceRequest, _fusion_service_pb2.ContributeFreeSpaceResponse]
-    """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote."""
+    """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others."""
     RenderView: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
@@ -113,7 +113,7 @@ class FusionServiceAsyncStub(FusionServiceStub):
     QueryObjects: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.QueryObjectsRequest, _fusion_service_pb2.QueryObjectsResponse]  # type: ignore[assignment]
     """The team's objects, each merged over the agents that observed it, or those that a noun names."""
     ContributeFreeSpace: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.ContributeFreeSpaceRequest, _fusion_service_pb2.ContributeFreeSpaceResponse]  # type: ignore[assignment]
-    """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote."""
+    """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others."""
     RenderView: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]  # type: ignore[assignment]
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
@@ -219,7 +219,7 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _fusion_service_pb2.ContributeFreeSpaceRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.ContributeFreeSpaceResponse, _abc.Awaitable[_fusion_service_pb2.ContributeFreeSpaceResponse]]:
-        """Replace what the agent has observed as free in some blocks of voxels; used by the free-space vote."""
+        """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others."""
 
     @_abc_1.abstractmethod
     def RenderView(

@@ -32,12 +32,10 @@ def live_page(
     is_agent: bool,
     tls: Tls | None = None,
     limit: int = DEFAULT_LIMIT,
-    mission_id: str = "",
 ) -> Iterator[str]:
     """Serve the page of an agent or a fusion server, also one that starts later; yield the page's URL.
 
-    mission_id: of the fusion server's missions; empty for its only one. Raises InvalidInputError for an unusable
-    address or port.
+    Raises InvalidInputError for an unusable address or port.
     """
     require_callable("view", address)
     page = open_page(port, f"GaussLite {'agent' if is_agent else 'fusion server'}", limit)
@@ -46,7 +44,7 @@ def live_page(
     def open_client() -> AgentClient | FusionClient:
         if is_agent:
             return AgentClient(address, _DEADLINE_S, tls)
-        return FusionClient(address, _DEADLINE_S, mission_id=mission_id, tls=tls)
+        return FusionClient(address, _DEADLINE_S, tls=tls)
 
     follower = threading.Thread(target=_follow, args=(page, open_client, stopped), daemon=True)
     follower.start()

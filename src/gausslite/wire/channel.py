@@ -15,7 +15,6 @@ from gausslite.wire.address import require_callable
 from gausslite.wire.connection import KEEPALIVE_S, connection_options
 from gausslite.wire.status import from_rpc_error
 from gausslite.wire.tls import Tls, open_channel
-from gausslite.wire.tracing import traced_channel
 
 DEADLINE_S = 30.0
 _REQUESTS_END_S = 1.0
@@ -59,7 +58,7 @@ class ServiceChannel:
             *connection_options(self.keepalive_s),
             ("grpc.max_reconnect_backoff_ms", 2000),
         )
-        self._channel = traced_channel(open_channel(address, tls, options))
+        self._channel = open_channel(address, tls, options)
 
     def __str__(self) -> str:
         """Return the kind and address, such as "parser localhost:50051"."""

@@ -33,7 +33,6 @@ from gausslite.wire.roles import require_role
 from gausslite.wire.status import code_and_reason, to_status
 from gausslite.wire.tls import Tls
 from gausslite.wire.token_bucket import TokenBucket
-from gausslite.wire.tracing import start_server_span
 
 _log = logging.getLogger(__name__)
 _LAST_CALLS_S = 1.0
@@ -220,11 +219,10 @@ class _Guard:
     def unary_method(self, inner: Any) -> Any:
         async def guarded(request: Any, context: Any) -> Any:
             try:
-                with start_server_span(self.method, context):
-                    caller = Caller.of(context)
-                    require_role(self.method, caller)
-                    with self.usage.open_call(caller) as bandwidth:
-                        return await inner(await self._admit(request, bandwidth), context)
+                caller = Caller.of(context)
+                require_role(self.method, caller)
+                with self.usage.open_call(caller) as bandwidth:
+                    return await inner(await self._admit(request, bandwidth), context)
             except Exception as error:
                 await self._abort(error, context)
 
@@ -233,12 +231,11 @@ class _Guard:
     def stream_method(self, inner: Any) -> Any:
         async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
             try:
-                with start_server_span(self.method, context):
-                    caller = Caller.of(context)
-                    require_role(self.method, caller)
-                    with self.usage.open_call(caller) as bandwidth:
-                        async for response in inner(await self._admit(request, bandwidth), context):
-                            yield response
+                caller = Caller.of(context)
+                require_role(self.method, caller)
+                with self.usage.open_call(caller) as bandwidth:
+                    async for response in inner(await self._admit(request, bandwidth), context):
+                        yield response
             except Exception as error:
                 await self._abort(error, context)
 

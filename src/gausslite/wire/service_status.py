@@ -30,17 +30,17 @@ class ServiceStatus:
     values: dict[str, Any]
 
 
-def query_status(address: str, tls: Tls | None, mission_id: str = "") -> ServiceStatus:
-    """Return the status of the agent, or of a mission of the fusion server; an empty id is that of its only one.
+def query_status(address: str, tls: Tls | None) -> ServiceStatus:
+    """Return the status of the agent or of the fusion server.
 
-    Raises UnavailableError, InvalidInputError if it is neither, MismatchError for another mission.
+    Raises UnavailableError, InvalidInputError if it is neither.
     """
     require_callable("address", address)
     if serves(address, _AGENT, tls):
         with AgentClient(address, tls=tls) as agent:
             return ServiceStatus(True, _to_values(agent.status()))
     if serves(address, _FUSION, tls):
-        with FusionClient(address, mission_id=mission_id, tls=tls) as fusion:
+        with FusionClient(address, tls=tls) as fusion:
             return ServiceStatus(False, _to_values(fusion.status()))
     raise InvalidInputError(f"{address}: expected an agent or a fusion server, got another service")
 

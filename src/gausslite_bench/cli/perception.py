@@ -86,8 +86,7 @@ def run_perception(options: argparse.Namespace) -> int:
     queries = [*_task_queries(options.task, regions), *absent]
     if options.pictures is not None:
         prepare_folder(options.pictures)
-    segmenter = models.segmenter if options.resegment else None
-    bench = PerceptionBench(models.detector, queries, regions, source.up_axis, segmenter)
+    bench = PerceptionBench(models.detector, queries, regions, source.up_axis)
     sheets = [PerceptionSheet(len(positions)) for _ in queries] if options.pictures is not None else []
     for position in positions:
         masks = bench.process(source.frame(position, size))

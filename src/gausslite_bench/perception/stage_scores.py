@@ -18,7 +18,7 @@ from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.views import MIN_ROI_PIXELS
-from gausslite.perception.detect import Detector, Segmenter
+from gausslite.perception.detect import Detector
 from gausslite.perception.evidence import EvidenceSettings
 from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import RelevanceTrackerSettings, merge_detections
@@ -122,7 +122,6 @@ class PerceptionBench:
         queries: Sequence[TaskQuery],
         regions: Mapping[str, Region],
         up_axis: UpAxis,
-        segmenter: Segmenter | None = None,
     ) -> None:
         """regions: ground truth by object name. Raises InvalidInputError for an object without region."""
         for query in queries:
@@ -135,7 +134,7 @@ class PerceptionBench:
             detector, tuple(dict.fromkeys(noun for query in queries for noun in query.graph.queries))
         )
         self._regions = {name: regions[name] for name in names}
-        self._evaluations = [_TaskEvaluation(query, detector, up_axis, segmenter) for query in queries]
+        self._evaluations = [_TaskEvaluation(query, detector, up_axis) for query in queries]
 
     def process(self, frame: Frame) -> list[FrameMasks]:
         """Return the masks of each task's stages in the next frame."""
@@ -150,7 +149,7 @@ class PerceptionBench:
 class _TaskEvaluation:
     """Estimators and counters of one task."""
 
-    def __init__(self, query: TaskQuery, detector: Detector, up_axis: UpAxis, segmenter: Segmenter | None) -> None:
+    def __init__(self, query: TaskQuery, detector: Detector, up_axis: UpAxis) -> None:
         self._query = query
         self._detector = _CachedDetector(detector)
         every_frame = RelevanceTrackerSettings(up_axis=up_axis, max_frames=1)
@@ -160,7 +159,7 @@ class _TaskEvaluation:
             PerceptionStage.TRACKED: RelevanceTrackerSettings(up_axis=up_axis),
         }
         self._estimators = {
-            stage: TaskRelevanceEstimator(query.graph, self._detector, tracker_settings, segmenter)
+            stage: TaskRelevanceEstimator(query.graph, self._detector, tracker_settings)
             for stage, tracker_settings in settings.items()
         }
         self._past_frames = PastFrames(self._estimators[PerceptionStage.TRACKED])

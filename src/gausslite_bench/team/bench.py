@@ -18,7 +18,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frame_alignment import AlignmentSettings
 from gausslite.fusion.joint_refinement import RefineSettings, refine
 from gausslite.fusion.keyframes import AgentKeyframe
-from gausslite.fusion.limits import FusionSettings, Quotas, VoteRule
+from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.mission.settings import MissionSettings
@@ -30,7 +30,6 @@ from gausslite_bench.team.scenes import TeamPlan, TeamScene
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
 TRUSTED = ", frames trusted"
-FREE_SPACE_VOTE = "free-space vote"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +121,6 @@ def _fuse(trial: TeamTrial, maps: Sequence[AgentMap], align: bool) -> tuple[dict
     free = {each.agent_id: each.free_space for each in maps}
     engine = fuse_messages(whole, grid, align, free)
     fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
-    fused[FREE_SPACE_VOTE] = fuse_messages(whole, grid, align, free, VoteRule.FREE_SPACE).maps.voted_map().gaussians
     first, *others = maps
     shared = {first.agent_id: whole_map(first, grid), **{each.agent_id: each.messages for each in others}}
     fused[SHARED_VOTE] = fuse_messages(shared, grid, align, free).maps.voted_map().gaussians
@@ -143,12 +141,10 @@ def fuse_messages(
     grid: VoxelGrid,
     align: bool,
     free_space: Mapping[str, FreeSpace],
-    vote: VoteRule = VoteRule.PAPER,
 ) -> FusionEngine:
     """Return a fusion engine that has received each agent's free space and messages, agent by agent."""
     quotas = Quotas(voxels_per_agent=10_000_000, gaussians_per_agent=100_000_000)
     settings = FusionSettings(grid, quotas=quotas, alignment=AlignmentSettings() if align else None)
-    settings = replace(settings, vote=vote)
     engine = FusionEngine(MemoryStore(), settings)
     for agent_id, subsets in messages.items():
         session_id = engine.join(agent_id, MissionConfig("", "", grid.size_m)).session.session_id

@@ -49,9 +49,7 @@ def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
     ],
 )
 def test_an_agent_restores_the_settings_of_its_configuration_file(tmp_path: Path, mission: MissionSettings) -> None:
-    perception = PerceptionSettings(
-        tmp_path / "a.onnx", resegment=True, segmenter="depth", vocabulary=tmp_path / "v", tiles=3
-    )
+    perception = PerceptionSettings(tmp_path / "a.onnx", segmenter="depth", vocabulary=tmp_path / "v", tiles=3)
     config = tmp_path / "config.toml"
     config.write_text(to_toml({**mission_options(mission), **perception_options(perception)}))
     settings = parse_arguments(["--config", str(config)])

@@ -46,6 +46,8 @@ def test_a_working_machine_has_no_error_and_the_findings_are_true(tmp_path: Path
     assert f"they use {choose_simd(None)}" in checks["cpu"]["finding"]
     assert checks["rasterizer"]["finding"].startswith(f"backend {choose_rasterizer('auto').name}, because ")
     assert version("gausslite") in checks["package"]["finding"]
+    assert [name for name in checks if name.startswith("model")] == ["models"]
+    assert "gausslite models source NAME" in checks["models"]["advice"]
     extras = {name.removeprefix("extra ") for name in checks if name.startswith("extra ")}
     assert extras == set(metadata("gausslite").get_all("Provides-Extra"))
     assert list(tmp_path.iterdir()) == []
@@ -79,8 +81,8 @@ def test_a_complete_model_passes_and_a_truncated_one_is_an_error(tmp_path: Path,
     write_tiny_yolo(model, ["mug"], [(32, 32, 20, 20, 0, 0.9)])
     code, checks = doctor("--folder", str(tmp_path))
     assert code == 0
-    assert "network" in checks["model yolo-seg"]["finding"]
-    assert "gausslite models fetch fastsam" in checks["model fastsam"]["advice"]
+    assert "YOLO-seg" in checks["model yolo-seg"]["finding"]
+    assert [name for name in checks if name.startswith("model")] == ["model yolo-seg"]
 
     model.write_bytes(model.read_bytes()[:-10])
     code, checks = doctor("--folder", str(tmp_path))

@@ -19,14 +19,11 @@ def test_only_one_module_creates_bars() -> None:
     assert creating == ["src/gausslite/cli/progress.py"]
 
 
-@pytest.mark.parametrize(("total", "unit", "shown"), [(4, "frame", "2/4"), (None, "B", "2.00B")])
-def test_a_bar_shows_its_label_and_count_on_stderr(
-    total: int | None, unit: str, shown: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bar_shows_its_label_and_count_on_stderr(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stderr)
-    with progress_bar(total, "mapping", unit) as bar:
+    with progress_bar(4, "mapping", "frame") as bar:
         bar.update(2)
     last = stderr.getvalue().replace("\r", "\n").strip().splitlines()[-1]
     assert last.startswith("mapping: ")
-    assert shown in last
+    assert "2/4" in last

@@ -38,7 +38,6 @@ from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.store_changes import RecordSaved
 from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import MissionStatus, TrafficCounters
-from gausslite.fusion.vote import fuse
 
 SHARDS, SERVERS = 2, 3
 AGENTS = ("ant", "bee")
@@ -116,12 +115,12 @@ def figures(engine: FusionEngine) -> MissionStatus:
 
 def assert_same_mission(team: Team) -> None:
     first = team.engines[0]
-    offline = fuse(first.maps.updates_by_agent())
+    voted = first.maps.voted_map()
     for engine in team.engines:
         assert figures(engine) == figures(first)
-        assert_same_batch(engine.maps.voted_map(), offline.batch)
+        assert_same_batch(engine.maps.voted_map(), voted)
         watched = engine.maps.changes()
-        assert_same_batch(watched.won.batch, offline.batch)
+        assert_same_batch(watched.won.batch, voted)
         assert engine.query_objects() == first.query_objects()
         for agent_id in AGENTS:
             assert engine.encoded_keyframe(agent_id) == first.encoded_keyframe(agent_id)

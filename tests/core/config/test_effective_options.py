@@ -53,7 +53,7 @@ def test_the_help_states_no_raw_defaults() -> None:
 
 def test_the_help_of_the_fusion_server_names_its_maintenance_commands() -> None:
     text = " ".join(fusion_server.build_parser().format_help().split())
-    assert "file of a store: backup, restore, verify, compact, check-claims." in text
+    assert "file of a store: backup, restore, verify, compact." in text
 
 
 def test_the_list_of_known_options_is_complete() -> None:

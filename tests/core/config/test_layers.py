@@ -162,7 +162,7 @@ def test_unknown_variables_are_warnings_without_their_values(capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(
-    ("variable", "meant"), [("GAUSSLITE_SIMDD", "GAUSSLITE_SIMD"), ("GAUSSLITE_MODEL_URL", "GAUSSLITE_MODELS_URL")]
+    ("variable", "meant"), [("GAUSSLITE_SIMDD", "GAUSSLITE_SIMD"), ("GAUSSLITE_RECORDING", "GAUSSLITE_RECORDINGS")]
 )
 def test_the_nearest_of_all_known_variables_is_suggested(
     variable: str, meant: str, capsys: pytest.CaptureFixture[str]

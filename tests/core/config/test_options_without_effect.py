@@ -21,7 +21,6 @@ from gausslite_parser.program import run as run_parser
         (("--deadline-slack", "0.5"), "--rate HZ"),
         (("--segmenter", "depth"), "--detector FILE.onnx"),
         (("--vocabulary", "vocab.txt"), "--detector FILE.onnx"),
-        (("--resegment",), "--detector FILE.onnx"),
     ],
 )
 @pytest.mark.parametrize("command", ["map", "demo", "agent", "bench loop"])

@@ -53,7 +53,7 @@ def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: 
     more = ("--resume", state, "--task", "Find the mug")
     for options, difference in (
         ((), "--task unset (got 'Find the mug')"),
-        (("--detector", "yolo.onnx", "--segmenter", "depth", "--resegment"), "--resegment unset (got 'True'), "),
+        (("--detector", "yolo.onnx", "--segmenter", "depth"), "--segmenter unset (got 'depth'), "),
     ):
         assert main(["map", str(sequence), "--threads", "1", "--out", str(tmp_path / "other"), *options, *more]) == 2
         assert difference in capsys.readouterr().err

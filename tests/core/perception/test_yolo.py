@@ -191,15 +191,6 @@ def test_an_object_with_a_far_lower_score_than_another_is_left_out(tmp_path, sco
     assert strict.notes == (left_out if False in marked else ())
 
 
-def test_segmenter_matches_instances_of_any_class_to_boxes(tmp_path):
-    segmenter = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [CUP])).segmenter()
-    boxes = np.array([[30, 16, 64, 50], [80, 0, 120, 30]], np.float32)
-    first, second = segmenter.segment(frame_with_red_square(), boxes)
-    assert first is not None
-    assert first.sum() > 0.97 * 32 * 32
-    assert second is None
-
-
 @pytest.mark.parametrize(
     ("content", "expected"),
     [

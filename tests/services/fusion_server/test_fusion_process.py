@@ -65,13 +65,14 @@ def test_a_watcher_detects_a_server_that_stopped_answering() -> None:
 
 
 def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(tmp_path: Path) -> None:
-    nonsense = tmp_path / "notes.sqlite"
+    nonsense = tmp_path / "missions" / "notes.sqlite"
+    nonsense.parent.mkdir()
     nonsense.write_text("remember the milk, " * 300)
     assert "cannot be opened" in ends_with_one_line("--store", str(tmp_path / "no" / "folder" / "x.sqlite"))
     assert "undamaged GaussLite store" in ends_with_one_line("--store", str(nonsense))
     assert "--store memroy: expected memory or" in ends_with_one_line("--store", "memroy")
     assert "a folder needs --shards" in ends_with_one_line("--store", str(tmp_path))
-    assert "got the name of a file" in ends_with_one_line("--store", "x.sqlite", "--max-missions", "2")
+    assert "start one server for each mission in the folder" in ends_with_one_line("--store", str(nonsense.parent))
     assert "--health" in ends_with_one_line("--health", "nonsense")
     assert "--voxel-size: expected 0.001 to 1000" in ends_with_one_line("--voxel-size", "0")
     assert "--store-max-mb" in ends_with_one_line("--store-max-mb", "0")

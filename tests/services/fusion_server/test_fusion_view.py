@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from browser import open_browser
-from fusion_running import GRID, RunningServer, frame, fusion_server, server_process
+from fusion_running import GRID, RunningServer, frame, fusion_server
 from sample_gaussians import plain_gaussians
 
-from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport
@@ -212,25 +210,6 @@ def test_a_refinement_is_started_in_a_browser_which_then_shows_its_map():
         choose(tab, "Colour", "agent")
         # the Gaussians of a refined map belong to no agent
         tab.get_by_text("none", exact=True).wait_for()
-
-
-def test_the_page_shows_one_of_several_missions(capsys: pytest.CaptureFixture[str]):
-    with server_process("--max-missions", "2") as (_, server):
-        for mission_id, agent_id in (("attic", "ant"), ("cellar", "bee")):
-            with FusionClient(server.address, mission_id=mission_id) as client:
-                client.contribute_keyframes(client.join(agent_id, GRID).session_id, [coloured_frame(0, 90)])
-        assert main(["view", server.address]) == 2
-        assert "(attic, cellar)" in capsys.readouterr().err
-        with open_browser() as browser, live_page(0, server.address, is_agent=False, mission_id="attic") as url:
-            tab = browser.new_page()
-            tab.goto(url)
-            tab.get_by_text("ant: keyframe 0").wait_for()
-            assert tab.get_by_text("bee: keyframe 0").count() == 0
-
-
-def test_a_file_has_no_mission(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["view", str(tmp_path / "map.ply"), "--mission", "attic"]) == 2
-    assert "expected the address of a fusion server" in capsys.readouterr().err
 
 
 def choose(tab: Any, control: str, option: str) -> None:

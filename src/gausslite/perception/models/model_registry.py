@@ -1,4 +1,4 @@
-"""Identify the network of a model file by its inputs and outputs, and build the detector and the segmenter."""
+"""Identify the network of a model file by its inputs and outputs, and build the detector and its segmenter."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _has_named_boxes(model: OpenModel) -> bool:
 
 
 class ModelRegistry:
-    """The detector and the segmenter of one mission; each file is opened once."""
+    """The detector of one mission, with its segmenter; each file is opened once."""
 
     def __init__(
         self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None,
@@ -77,7 +77,6 @@ class ModelRegistry:
         family = identify_family(model)
         if family is ModelFamily.TEXT_ENCODER:
             raise ModelFileError(f"model {detector}: expected a detector, got a {family}, which belongs beside one")
-        self._segmenter: Segmenter
         self._tiling = tiling or Tiling(1)
         if family is ModelFamily.YOLO_SEG:
             self._use_yolo_masks(model, segmenter, threads, accept_similar)
@@ -86,24 +85,19 @@ class ModelRegistry:
             raise InvalidInputError(
                 f"segmenter: {model.path} finds boxes only; expected depth or a FastSAM file, got {OWN_MASKS}"
             )
-        self._segmenter = _segmenter(segmenter or DEPTH, threads)
+        segmenters = _with_depth_fallback(_segmenter(segmenter or DEPTH, threads))
         if family is ModelFamily.YOLO_BOXES:
             from gausslite.perception.yolo import load_yolo
 
             boxes: BoxDetector = load_yolo(model, accept_similar)
         else:
             boxes = _open_vocabulary(model, family, vocabulary, threads)
-        self._detector: Detector = SegmentedDetector(boxes, _with_depth_fallback(self._segmenter))
+        self._detector: Detector = SegmentedDetector(boxes, segmenters)
 
     @property
     def detector(self) -> Detector:
         """The detector of the task's nouns, with masks."""
         return self._detector if self._tiling.per_side == 1 else TiledDetector(self._detector, self._tiling)
-
-    @property
-    def segmenter(self) -> Segmenter:
-        """The segmenter of propagated boxes."""
-        return self._segmenter
 
     def _use_yolo_masks(
         self, model: OpenModel, segmenter: str | None, threads: int | None, accept_similar: bool
@@ -112,10 +106,9 @@ class ModelRegistry:
 
         network = load_yolo(model, accept_similar)
         if segmenter in (None, OWN_MASKS):
-            self._segmenter, self._detector = network.segmenter(), network
+            self._detector = network
         else:
-            self._segmenter = _segmenter(str(segmenter), threads)
-            self._detector = SegmentedDetector(network, _with_depth_fallback(self._segmenter))
+            self._detector = SegmentedDetector(network, _with_depth_fallback(_segmenter(str(segmenter), threads)))
 
 
 def _open_vocabulary(
