@@ -14,17 +14,12 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.camera_estimate import estimate_camera
-from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
-from gausslite.calibration.registration import find_registration
+from gausslite.calibration.calibrate import calibrate
 from gausslite.codec.ply import read_ply, write_ply
-from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.open import is_simulated, open_source
-from gausslite.datasets.registered_source import RegisteredSource
+from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import describe, require_instance, require_size
 from gausslite.domain.camera import Camera
-from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
@@ -130,27 +125,12 @@ def open_sequence(
 def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None) -> CalibratedSequence:
     """Open a sequence and estimate what it does not state, as `gausslite map` does; takes ten to thirty seconds.
 
-    Depth is registered if the layout does not promise it. Simulated homes are used without correction. Raises
-    DatasetError, PoseError, InvalidInputError.
+    Nothing is estimated that the source guarantees, such as the exact poses of a simulated home. Raises DatasetError,
+    PoseError, InvalidInputError.
     """
-    source = open_source(str(spec), up_axis)
-    notes = []
-    if not source.depth_registered:
-        registration, note = find_registration(source)
-        notes.append(f"depth registration {registration or 'none'}: {note}")
-        if registration is not None:
-            source = RegisteredSource(source, registration)
-    if is_simulated(str(spec)):
-        return CalibratedSequence(source, PoseExposurePrior(), tuple(notes))
-    if source.depth_registered:
-        estimate = estimate_camera(source, CameraCorrection(source.lens))
-        correction = estimate.correction
-        evidence = "; ".join(estimate.evidence)
-        notes.append(f"camera correction {'none' if correction.is_identity else correction}: {evidence}")
-        source = source if correction.is_identity else CorrectedSource(source, correction)
-    prior, note = estimate_pose_exposure_prior(source)
-    notes.append(f"pose prior {'none' if prior.is_exact else prior}: {note}")
-    return CalibratedSequence(source, prior, tuple(notes))
+    found = calibrate(open_source(str(spec), up_axis))
+    notes = tuple(str(evidence) for evidence in found.evidence if not evidence.guaranteed)
+    return CalibratedSequence(found.source, found.pose_prior, notes)
 
 
 def create_mapper(

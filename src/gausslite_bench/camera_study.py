@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 
-from gausslite.calibration.camera_estimate import estimate_camera
+from gausslite.calibration.calibrate import StatedValues, calibrate
 from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
@@ -17,6 +17,7 @@ from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.evaluation.compare import average, score_view
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mission.build import build_mapper
@@ -92,9 +93,9 @@ class CameraStudy:
         recorded = _CachedSource(open_source(walk + self._camera_options()))
         yield CameraCondition.UNCORRECTED, recorded, None, ()
         yield CameraCondition.TRUTH, CorrectedSource(recorded, self.truth), self.truth, ()
-        estimate = estimate_camera(recorded, CameraCorrection())
-        corrected = recorded if estimate.correction.is_identity else CorrectedSource(recorded, estimate.correction)
-        yield CameraCondition.ESTIMATE, corrected, estimate.correction, estimate.evidence
+        found = calibrate(recorded, StatedValues(pose_prior=PoseExposurePrior()))
+        reasons = [reason for evidence in found.evidence if not evidence.guaranteed for reason in evidence.reasons]
+        yield CameraCondition.ESTIMATE, found.source, found.correction, reasons
 
     def _camera_options(self) -> str:
         options = f"&shutter={_MS_PER_S * self.truth.readout_s:g}ms&blur={_MS_PER_S * self.truth.exposure_s:g}ms"

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
@@ -100,6 +101,27 @@ class SimulatedHome:
     def depth_registered(self) -> bool:
         """True: one camera renders both images."""
         return True
+
+    @property
+    def camera_ideal(self) -> bool:
+        """True unless the settings have a lens, a rolling shutter or motion blur."""
+        settings = self._settings
+        return settings.lens is None and settings.readout_ms == 0 and settings.exposure_ms == 0
+
+    @property
+    def poses_exact(self) -> bool:
+        """True unless the settings have an odometry that drifts."""
+        return self._settings.drift_percent == 0
+
+    @property
+    def world_frame(self) -> str:
+        """Home and seed: all trajectories through one home share its frame."""
+        return f"{self._settings.home_name.replace(':', '-')}-seed-{self._settings.seed}"
+
+    @property
+    def regions_file(self) -> Path | None:
+        """None: regions are computed from the scene."""
+        return None
 
     @property
     def excluded_frames(self) -> str:

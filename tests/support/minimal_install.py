@@ -73,7 +73,7 @@ def default_paths(out: Path) -> list[dict[str, object]]:
         ("report", run_folder),
         ("objects", run_folder),
         ("export", run_folder, "--to", "ply"),
-        ("calibrate", "sim:home?frames=12&size=160x120"),
+        ("calibrate", "sim:home?frames=12&size=160x120&drift=2%"),
         ("models", "list"),
         ("doctor", "--json"),
         ("demo", *halves, "--size", "160x120", "--refine-iterations", "5", "--out", str(out / "demo")),

@@ -130,8 +130,7 @@ def _read_saved(settings: AgentSettings) -> SavedMission | None:
 def _estimators(settings: AgentSettings, stream: FrameStream | None) -> EstimatorFactory:
     """Return the estimator factory. Raises InvalidInputError if the task of the command line has no detector."""
     estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream))
-    simulated = settings.source is not None and settings.source.is_simulated
-    if settings.task is not None and not simulated:
+    if settings.task is not None:
         estimators.require_detector()
     if settings.source is not None and stream is not None and settings.perception.model is None:
         note = region_file_note(settings.source.spec, stream.source)

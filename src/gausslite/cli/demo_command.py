@@ -155,7 +155,7 @@ def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> di
         "world-frame": _world_frame(options, scenario),
         "test-every": scenario.test_every,
         "register-depth": None if registration is None else str(registration),
-        "camera-correction": None if correction is None else str(correction),
+        "camera-correction": None if correction.is_identity else str(correction),
         **mission_options(settings),
         **perception_options(perception_settings(options)),
     }
@@ -164,7 +164,7 @@ def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> di
 def _world_frame(options: argparse.Namespace, scenario: Scenario) -> str:
     if options.world_frame is not None:
         return str(options.world_frame)
-    return default_world_frame(scenario.agents[0].source, scenario.held_out[0].source)
+    return default_world_frame(scenario.held_out[0].source)
 
 
 def _score(

@@ -10,14 +10,15 @@ from pathlib import Path
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.calibration.calibrate import StatedValues
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.cli.source_options import (
     add_regions,
     add_source,
-    correct_with_warnings,
+    calibrate_with_messages,
     open_recorded,
-    register_with_warnings,
     selected_regions,
+    stated_values,
 )
 from gausslite.codec.ply import read_ply
 from gausslite.codec.png import write_png
@@ -28,11 +29,10 @@ from gausslite.config.values import AUTO, NONE, read_camera_correction, read_dep
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose_correction import CorrectionTrack
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
 from gausslite.evaluation.corrected import CorrectedScores
@@ -96,8 +96,7 @@ def run(options: argparse.Namespace) -> int:
     viewer = view_map(read_ply(options.map), threads=options.threads)
     conditions = _Conditions.of(options)
     recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)
-    registered, _ = register_with_warnings(options.source, recorded, conditions.depth_registration, AUTO)
-    source, _ = correct_with_warnings(options.source, registered, conditions.camera_correction)
+    source = calibrate_with_messages(options.source, recorded, conditions.stated).source
     positions = _selected_positions(options, source)
     regions = selected_regions(options, source)
     if options.pictures is not None:
@@ -133,14 +132,13 @@ def run(options: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Conditions:
-    """Registration of the source, and how views are scored.
+    """What is stated of the source, and how views are scored.
 
     fit_views: their pose and exposure are fitted first. trajectory: returns the tracked pose at a time in nanoseconds;
     None to start from the given poses. corrections: those published with the map; None if there are none to score.
     """
 
-    depth_registration: DepthRegistration | str | None
-    camera_correction: CameraCorrection | str | None
+    stated: StatedValues
     fit_views: bool
     trajectory: Callable[[int], Float64[ndarray, "4 4"]] | None
     corrections: CorrectionTrack | None
@@ -164,11 +162,13 @@ class _Conditions:
         fit_views = poses in (PoseMode.REFINE, PoseMode.TRACK) if fit_views is None else fit_views
         if from_report:
             print_message(f"from the report next to {options.map.name}: {' '.join(from_report)}")
+        # views are scored from the poses as they are, or fitted
+        stated = stated_values(registration, correction, PoseExposurePrior())
         if poses == PoseMode.TRACK:
-            return cls(registration, correction, fit_views, read_trajectory(options.map.parent), None)
+            return cls(stated, fit_views, read_trajectory(options.map.parent), None)
         corrections = read_corrections(options.map.parent)
         corrections = None if corrections is None or corrections.is_identity else corrections
-        return cls(registration, correction, fit_views, None, corrections)
+        return cls(stated, fit_views, None, corrections)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,20 @@ from pathlib import Path
 from gausslite.cli.depth_check import depth_notes, require_mappable_depth
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
-from gausslite.cli.source_options import add_regions, add_source, report_region_file, selected_regions
+from gausslite.cli.source_options import (
+    add_regions,
+    add_source,
+    report_region_file,
+    selected_regions,
+    stated_values,
+)
 from gausslite.cli.trajectory_report import tracking_text, trajectory_report
 from gausslite.codec.object_report import noun_as_json, object_as_json
 from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
 from gausslite.config.source_options import add_camera_correction
 from gausslite.config.switches import add_switch
-from gausslite.config.values import AUTO, NONE
+from gausslite.config.values import AUTO
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
@@ -71,7 +77,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="switch to another task at this frame number; may be repeated",
     )
-    add_camera_correction(parser, allow_auto=True, default_text=f"{AUTO}, {NONE} for simulated homes")
+    add_camera_correction(parser, allow_auto=True, default_text=AUTO)
     add_detector(parser)
     add_regions(parser)
     add_policy(parser, allow_auto=True, default_policy=policy_of)
@@ -120,7 +126,8 @@ def _map(options: argparse.Namespace) -> int:
         choose_rasterizer(inputs.mission.backend, inputs.mission.threads)
         if isinstance(roi, TaskGraph):
             estimators.require_detector()
-        inputs = inputs.calibrated(options)
+        stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
+        inputs = inputs.calibrated(stated)
     mapper = build_task_mapper(inputs.mission, estimators, roi)
     if saved is not None:
         saved.restore(mapper)

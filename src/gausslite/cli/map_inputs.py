@@ -7,22 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gausslite.cli.source_options import (
-    correct_with_warnings,
-    open_recorded,
-    register_with_warnings,
-    resolve_pose_prior,
-    selected_regions,
-)
+from gausslite.calibration.calibrate import StatedValues
+from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.codec.task_json import graph_as_json
 from gausslite.config.mapping_options import mission_settings, perception_settings
 from gausslite.config.options_without_effect import require_effect
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.selection import frame_step
-from gausslite.datasets.sequence_name import default_world_frame, sequence_name
+from gausslite.datasets.sequence_name import default_world_frame
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
@@ -88,30 +82,22 @@ class MapInputs:
         _report_uniform_map(options)
         return cls(mission, perception_settings(options), source, task, stream, schedule)
 
-    def calibrated(
-        self,
-        options: argparse.Namespace,
-        registration: DepthRegistration | str | None = None,
-        correction: CameraCorrection | str | None = None,
-        pose_prior: PoseExposurePrior | str | None = None,
-    ) -> MapInputs:
-        """Return the inputs with registration, correction and prior, given here or by the options, or estimated."""
-        registration = options.register_depth if registration is None else registration
-        pose_prior = options.pose_prior if pose_prior is None else pose_prior
-        correction = options.camera_correction if correction is None else correction
-        registered, registered_to = register_with_warnings(self.source.spec, self.stream.source, registration, AUTO)
-        if self.mission.poses is PoseMode.TRACK and not isinstance(correction, CameraCorrection):
+    def calibrated(self, stated: StatedValues) -> MapInputs:
+        """Return the inputs with registration, correction and prior: those stated, else guaranteed or estimated."""
+        recorded, poses = self.stream.source, self.mission.poses
+        if poses is PoseMode.TRACK and stated.correction is None:
             # readout time and offset are estimated from given poses
-            correction = CameraCorrection(registered.lens if registered.depth_registered else None)
-        frames, corrected_by = correct_with_warnings(self.source.spec, registered, correction)
-        if self.mission.poses is not PoseMode.REFINE and pose_prior == AUTO:
-            pose_prior = PoseExposurePrior()
-        mission = replace(self.mission, pose_prior=resolve_pose_prior(self.source.spec, frames, pose_prior))
+            stated = replace(stated, correction=CameraCorrection(recorded.lens))
+        if poses is not PoseMode.REFINE and stated.pose_prior is None:
+            stated = replace(stated, pose_prior=PoseExposurePrior())
+        found = calibrate_with_messages(self.source.spec, recorded, stated)
+        mission = replace(self.mission, pose_prior=found.pose_prior)
+        correction = None if found.correction.is_identity else found.correction
         return replace(
             self,
             mission=replace(mission, pose_prior=mission.refinement_prior),
-            source=replace(self.source, depth_registration=registered_to, camera_correction=corrected_by),
-            stream=replace(self.stream, source=frames),
+            source=replace(self.source, depth_registration=found.registration, camera_correction=correction),
+            stream=replace(self.stream, source=found.source),
         )
 
     def resumed(self, options: argparse.Namespace, saved: SavedRun) -> MapInputs:
@@ -119,14 +105,16 @@ class MapInputs:
 
         Raises MismatchError if other options differ from the saved run's.
         """
-        registration, correction, pose_prior = None, None, None
-        if options.register_depth in (None, AUTO):
+        registration = options.register_depth
+        if registration in (None, AUTO):
             registration = saved.value(SourceSettings, "depth_registration") or NONE
-        if options.camera_correction in (None, AUTO):
+        correction = options.camera_correction
+        if correction in (None, AUTO):
             correction = saved.value(SourceSettings, "camera_correction") or CameraCorrection()
-        if options.pose_prior == AUTO:
+        pose_prior = options.pose_prior
+        if pose_prior == AUTO:
             pose_prior = saved.value(MissionSettings, "pose_prior")
-        inputs = self.calibrated(options, registration, correction, pose_prior)
+        inputs = self.calibrated(stated_values(registration, correction, pose_prior))
         saved.require(*inputs._fixed_settings(saved.last_index))
         _report_other_step(saved, self.source.frames)
         return inputs
@@ -138,14 +126,14 @@ class MapInputs:
     def _fixed_settings(self, last_index: int) -> tuple[Any, ...]:
         graph = self.schedule.at(last_index)
         task = replace(self.task, task=None if graph is None else graph.text)
-        sequence = _Sequence(sequence_name(self.source.spec, self.stream.source))
+        sequence = _Sequence(self.stream.source.world_frame)
         return self.mission, self.perception, self.source, task, sequence
 
     def world_frame(self, options: argparse.Namespace) -> str:
         """Return the name of the world frame: that of the options, else the sequence's."""
         if options.world_frame is not None:
             return str(options.world_frame)
-        return default_world_frame(self.source.spec, self.stream.source)
+        return default_world_frame(self.stream.source)
 
     def report(self) -> dict[str, object]:
         """Return the inputs as part of the report."""

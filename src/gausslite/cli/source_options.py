@@ -5,14 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.calibration.camera_estimate import estimate_camera
-from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
-from gausslite.calibration.registration import find_registration
+from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
 from gausslite.config.source_options import add_frames
-from gausslite.config.values import AUTO, NONE, read_names, read_numbers
-from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.open import has_exact_poses, is_simulated, open_source
-from gausslite.datasets.registered_source import RegisteredSource
+from gausslite.config.values import NONE, read_names, read_numbers
+from gausslite.datasets.open import open_source
 from gausslite.datasets.ros.bag_source import BagSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
@@ -35,20 +31,6 @@ def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> Non
     add_frames(parser, allow_auto=True, default_text=default_text)
 
 
-def open_with_warnings(
-    spec: str,
-    up_axis: UpAxis | None,
-    depth_registration: DepthRegistration | str | None,
-    default: str = NONE,
-) -> tuple[Source, DepthRegistration | None]:
-    """Open a sequence and return it with the colour camera that its depth is registered to, None for no registration.
-
-    depth_registration: a camera, AUTO, NONE, or None if the user did not set it; then default applies, AUTO or NONE.
-    Messages about the sequence go to stderr. Raises DatasetError, PoseError, InvalidInputError.
-    """
-    return register_with_warnings(spec, open_recorded(spec, up_axis), depth_registration, default)
-
-
 def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True) -> Source:
     """Open a sequence without registration; report the topics of a bag, and excluded frames.
 
@@ -62,59 +44,33 @@ def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True)
     return source
 
 
-def register_with_warnings(
-    spec: str, source: Source, depth_registration: DepthRegistration | str | None, default: str
-) -> tuple[Source, DepthRegistration | None]:
-    """Register the depth of an opened sequence as in `open_with_warnings`; an estimate (AUTO) takes seconds."""
-    if depth_registration is None and not source.depth_registered:
-        depth_registration = default
-        hint = f"--register-depth {AUTO} estimates the registration, {NONE} uses depth as recorded"
-        if default == AUTO:
-            hint = f"the registration is estimated now, --register-depth {NONE} uses depth as recorded"
-        print_message(f"{spec}: this layout does not state whether depth is registered to colour; {hint}")
-    if depth_registration == AUTO:
-        depth_registration, reason = find_registration(source)
-        print_message(f"--register-depth {depth_registration or NONE}: {reason}")
-    if not isinstance(depth_registration, DepthRegistration):
-        return source, None
-    return RegisteredSource(source, depth_registration), depth_registration
+def stated_values(
+    registration: DepthRegistration | str | None,
+    correction: CameraCorrection | str | None,
+    pose_prior: PoseExposurePrior | str | None,
+) -> StatedValues:
+    """Return what the options state: AUTO and None state nothing, NONE states that depth is used as recorded."""
+    return StatedValues(
+        registration if isinstance(registration, DepthRegistration) else None,
+        registration == NONE,
+        correction if isinstance(correction, CameraCorrection) else None,
+        pose_prior=pose_prior if isinstance(pose_prior, PoseExposurePrior) else None,
+    )
 
 
-def correct_with_warnings(
-    spec: str, source: Source, correction: CameraCorrection | str | None
-) -> tuple[Source, CameraCorrection | None]:
-    """Correct a registered source's lens, rolling shutter, time offset and blur; None if images are used as recorded.
-
-    correction: a correction, AUTO, or None if the user did not set it: AUTO then, except for a simulated home, which is
-    exact. An estimate (AUTO) takes seconds. Raises DatasetError, PoseError.
-    """
-    if correction is None:
-        correction = CameraCorrection() if is_simulated(spec) else AUTO
-    if isinstance(correction, str) and not source.depth_registered:
-        correction, reason = CameraCorrection(), "depth is not registered to colour"
-        print_message(f"--camera-correction {NONE}: {reason}")
-    elif isinstance(correction, str):
-        estimate = estimate_camera(source, CameraCorrection(source.lens))
-        correction = estimate.correction
-        reason = "; ".join(estimate.evidence)
-        print_message(f"--camera-correction '{NONE if correction.is_identity else correction}': {reason}")
-    if correction.is_identity:
-        return source, None
-    return CorrectedSource(source, correction), correction
+def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> Calibration:
+    """Calibrate an opened sequence as `calibrate` does; each estimate and its reason go to stderr."""
+    if not source.depth_registered and stated.registration is None and not stated.depth_as_recorded:
+        print_message(
+            f"{spec}: this layout does not state whether depth is registered to colour; the registration is estimated "
+            f"now, --register-depth {NONE} uses depth as recorded"
+        )
+    return calibrate(source, stated, _report_estimate)
 
 
-def resolve_pose_prior(spec: str, source: Source, pose_prior: PoseExposurePrior | str) -> PoseExposurePrior:
-    """Return the given prior or, for AUTO, an estimate from the recording, which is printed to stderr.
-
-    Poses of a simulated home without drift are exact.
-    """
-    if isinstance(pose_prior, PoseExposurePrior):
-        return pose_prior
-    if has_exact_poses(spec):
-        return PoseExposurePrior()
-    estimate, reason = estimate_pose_exposure_prior(source)
-    print_message(f"--pose-prior {NONE if estimate.is_exact else estimate}: {reason}")
-    return estimate
+def _report_estimate(evidence: Evidence) -> None:
+    if not evidence.guaranteed:
+        print_message(f"--{evidence}")
 
 
 def add_regions(parser: argparse.ArgumentParser) -> None:

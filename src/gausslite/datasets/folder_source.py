@@ -15,7 +15,7 @@ from numpy import ndarray
 from gausslite.datasets.images import DepthUnits, load_rgbd
 from gausslite.datasets.intrinsics import FolderCamera
 from gausslite.datasets.poses import is_lost, nearest_rigid
-from gausslite.datasets.regions import regions_in_folder
+from gausslite.datasets.regions import REGIONS_FILE, balls_for_small_objects, load_voxel_regions
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, PoseError
@@ -65,9 +65,31 @@ class FolderSource:
         """The layout's upward direction, unless the caller gives another."""
         return self._up_axis
 
+    @property
+    def camera_ideal(self) -> bool:
+        """False: a recording may have any camera."""
+        return False
+
+    @property
+    def poses_exact(self) -> bool:
+        """False: the files do not state how the poses were found."""
+        return False
+
+    @property
+    def world_frame(self) -> str:
+        """Name of the recording, also where the folder is given as "."."""
+        return self.name or self._folder.resolve().name
+
+    @property
+    def regions_file(self) -> Path | None:
+        """roi_voxels.npz in the folder; None without it."""
+        path = self._folder / REGIONS_FILE
+        return path if path.is_file() else None
+
     def regions(self) -> Mapping[str, Region]:
         """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
-        return regions_in_folder(self._folder)
+        path = self.regions_file
+        return {} if path is None else balls_for_small_objects(load_voxel_regions(path))
 
 
 class NumberedFolderSource(FolderSource, ABC):

@@ -52,11 +52,6 @@ def open_source(
     return source if depth_registration is None else RegisteredSource(source, depth_registration)
 
 
-def is_simulated(spec: str) -> bool:
-    """True for a simulated sequence, whose scene and regions take seconds to build."""
-    return spec.startswith(_SIMULATED)
-
-
 def open_reference(spec: str, depth_registration: DepthRegistration | None = None) -> Source | None:
     """Return the sequence with its true poses, for scoring a trajectory; None if it has no poses.
 
@@ -68,13 +63,8 @@ def open_reference(spec: str, depth_registration: DepthRegistration | None = Non
         return None
 
 
-def has_exact_poses(spec: str) -> bool:
-    """True for a simulated home without odometry drift."""
-    return is_simulated(spec) and "drift=" not in spec
-
-
 def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
-    if is_simulated(spec):
+    if spec.startswith(_SIMULATED):
         # the core does not import the simulator package
         open_simulated: Callable[[str, UpAxis | None], Source] = import_module(_SIMULATOR).open_simulated
 

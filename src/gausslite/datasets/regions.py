@@ -54,15 +54,6 @@ def load_voxel_regions(path: Path) -> dict[str, VoxelRegion]:
     return regions
 
 
-def regions_in_folder(folder: Path) -> dict[str, Region]:
-    """Return the regions of REGIONS_FILE in the folder, small objects as balls; empty without the file.
-
-    Raises DatasetError.
-    """
-    path = folder / REGIONS_FILE
-    return balls_for_small_objects(load_voxel_regions(path)) if path.is_file() else {}
-
-
 def balls_for_small_objects(regions: Mapping[str, VoxelRegion]) -> dict[str, Region]:
     """Replace small objects by a ball of radius 0.10 m around their centroid.
 

@@ -45,6 +45,26 @@ class Source(Protocol):
         ...
 
     @property
+    def camera_ideal(self) -> bool:
+        """True if images have no lens distortion, rolling shutter and motion blur; no estimate is made then."""
+        ...
+
+    @property
+    def poses_exact(self) -> bool:
+        """True if the poses have no error; no estimate is made then, and poses are not refined."""
+        ...
+
+    @property
+    def world_frame(self) -> str:
+        """Name of the poses' frame, the same for sequences that share it."""
+        ...
+
+    @property
+    def regions_file(self) -> Path | None:
+        """File of the ground-truth regions; None if there are none, or if the sequence computes them."""
+        ...
+
+    @property
     def excluded_frames(self) -> str:
         """Message on the recorded frames that the sequence excludes, and why; empty if there are none."""
         ...

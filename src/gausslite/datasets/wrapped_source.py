@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
@@ -42,6 +43,26 @@ class WrappedSource:
     def depth_registered(self) -> bool:
         """True if the wrapped source's depth is registered."""
         return self._source.depth_registered
+
+    @property
+    def camera_ideal(self) -> bool:
+        """True if the wrapped source's camera is ideal."""
+        return self._source.camera_ideal
+
+    @property
+    def poses_exact(self) -> bool:
+        """True if the wrapped source's poses are exact."""
+        return self._source.poses_exact
+
+    @property
+    def world_frame(self) -> str:
+        """World frame of the wrapped source."""
+        return self._source.world_frame
+
+    @property
+    def regions_file(self) -> Path | None:
+        """Region file of the wrapped source."""
+        return self._source.regions_file
 
     @property
     def excluded_frames(self) -> str:

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.held_out import HeldOutSplit
-from gausslite.datasets.open import is_simulated, open_source
-from gausslite.datasets.regions import REGIONS_FILE
+from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import DatasetError, PoseError
@@ -21,9 +20,9 @@ OnCorrupt = Callable[[int, DatasetError | PoseError], None]
 
 def region_file_note(spec: str, source: Source) -> str | None:
     """Return a message if the ground-truth regions come from a file of the sequence's folder, else None."""
-    if is_simulated(spec) or not source.regions():
+    if source.regions_file is None:
         return None
-    return f"{spec}: the ground-truth regions of {REGIONS_FILE} in the sequence's folder are used"
+    return f"{spec}: the ground-truth regions of {source.regions_file.name} in the sequence's folder are used"
 
 
 @dataclass(frozen=True, slots=True)

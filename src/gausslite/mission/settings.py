@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 
-from gausslite.datasets.open import is_simulated
 from gausslite.datasets.source import Source
 from gausslite.domain.arguments import require_instance, require_number, require_whole
 from gausslite.domain.camera_correction import CameraCorrection
@@ -102,11 +101,6 @@ class SourceSettings:
     depth_registration: DepthRegistration | None = field(default=None, metadata={"flag": "--register-depth"})
     camera_correction: CameraCorrection | None = None
     require_poses: bool = True
-
-    @property
-    def is_simulated(self) -> bool:
-        """True for a simulated home, whose scene and regions take seconds to build."""
-        return is_simulated(self.spec)
 
 
 @dataclass(frozen=True, slots=True)

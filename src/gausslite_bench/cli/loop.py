@@ -8,14 +8,22 @@ from dataclasses import asdict, dataclass
 
 from gausslite.cli.map_inputs import choose_roi
 from gausslite.cli.progress import MappingBar
-from gausslite.cli.source_options import add_regions, open_with_warnings, selected_regions
+from gausslite.cli.source_options import (
+    add_regions,
+    calibrate_with_messages,
+    open_recorded,
+    selected_regions,
+    stated_values,
+)
 from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings, perception_settings
 from gausslite.config.options_without_effect import require_effect
 from gausslite.config.source_options import add_frames
 from gausslite.config.switches import add_switch
+from gausslite.config.values import AUTO
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
@@ -42,7 +50,7 @@ _MEMORY_SAMPLES = 40
 def configure_loop(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench loop`."""
     parser.add_argument("source", metavar="SOURCE", nargs="?", default=_HOME, help="as in map (default: %(default)s)")
-    add_frames(parser, allow_auto=True)
+    add_frames(parser, allow_auto=True, default_text=AUTO)
     parser.add_argument("--task", metavar="TEXT", help=f'as in map (on the default source "{_HOME_TASK}")')
     add_detector(parser)
     add_regions(parser)
@@ -67,7 +75,8 @@ def run_loop(options: argparse.Namespace) -> int:
     require_effect(options)
     if options.loop is not None and options.loop < 2:
         raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
-    source, _ = open_with_warnings(options.source, options.up, options.register_depth)
+    stated = stated_values(options.register_depth, CameraCorrection(), options.pose_prior)
+    source = calibrate_with_messages(options.source, open_recorded(options.source, options.up), stated).source
     positions: Sequence[int] = select_frames(source, options.frames)
     held_out: Sequence[int] = ()
     if options.unlimited is not None:

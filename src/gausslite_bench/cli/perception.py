@@ -9,16 +9,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from gausslite.cli.source_options import add_source, open_with_warnings
+from gausslite.cli.source_options import add_source, calibrate_with_messages, open_recorded, stated_values
 from gausslite.codec.png import write_png
 from gausslite.config.mapping_options import add_detector
 from gausslite.config.switches import add_switch
-from gausslite.config.values import read_names
+from gausslite.config.values import AUTO, read_names
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.object_names import head_of, same_kind
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.perception.detect import Detector
@@ -34,7 +36,7 @@ _COLUMNS = ("IoU", "precision", "recall", "marked, %", "max, %", "frames", "righ
 
 def configure_perception(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench perception`."""
-    add_source(parser)
+    add_source(parser, default_text=AUTO)
     add_detector(parser)
     add = parser.add_argument_group("benchmark").add_argument
     add("--roi", metavar="FILE.npz", type=Path, help="ground-truth regions (default: the source's own)")
@@ -71,7 +73,7 @@ def run_perception(options: argparse.Namespace) -> int:
 
     if options.detector is None:
         raise InvalidInputError("--detector: expected a model file to compare with ground truth, got none")
-    source, _ = open_with_warnings(options.source, options.up, options.register_depth)
+    source = _open(options)
     positions, size = select_frames(source, options.frames), frame_size(options.size, source)
     regions = _regions(options, source)
     models = ModelRegistry(
@@ -97,6 +99,12 @@ def run_perception(options: argparse.Namespace) -> int:
     matches = models.detector.matches([noun for query in absent for noun in query.graph.queries])
     _print_scores(bench.scores(), matches, options.json)
     return 0
+
+
+def _open(options: argparse.Namespace) -> Source:
+    """Return the source with registered depth; nothing else is estimated."""
+    stated = stated_values(options.register_depth, CameraCorrection(), PoseExposurePrior())
+    return calibrate_with_messages(options.source, open_recorded(options.source, options.up), stated).source
 
 
 def _print_scores(scores: Sequence[TaskScore], absent: Sequence[NounMatch], as_json: bool) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gausslite.cli.source_options import correct_with_warnings, open_with_warnings
+from gausslite.cli.source_options import calibrate_with_messages, open_recorded, stated_values
 from gausslite.config.mapping_options import add_pose_prior
 from gausslite.config.source_options import add_camera_correction, add_register_depth
 from gausslite.config.switches import add_switch
@@ -123,10 +123,11 @@ def real_sequence_plans(options: argparse.Namespace) -> tuple[list[RealScenePlan
     plans = real_plans(options.real, roi, options.frames, options.up, pose_policy=_pose_policy(options, REAL_CAMERA))
     chosen = choose_kinds(plans, options.kinds)
     spec = str(options.real)
-    registered, registration = open_with_warnings(spec, options.up, options.register_depth, AUTO)
-    source, correction = correct_with_warnings(spec, registered, options.camera_correction)
-    plans = [replace(plan, depth_registration=registration, camera_correction=correction) for plan in chosen]
-    return plans, downscaled_size(source.camera)
+    stated = stated_values(options.register_depth, options.camera_correction, REAL_CAMERA.pose_prior)
+    found = calibrate_with_messages(spec, open_recorded(spec, options.up), stated)
+    correction = None if found.correction.is_identity else found.correction
+    plans = [replace(plan, depth_registration=found.registration, camera_correction=correction) for plan in chosen]
+    return plans, downscaled_size(found.source.camera)
 
 
 def _pose_policy(options: argparse.Namespace, default: PosePolicy) -> PosePolicy:

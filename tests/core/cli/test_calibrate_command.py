@@ -21,7 +21,7 @@ def test_an_agent_takes_the_lines_as_they_are(tmp_path: Path, capsys: pytest.Cap
     assert main(["calibrate", TURNING, "--lens", "radtan:0,0,0,0", "--out", str(path)]) == 0
     output = capsys.readouterr()
     assert output.out == path.read_text()
-    assert "# readout and offset:" in output.out
+    assert "# camera-correction: readout and offset:" in output.out
     assert "calibrate" in output.err
     settings = parse_arguments(["--config", str(path), "--source", TURNING, "--task", "Find the mug"])
     assert settings.source is not None
@@ -32,12 +32,14 @@ def test_an_agent_takes_the_lines_as_they_are(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_json_has_every_estimate_and_its_evidence(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", "sim:home-1?frames=8&size=64x48&speed=1", "--json"]) == 0
+    assert main(["calibrate", "sim:home-1?frames=8&size=64x48&speed=1&blur=1ms&drift=1%", "--json"]) == 0
     stored = json.loads(capsys.readouterr().out)
     assert stored["register_depth"] is None
     assert stored["camera_correction"] is None
     assert (stored["readout_s"], stored["exposure_s"], stored["lens"]) == (0.0, 0.0, None)
+    assert stored["evidence"]["register_depth"] == ["the layout has registered depth"]
     assert "turn fast enough" in stored["evidence"]["camera_correction"][0]
+    assert "pairs of frames" in stored["evidence"]["pose_prior"][0]
 
 
 def test_the_published_lens_is_kept_and_the_readout_of_a_real_clip_is_found(

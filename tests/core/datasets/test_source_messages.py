@@ -9,60 +9,52 @@ import numpy as np
 import pytest
 from tiny_sequences import write_seven_scenes, write_tum
 
-from gausslite.cli.source_options import open_with_warnings, resolve_pose_prior, selected_regions
+from gausslite.calibration.calibrate import Calibration
+from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import open_source
+from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 
+EXACT = PoseExposurePrior()
 CAMERA = DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0")
 
 
-def test_unregistered_depth_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    seven, tum = str(write_seven_scenes(tmp_path / "seq")), str(write_tum(tmp_path / "fr1"))
-    assert open_with_warnings(seven, None, None)[1] is None
-    [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith(
-        f"{seven}: this layout does not state whether depth is registered to colour; --register-depth auto "
-    )
-    for spec, option in ((seven, NONE), (seven, CAMERA), (tum, None)):
-        open_with_warnings(spec, None, option)
-        assert capsys.readouterr().err == ""
+def calibrate(spec: Path, registration: DepthRegistration | str | None, prior: PoseExposurePrior | str) -> Calibration:
+    stated = stated_values(registration, CameraCorrection(), prior)
+    return calibrate_with_messages(str(spec), open_source(str(spec)), stated)
 
 
 def test_depth_is_registered_to_the_given_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    seven = str(write_seven_scenes(tmp_path / "seq"))
-    source, camera = open_with_warnings(seven, None, CAMERA)
-    assert camera == CAMERA
-    assert source.depth_registered
-    assert source.camera == CAMERA.camera(16, 12)
-    source, camera = open_with_warnings(seven, None, AUTO)
-    assert (camera, source.depth_registered) == (None, False)
-    assert "--register-depth none: registration: expected at least 1000 depth edge points" in capsys.readouterr().err
+    calibration = calibrate(write_seven_scenes(tmp_path / "seq"), CAMERA, EXACT)
+    assert calibration.registration == CAMERA
+    assert calibration.source.depth_registered
+    assert calibration.source.camera == CAMERA.camera(16, 12)
+    assert capsys.readouterr().err == ""
 
 
-def test_an_estimate_by_default_is_reported_and_made_only_if_necessary(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seven, tum = str(write_seven_scenes(tmp_path / "seq")), str(write_tum(tmp_path / "fr1"))
-    assert open_with_warnings(seven, None, None, AUTO)[1] is None
-    notice, result = capsys.readouterr().err.splitlines()
-    assert notice.endswith("; the registration is estimated now, --register-depth none uses depth as recorded")
-    assert result.startswith("--register-depth none: registration: expected at least 1000 depth edge points")
-    assert open_with_warnings(seven, None, CAMERA, AUTO)[1] == CAMERA
-    for spec, option in ((seven, NONE), (tum, None)):
-        assert open_with_warnings(spec, None, option, AUTO)[1] is None
+def test_an_estimated_registration_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seven, tum = write_seven_scenes(tmp_path / "seq"), write_tum(tmp_path / "fr1")
+    for option in (None, AUTO):
+        calibration = calibrate(seven, option, EXACT)
+        assert (calibration.registration, calibration.source.depth_registered) == (None, False)
+        notice, result = capsys.readouterr().err.splitlines()
+        assert notice == (
+            f"{seven}: this layout does not state whether depth is registered to colour; the registration is estimated "
+            "now, --register-depth none uses depth as recorded"
+        )
+        assert result.startswith("--register-depth none: registration: expected at least 1000 depth edge points")
+    for spec, option in ((seven, NONE), (tum, None), (tum, AUTO)):
+        assert calibrate(spec, option, EXACT).registration is None
     assert capsys.readouterr().err == ""
 
 
 def test_an_estimated_pose_prior_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tum = write_tum(tmp_path / "fr1")
-    source = open_source(str(tum))
-    given = PoseExposurePrior(0.01, 0.5)
-    assert resolve_pose_prior(str(tum), source, given) == given
-    assert resolve_pose_prior("sim:home", source, AUTO).is_exact
+    tum, given = write_tum(tmp_path / "fr1"), PoseExposurePrior(0.01, 0.5)
+    assert calibrate(tum, None, given).pose_prior == given
     assert capsys.readouterr().err == ""
-    assert resolve_pose_prior(str(tum), source, AUTO).is_exact
+    assert calibrate(tum, None, AUTO).pose_prior.is_exact
     [line] = capsys.readouterr().err.splitlines()
     assert line == "--pose-prior none: only 0 pairs of frames overlap, too few for an estimate"
 
@@ -71,7 +63,7 @@ def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtu
     folder = write_tum(tmp_path / "fr1", frames=4)
     rows = (folder / "depth.txt").read_text().splitlines()
     (folder / "depth.txt").write_text("\n".join(rows[:3]))
-    open_with_warnings(str(folder), None, None)
+    open_recorded(str(folder), None)
     [line] = capsys.readouterr().err.splitlines()
     assert line == (f"{folder}: 1 of 4 colour images are skipped: without a pose at their time or depth within 20 ms")
 

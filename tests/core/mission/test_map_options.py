@@ -53,9 +53,9 @@ def test_trajectories_through_one_home_share_a_world_frame(tmp_path: Path) -> No
         ("sim:home-3?trajectory=1", "sim-home-3-seed-0"),
         ("sim:home-3?trajectory=2&seed=07", "sim-home-3-seed-7"),
     ):
-        assert default_world_frame(spec, open_source(spec)) == expected
+        assert default_world_frame(open_source(spec)) == expected
     folder = write_tum(tmp_path / "fr1\n")
-    assert default_world_frame(str(folder), open_source(str(folder))) == ""
+    assert default_world_frame(open_source(str(folder))) == ""
 
 
 def test_save_ply_names_the_world_frame(tmp_path: Path) -> None:

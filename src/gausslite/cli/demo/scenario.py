@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gausslite.cli.source_options import (
-    correct_with_warnings,
+    calibrate_with_messages,
     open_recorded,
-    register_with_warnings,
     report_region_file,
-    resolve_pose_prior,
+    stated_values,
 )
-from gausslite.config.values import AUTO
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
@@ -56,7 +54,7 @@ class Scenario:
     held_out: tuple[FrameStream, ...]
     regions: Mapping[str, Region]
     depth_registration: DepthRegistration | None = None
-    camera_correction: CameraCorrection | None = None
+    camera_correction: CameraCorrection = field(default_factory=CameraCorrection)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
 
     @property
@@ -82,13 +80,14 @@ def simulated_scenario(options: argparse.Namespace) -> Scenario:
     )
     held_out = open_source(specs[2])
     size = frame_size(options.size or HOME_SIZE, held_out)
+    found = calibrate_with_messages(specs[2], held_out, stated_values(None, None, options.pose_prior))
     return Scenario(
         agents,
         size,
         None,
         (FrameStream(held_out, range(len(held_out)), size),),
         _scored_regions(options, held_out.regions()),
-        pose_prior=resolve_pose_prior(specs[2], held_out, options.pose_prior),
+        pose_prior=found.pose_prior,
     )
 
 
@@ -107,11 +106,12 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
         training, held_out = HeldOutSplit(_TEST_EVERY).split(select_frames(recorded, frames))
         agents.append(AgentPlan(f"agent-{letter}", task, str(options.source), frames, len(training)))
         held_out_positions.append(held_out)
-    registered, registration = register_with_warnings(options.source, recorded, options.register_depth, AUTO)
-    source, correction = correct_with_warnings(options.source, registered, options.camera_correction)
-    pose_prior = resolve_pose_prior(options.source, source, options.pose_prior)
-    views = tuple(FrameStream(source, positions, size) for positions in held_out_positions)
-    return Scenario(tuple(agents), size, _TEST_EVERY, views, regions, registration, correction, pose_prior)
+    stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
+    found = calibrate_with_messages(options.source, recorded, stated)
+    views = tuple(FrameStream(found.source, positions, size) for positions in held_out_positions)
+    return Scenario(
+        tuple(agents), size, _TEST_EVERY, views, regions, found.registration, found.correction, found.pose_prior
+    )
 
 
 def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) -> dict[str, Region]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
@@ -106,6 +107,26 @@ class BagSource:
     def depth_registered(self) -> bool:
         """True: depth is aligned as recorded, or registered here."""
         return True
+
+    @property
+    def camera_ideal(self) -> bool:
+        """False: a recording may have any camera."""
+        return False
+
+    @property
+    def poses_exact(self) -> bool:
+        """False: poses of transforms and of odometry have errors."""
+        return False
+
+    @property
+    def world_frame(self) -> str:
+        """Name of the bag."""
+        return self.name
+
+    @property
+    def regions_file(self) -> Path | None:
+        """None: a bag has no regions."""
+        return None
 
     @property
     def excluded_frames(self) -> str:

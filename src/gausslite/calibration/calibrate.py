@@ -1,0 +1,136 @@
+"""Decide what a recording does not state: the registration of its depth, its camera, and its poses' errors.
+
+A value that the user states is used. Where the source guarantees a value, no estimate is made. The rest is estimated
+from the frames: registration first, then the camera from registered frames, then the pose prior from corrected ones.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gausslite.calibration.camera_estimate import estimate_camera
+from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
+from gausslite.calibration.registration import find_registration
+from gausslite.datasets.corrected_source import CorrectedSource
+from gausslite.datasets.registered_source import RegisteredSource
+from gausslite.datasets.source import Source
+from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.depth_registration import DepthRegistration
+from gausslite.domain.lens import Lens
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+
+_NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class StatedValues:
+    """What the user states of a recording; None leaves a value to the source's guarantee or to an estimate.
+
+    depth_as_recorded: depth is used without registration. lens: kept where the camera is estimated, in place of the
+    lens that the source's files state.
+    """
+
+    registration: DepthRegistration | None = None
+    depth_as_recorded: bool = False
+    correction: CameraCorrection | None = None
+    lens: Lens | None = None
+    pose_prior: PoseExposurePrior | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Why a value that the user did not state was chosen.
+
+    option: name of the option that states it. value: as the option reads it. guaranteed: by the source; False for an
+    estimate.
+    """
+
+    option: str
+    value: str
+    reasons: tuple[str, ...]
+    guaranteed: bool = False
+
+    def __str__(self) -> str:
+        """Return option, value and reasons as one line."""
+        return f"{self.option} {shlex.quote(self.value)}: {'; '.join(self.reasons)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A source with registered depth and corrected images, what was applied to it, and the errors of its poses.
+
+    registration: None if depth is used as recorded. correction: the identity if images are. evidence: of each value
+    that the user did not state.
+    """
+
+    source: Source
+    registration: DepthRegistration | None
+    correction: CameraCorrection
+    pose_prior: PoseExposurePrior
+    evidence: tuple[Evidence, ...]
+
+
+def calibrate(
+    source: Source, stated: StatedValues | None = None, report: Callable[[Evidence], None] | None = None
+) -> Calibration:
+    """Return the source as it should be mapped, and its pose prior. Estimates take ten to thirty seconds.
+
+    report: called with the evidence of each value as soon as it is known. Raises DatasetError, PoseError,
+    InvalidInputError.
+    """
+    stated = stated or StatedValues()
+    found: list[Evidence] = []
+
+    def decide(evidence: Evidence) -> None:
+        found.append(evidence)
+        if report is not None:
+            report(evidence)
+
+    registration = stated.registration
+    if registration is None and not stated.depth_as_recorded:
+        registration = _registration_of(source, decide)
+    if registration is not None:
+        source = RegisteredSource(source, registration)
+    correction = stated.correction
+    if correction is None:
+        correction = _correction_of(source, stated.lens, decide)
+    if not correction.is_identity:
+        source = CorrectedSource(source, correction)
+    prior = stated.pose_prior
+    if prior is None:
+        prior = _pose_prior_of(source, decide)
+    return Calibration(source, registration, correction, prior, tuple(found))
+
+
+def _registration_of(source: Source, decide: Callable[[Evidence], None]) -> DepthRegistration | None:
+    if source.depth_registered:
+        decide(Evidence("register-depth", _NONE, ("the layout has registered depth",), guaranteed=True))
+        return None
+    registration, reason = find_registration(source)
+    decide(Evidence("register-depth", str(registration or _NONE), (reason,)))
+    return registration
+
+
+def _correction_of(source: Source, lens: Lens | None, decide: Callable[[Evidence], None]) -> CameraCorrection:
+    if source.camera_ideal:
+        decide(Evidence("camera-correction", _NONE, ("the source has an ideal camera",), guaranteed=True))
+        return CameraCorrection()
+    if not source.depth_registered:
+        decide(Evidence("camera-correction", _NONE, ("depth is not registered to colour",)))
+        return CameraCorrection()
+    estimate = estimate_camera(source, CameraCorrection(lens or source.lens))
+    correction = estimate.correction
+    text = _NONE if correction.is_identity else str(correction)
+    decide(Evidence("camera-correction", text, estimate.evidence))
+    return correction
+
+
+def _pose_prior_of(source: Source, decide: Callable[[Evidence], None]) -> PoseExposurePrior:
+    if source.poses_exact:
+        decide(Evidence("pose-prior", _NONE, ("the source has exact poses",), guaranteed=True))
+        return PoseExposurePrior()
+    prior, reason = estimate_pose_exposure_prior(source)
+    decide(Evidence("pose-prior", _NONE if prior.is_exact else str(prior), (reason,)))
+    return prior
