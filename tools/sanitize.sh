@@ -7,8 +7,10 @@ fail() { echo "sanitize: $1" >&2; exit 1; }
 
 kind=${1:-}
 case $kind in
-  address) sanitizers=address,undefined runtimes="libasan.so libubsan.so" ;;
-  thread) sanitizers=thread runtimes=libtsan.so ;;
+  # One SIMD variant besides the portable one: instrumenting all takes many minutes and finds no more errors in the stages.
+  address) sanitizers=address,undefined runtimes="libasan.so libubsan.so" variants="avx2;neon" tests="kernels choices bindings" ;;
+  # The variants share the work among threads by the same code.
+  thread) sanitizers=thread runtimes=libtsan.so variants=portable tests="kernels bindings" ;;
   *) fail "expected address or thread, got '$kind'" ;;
 esac
 python=$(command -v "${2:-python3}") || fail "no such Python: ${2:-python3}"
@@ -35,10 +37,9 @@ export UBSAN_OPTIONS=print_stacktrace=1 TSAN_OPTIONS=halt_on_error=1 PYTHONMALLO
 run_checked() { env LD_PRELOAD="$preload" "${no_randomisation[@]}" "$python" "$@"; }
 run_checked -c pass || fail "the $kind sanitizer's runtime does not start on this machine; nothing was checked"
 
-# One SIMD variant besides the portable one: instrumenting all takes many minutes and finds no more errors in the stages.
 build=$root/build/sanitize-$kind
 PATH=$(dirname "$python"):$PATH
-cmake -S "$root/native" -B "$build" -DGAUSSLITE_SANITIZE=$sanitizers -DGAUSSLITE_VARIANTS="avx2;neon" \
+cmake -S "$root/native" -B "$build" -DGAUSSLITE_SANITIZE=$sanitizers -DGAUSSLITE_VARIANTS="$variants" \
   -DCMAKE_CXX_COMPILER="$compiler" -DPython_EXECUTABLE="$python" -Dnanobind_DIR="$("$python" -m nanobind --cmake_dir)" >/dev/null
 cmake --build "$build" --parallel "$(nproc)" >/dev/null
 
@@ -55,6 +56,6 @@ export PYTHONPATH=$build/package PYTHONDONTWRITEBYTECODE=1
 cd "$root"
 run_checked -c "import sys, gausslite.render._kernels as kernels; sys.exit(not kernels.__file__.startswith('$build/package'))" ||
   fail "Python does not import the instrumented kernels; nothing was checked"
-[ $# -gt 0 ] || set -- tests/core/render/test_cpu_kernels.py tests/core/render/test_cpu_choices.py tests/core/render/test_cpu_bindings.py
+[ $# -gt 0 ] || for name in $tests; do set -- "$@" "tests/core/render/test_cpu_$name.py"; done
 # Uncaptured: a sanitizer writes its report and ends the process; pytest would lose the report.
 run_checked -m pytest -q --capture=no -p no:cacheprovider "$@"

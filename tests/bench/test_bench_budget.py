@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from quality_results import TASK, UNIFORM, finished
 
 from gausslite.cli.main import main
-from gausslite_bench.quality.budget import BudgetAxes, BudgetPoint, budget_curves, budget_table, task_gain
+from gausslite_bench.quality.budget import BudgetAxes, budget_curves, budget_table, task_gain
 
 AXES = BudgetAxes(caps=(60_000, 15_000), sizes=((320, 240),), iterations=(8, 4, 16))
 
@@ -24,10 +23,6 @@ def test_one_budget_varies_at_a_time() -> None:
     assert len(AXES.all_points()) == 4  # the common point once
 
 
-def test_single_values_are_one_point() -> None:
-    assert BudgetAxes((900,), ((64, 48),), (2,)).all_points() == [BudgetPoint(900, (64, 48), 2)]
-
-
 def test_the_gain_is_the_mean_over_seeds_with_their_spread() -> None:
     budget = AXES.all_points()[0].trial_budget
     trials = [finished(TASK, 0, 24.0, budget), finished(TASK, 1, 26.0, budget)]
@@ -37,12 +32,6 @@ def test_the_gain_is_the_mean_over_seeds_with_their_spread() -> None:
     assert (gain.roi, gain.roi_spread, gain.full, gain.worst_scene) == (2.0, 1.0, 0.0, 2.0)
     assert gain.roi_psnr == 26.0  # with fitted views, one decibel above the raw figures
     assert gain.ms == (12.5, 12.5)
-
-
-def test_without_a_view_of_the_region_there_is_no_gain() -> None:
-    one = finished(TASK, 0, 24.0, AXES.all_points()[0].trial_budget)
-    unseen = replace(one.result.scores, roi_psnr=None)
-    assert task_gain([replace(one, result=replace(one.result, scores=unseen, fitted=None))]) is None
 
 
 def test_the_table_and_the_curves_show_the_measured_points() -> None:

@@ -9,11 +9,8 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.lens import Lens
-from gausslite.mission.settings import MissionSettings
-from gausslite_bench.camera_study import CameraCondition, CameraScore, CameraStudy, camera_table, read_truth
-from gausslite_bench.quality.home_tasks import HOME_TASKS
+from gausslite_bench.camera_study import CameraCondition, CameraScore, camera_table, read_truth
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
@@ -43,15 +40,3 @@ def test_the_true_camera_is_that_of_the_options() -> None:
     lens = Lens.parse("radtan:-0.2,0,0,0")
     assert read_truth(30.0, 10.0, "radtan:-0.2,0,0,0") == CameraCorrection(lens, 0.03, exposure_s=0.01)
     assert read_truth(0.0, 0.0, "none").is_identity
-
-
-def test_wrong_options_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for option, expected in (
-        (["--pair", "home-1"], "one task"),
-        (["--speeds", "5000"], "1 to 1000"),
-        (["--shutter", "-3"], "readout"),
-    ):
-        assert main(["bench", "camera", "--out", str(tmp_path), *option]) == 2
-        assert expected in capsys.readouterr().err
-    with pytest.raises(InvalidInputError, match="time offset"):
-        CameraStudy(HOME_TASKS[0], CameraCorrection(time_offset_s=0.01), MissionSettings())

@@ -85,12 +85,6 @@ def test_the_offline_map_has_the_winners_of_the_acknowledged_updates(tmp_path: P
     assert fused.batch.kappa_sums.tolist() == [5, 9]
 
 
-@pytest.mark.parametrize("arguments", [("--kills", "0"), ("--agents", "33")])
-def test_wrong_numbers_are_one_line(arguments: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "chaos", *arguments]) == 2
-    assert arguments[0] in capsys.readouterr().err
-
-
 def test_a_record_without_its_end_is_read_when_it_is_complete(tmp_path: Path) -> None:
     agent = acknowledged_by(tmp_path / "journal", encode_subset(make_subset("ant", 1, {0: [1]}), GRID))
     data = (tmp_path / "journal").read_bytes()

@@ -1,13 +1,9 @@
-"""`gausslite bench codec`: the formats in order of size, exact decoders, and one clear line for an unknown task."""
+"""`gausslite bench codec`: the formats in order of size, and exact decoders."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pytest
 
-from gausslite.cli.main import main
 from gausslite.domain.gaussians import Gaussians
 from gausslite_bench.codec.formats import codec_formats
 from gausslite_bench.codec.scores import codec_table, measure_formats
@@ -51,8 +47,3 @@ def test_exact_formats_return_every_gaussian() -> None:
         assert each.decode is not None
         got = each.decode(each.encode(sent))
         assert sorted(map(tuple, got.means_m.tolist())) == sorted(map(tuple, sent.means_m.tolist())), each.name
-
-
-def test_an_unknown_task_is_refused_with_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "codec", "--out", str(tmp_path), "--pairs", "home-9-search"]) == 2
-    assert "home-9-search" in capsys.readouterr().err

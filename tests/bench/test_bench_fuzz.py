@@ -47,11 +47,6 @@ def test_a_decoder_with_an_unexpected_error_is_a_crash(monkeypatch: pytest.Monke
     assert outcomes.crashes == [("subset: IndexError: index out of range", b"short")]
 
 
-def test_a_folder_without_messages_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: object) -> None:
-    assert main(["bench", "fuzz", "--corpus", str(tmp_path)]) == 2
-    assert "expected folders of messages" in capsys.readouterr().err
-
-
 def test_a_seed_gives_the_same_messages() -> None:
     data = read_corpus(CORPUS)["subset"]
     first, second = (

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.domain.errors import InvalidInputError
 from gausslite.render.rasterizer import LossWeights
 from gausslite_bench.cli.gpu import frame_lines, gpu_record, rate_heading, rate_line
 from gausslite_bench.raster.gpu_rates import GpuBench
@@ -85,11 +84,6 @@ def test_the_gsplat_baseline_has_the_loss_of_our_step() -> None:
     step = rasterizer.step(rows, rows * 0, rows * 0, prepared, view.T_camera_world, loss, ZERO_LEARNING_RATES)
     plain = GsplatBaseline(rows[step.visible], prepared, view.T_camera_world, loss, rasterization)
     assert plain.train(2) == pytest.approx(step.loss, rel=1e-5)
-
-
-def test_no_repetitions_are_refused() -> None:
-    with pytest.raises(InvalidInputError, match="repetitions: expected 1 to 100000, got 0"):
-        GpuBench(CudaRasterizer("cpu"), repetitions=0)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")

@@ -10,7 +10,7 @@ from gausslite.cli.main import main
 from gausslite.domain.errors import DatasetError
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameTiming
-from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopTiming
+from gausslite_bench.loop.frame_costs import CostLog, FrameCost, LoopTiming
 
 SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
 
@@ -21,11 +21,6 @@ def cost(perception_s: float, iterations: int) -> FrameCost:
         sum(stages_s.values()), stages_s, frozenset({SkippableStage.SEEDING}), under_trained=iterations < 5
     )
     return FrameCost(budget, iterations, gaussians=100 * iterations, roi_share=0.5)
-
-
-def test_percentiles_of_equal_times_are_that_time() -> None:
-    latency = Latency.of([0.25] * 7)
-    assert (latency.p50_ms, latency.p90_ms, latency.p99_ms, latency.max_ms) == pytest.approx((250.0,) * 4)
 
 
 def test_hz_is_frames_by_the_sum_of_their_latencies() -> None:
@@ -75,12 +70,3 @@ def test_the_home_is_mapped_and_the_figures_are_json(
         assert 0 < times["p50_ms"] <= times["p90_ms"] <= times["p99_ms"] <= times["max_ms"]
     if budget[0] == "--iterations":
         assert (report["iterations_mean"], report["iterations_min"]) == (2.0, 2)
-
-
-def test_the_text_names_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
-    pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
-    assert main(["bench", "loop", "--policy", "uniform", "--frames", "0:2", *SMALL, "--iterations", "1"]) == 0
-    printed = capsys.readouterr().out
-    for word in ("2 frames", "Hz", "p99", "perception", "mapping", "publishing", "peak memory"):
-        assert word in printed

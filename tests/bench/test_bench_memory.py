@@ -43,21 +43,3 @@ def test_a_looped_run_reports_its_memory_and_the_gap_to_unlimited_time(capsys: p
     assert gap["gap_db"] == pytest.approx(gap["unlimited_db"] - gap["in_time_db"], abs=1e-5)
     for iterations in ("overhead", "overhead_full_image", "overhead_region"):
         assert 0.0 < report[f"{iterations}_percent"] < 100.0
-
-
-def test_a_loop_of_one_frame_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "loop", "--loop", "1"]) == 2
-    assert "--loop: expected at least 2 frames" in capsys.readouterr().err
-
-
-def test_a_gap_without_anything_to_score_is_refused_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
-    loop = ("bench", "loop", "sim:home?size=64x48", "--task", "mug")
-    for more, expected in (
-        (("--unlimited", "9"), "--unlimited: expected regions"),
-        (("--unlimited", "9", "--frames", "0:4"), "--unlimited: expected at least 8 frames"),
-        (("--unlimited", "-1"), "iterations: expected 0"),
-    ):
-        assert main([*loop, *more]) == 2
-        [line] = capsys.readouterr().err.splitlines()
-        assert expected in line

@@ -18,9 +18,3 @@ def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.
     assert all(load["missing"] == 0 for load in [*result["loads"], result["hostile"]])
     assert result["held"] == 20000
     assert min(result[name] for name in ("snapshot_s", "status_ms", "restart_s", "rss_mib")) > 0
-
-
-@pytest.mark.parametrize("arguments", [("--held", "many"), ("--agents", "0"), ("--seconds", "0")])
-def test_wrong_numbers_are_one_line(arguments: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "server", *arguments]) == 2
-    assert arguments[0] in capsys.readouterr().err

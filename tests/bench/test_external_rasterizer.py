@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gausslite.cli.main import main
-from gausslite.domain.errors import KernelError
 from gausslite.optimize.splat_table import SplatTable
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
 from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
@@ -89,18 +87,3 @@ def test_the_library_gets_the_splats_the_view_and_every_operation(library: Path)
     assert recorded_number(library, "last_row_padding") == 0.0
     point = (ctypes.c_float * 2).in_dll(ctypes.CDLL(str(library)), "principal_point")
     assert list(point) == [view.camera.cx_px, view.camera.cy_px]
-
-
-def test_the_benchmark_prints_ratios_to_the_library(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small = ["--sizes", "32x32", "--gaussians", "20", "--threads", "1", "--reps", "2", "--shares", "0"]
-    assert main(["bench", "raster", *small, "--external-rasterizer", str(library)]) == 0
-    assert capsys.readouterr().out.count("ratio") == 4
-    assert recorded(library, "opened") == recorded(library, "closed")
-
-
-def test_a_library_without_the_functions_is_refused(tmp_path: Path) -> None:
-    source, built = tmp_path / "empty.c", tmp_path / "libempty.so"
-    source.write_text("int gl_nothing;")
-    subprocess.run([COMPILER, "-shared", "-fPIC", source, "-o", built], check=True)
-    with pytest.raises(KernelError, match="expected a shared library with gl_new"):
-        ExternalRasterizer(built, 1, SplatTable(1), held_out_view(16, 16))

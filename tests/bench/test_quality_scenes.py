@@ -15,7 +15,7 @@ from gausslite.cli.main import main
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mission.settings import SceneInfo
-from gausslite_bench.quality.real_scenes import RealScenePlan, real_plans
+from gausslite_bench.quality.real_scenes import real_plans
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.quality.trials import Conditions, PerceptionMode, Trial, TrialBudget, Variant, build_map
 
@@ -49,13 +49,6 @@ def test_a_changed_camera_changes_the_settings_of_a_scene(tmp_path: Path) -> Non
     before = plan.training_settings()
     (folder / "camera-intrinsics.txt").write_text("21 0 7.5\n0 21 5.5\n0 0 1\n")
     assert plan.training_settings() != before
-
-
-def test_a_sequence_is_named_by_its_folder_for_any_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "kitchen").mkdir()
-    monkeypatch.chdir(tmp_path / "kitchen")
-    assert RealScenePlan(Path(), Path("roi.npz"), "mug", ("mug_1",)).name == "kitchen-mug"
-    assert RealScenePlan(tmp_path / "chess" / "seq-01", Path("roi.npz"), "mug", ("mug_1",)).name == "chess-seq-01-mug"
 
 
 @pytest.mark.parametrize("frames", [-5, 0, 1])

@@ -6,20 +6,17 @@ marked with `<!-- test: service -->` is a service that serves the following bloc
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
-import sysconfig
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
 import pytest
+from guide_blocks import Block, blocks, tiny_environment
 from tiny_yolo import write_tiny_yolo
 from tum_recording import write_home
 
@@ -29,49 +26,7 @@ pytest.importorskip("gsply", reason="exports need the extra `export`")
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if "<!-- test" in path.read_text(encoding="utf-8"))
-TINY = {
-    "GAUSSLITE_SIZE": "64x48",
-    "GAUSSLITE_FRAMES": "0:90:10",
-    "GAUSSLITE_ITERATIONS": "2",
-    "GAUSSLITE_MAX_GAUSSIANS": "2000",
-    "GAUSSLITE_THREADS": "1",
-}
 LIMIT_S = 120
-
-
-@dataclass(frozen=True)
-class Block:
-    """A fenced block of a page: its language, its text, and whether it is a service."""
-
-    language: str
-    text: str
-    is_service: bool
-
-    def command(self) -> list[str]:
-        return (
-            [sys.executable, "-c", self.text]
-            if self.language == "python"
-            else ["bash", "-euo", "pipefail", "-c", self.text]
-        )
-
-
-def blocks(page: Path) -> list[Block]:
-    """Return the marked blocks of a page, with free ports."""
-    found = re.findall(
-        r"^<!-- test(: service)? -->\n```(\w+)\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S
-    )
-    text = "".join(body for _, _, body in found)
-    ports = {port: free_port() for port in sorted(set(re.findall(r"(?<=:)500\d\d\b", text)))}
-    replaced = re.compile("|".join(rf"(?<=:){port}\b" for port in ports) or r"(?!)")
-    return [
-        Block(language, replaced.sub(lambda m: ports[m[0]], body), bool(service)) for service, language, body in found
-    ]
-
-
-def free_port() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return str(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +61,7 @@ def test_marked_blocks_run_as_written(page: Path, own_files: Path, tmp_path: Pat
     assert len(marked) == page.read_text(encoding="utf-8").count("<!-- test")
     folder = tmp_path / "reader"
     shutil.copytree(own_files, folder)
-    environment = {**os.environ, **TINY, "PATH": f"{sysconfig.get_path('scripts')}:{os.environ['PATH']}"}
+    environment = tiny_environment()
     with ExitStack() as services:
         for block in marked:
             if block.is_service:

@@ -25,11 +25,6 @@ pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`"
 SMALL = ("--size", "128x96", "--max-gaussians", "5000", "--iterations", "3", "--refine-iterations", "20")
 
 
-def _command(out: Path) -> list[str]:
-    frames = ("--frames-a", "0:10", "--frames-b", "0:10")
-    return [sys.executable, "-m", "gausslite", "demo", *SMALL, *frames, "--out", str(out)]
-
-
 def _children_named(marker: str) -> list[int]:
     found = []
     for entry in Path("/proc").iterdir():
@@ -41,33 +36,6 @@ def _children_named(marker: str) -> list[int]:
             if marker in command and int(entry.name) != os.getpid():
                 found.append(int(entry.name))
     return found
-
-
-def test_the_demo_maps_fuses_scores_and_ends_its_processes(tmp_path: Path) -> None:
-    out = tmp_path / "demo"
-    done = subprocess.run(_command(out), capture_output=True, text=True, timeout=280)
-    assert done.returncode == 0, done.stderr
-    report = json.loads((out / "report.json").read_text())
-    assert set(report["agents"]) == {"agent-a", "agent-b"}
-    for agent in report["agents"].values():
-        assert agent["frames"] == 10
-        assert agent["hz"] > 0
-        assert 0 < agent["roi_share"] < 1
-        assert agent["bytes_sent"] > 0
-        assert 0 < agent["map_shared_percent"] < 100
-    assert set(report["maps"]) == {"agent-a", "agent-b", "concatenation", "vote", "refine"}
-    for scores in report["maps"].values():
-        assert scores["roi_psnr"] > 5
-        assert scores["full_psnr"] > 5
-    sizes = {name: len(read_ply(out / f"{name}.ply")) for name in ("concatenation", "vote")}
-    both = sum(len(read_ply(out / agent / "map.ply")) for agent in report["agents"])
-    assert sizes["vote"] < sizes["concatenation"] == both
-    assert list((out / "pictures").glob("*.png"))
-    assert f"{out / 'report.html'} shows them" in done.stdout
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert all(f"<th>{name}</th>" in page for name in report["maps"])
-    assert not _children_named(str(out))
-    assert "max-gaussians = 5000\n" in (out / "agent-a" / "config.toml").read_text()
 
 
 def _write_recording(folder: Path) -> None:
@@ -88,7 +56,7 @@ def _write_recording(folder: Path) -> None:
     np.savez(folder / "roi_voxels.npz", mug_1=voxels, voxel_size_m=0.02)
 
 
-def test_agents_register_depth_and_refine_keyframes_as_the_demo_sets_it(tmp_path: Path) -> None:
+def test_the_demo_maps_fuses_scores_and_ends_its_processes_on_a_recording_with_a_calibration(tmp_path: Path) -> None:
     folder, out = tmp_path / "recording", tmp_path / "demo"
     _write_recording(folder)
     camera = ",".join(np.loadtxt(folder / "camera-intrinsics.txt")[[0, 1, 0, 1], [0, 1, 2, 2]].astype(str))
@@ -97,26 +65,47 @@ def test_agents_register_depth_and_refine_keyframes_as_the_demo_sets_it(tmp_path
     command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *map(str, tasks), *calibration, "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr
-    assert "pose and exposure of each held-out view were fitted" in done.stdout
+    assert not _children_named(str(out))
     report = json.loads((out / "report.json").read_text())
+    assert set(report["agents"]) == {"agent-a", "agent-b"}
+    for agent in report["agents"].values():
+        assert agent["frames"] == 7
+        assert agent["hz"] > 0
+        assert 0 < agent["roi_share"] < 1
+        assert agent["bytes_sent"] > 0
+        assert 0 < agent["map_shared_percent"] < 100
+    assert set(report["maps"]) == {"agent-a", "agent-b", "concatenation", "vote", "refine"}
+    for scores in report["maps"].values():
+        assert scores["roi_psnr"] > 5
+        assert scores["full_psnr"] > 5
+    sizes = {name: len(read_ply(out / f"{name}.ply")) for name in ("concatenation", "vote")}
+    both = sum(len(read_ply(out / agent / "map.ply")) for agent in report["agents"])
+    assert sizes["vote"] < sizes["concatenation"] == both
+    assert list((out / "pictures").glob("*.png"))
+    assert f"{out / 'report.html'} shows them" in done.stdout
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert all(f"<th>{name}</th>" in page for name in report["maps"])
+    assert "max-gaussians = 5000\n" in (out / "agent-a" / "config.toml").read_text()
+    # the agents register depth and refine keyframes as the demo sets it
+    assert "pose and exposure of each held-out view were fitted" in done.stdout
     assert DepthRegistration.parse(report["colour_camera"]) == DepthRegistration.parse(camera)
     assert report["view_error"] == "0.01,0.5,0.1,0.03"
     assert report["scored"] == {"objects": ["mug_1"], "views": 2, "fitted": True, "frames_corrupt": 0}
-    assert [agent["frames"] for agent in report["agents"].values()] == [7, 7]
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc to see processes")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_interrupting_the_demo_ends_every_process(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_ended_session_ends_every_process_of_the_demo(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    demo = subprocess.Popen(_command(out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    frames = ("--frames-a", "0:10", "--frames-b", "0:10")
+    command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *frames, "--out", str(out)]
+    demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     try:
         deadline = time.monotonic() + 120
         while len(_children_named(str(out / "agent-"))) < 2:
             assert demo.poll() is None, demo.stderr.read() if demo.stderr else ""
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        demo.send_signal(number)
+        demo.send_signal(signal.SIGHUP)
         _, errors = demo.communicate(timeout=60)
     finally:
         demo.kill()

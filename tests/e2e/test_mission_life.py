@@ -56,19 +56,17 @@ def require_complete(life: Life, frames: int) -> None:
     assert life.rendered_share > 0.5
 
 
-@pytest.mark.parametrize("kill", [False, True])
-def test_a_mission_from_its_task_to_the_refined_map(kill: bool, tmp_path: Path) -> None:
+def test_a_mission_with_a_killed_agent_from_its_task_to_the_refined_map(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
     options = ["--detector", str(model), "--max-gaussians", "3000", "--iterations", "2", "--threads", "1"]
-    life = live(tmp_path, box_frames(_FRAMES), "Pick up the cup", options, kill, noun="cup")
+    life = live(tmp_path, box_frames(_FRAMES), "Pick up the cup", options, kill=True, noun="cup")
     require_complete(life, _FRAMES)
     assert life.objects >= 1
 
 
-@pytest.mark.parametrize("kill", [False, True])
-def test_a_mission_in_the_kitchen(kill: bool, tmp_path: Path) -> None:
+def test_a_mission_in_the_kitchen(tmp_path: Path) -> None:
     if not (_KITCHEN.exists() and _DETECTOR.exists()):
         pytest.skip(f"expected {_KITCHEN} and {_DETECTOR}, got nothing there")
     options = ["--detector", str(_DETECTOR), "--max-gaussians", "20000", "--iterations", "2", "--threads", "1"]
-    life = live(tmp_path, encoded_frames(_KITCHEN, 6, 4), "Pick up the bottle", options, kill)
+    life = live(tmp_path, encoded_frames(_KITCHEN, 6, 4), "Pick up the bottle", options, kill=False)
     require_complete(life, 6)

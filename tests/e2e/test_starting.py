@@ -12,16 +12,15 @@ import pytest
 from gausslite.process.interrupts import raise_interrupts
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
-    ("module", "arguments", "imported"),
+    ("module", "arguments", "imported", "number"),
     [
-        ("gausslite", ["demo", "--help"], "argparse"),
-        ("gausslite", ["map", "--help"], "numpy"),
-        ("gausslite_agent", [], "asyncio"),
-        ("gausslite_agent", [], "cv2"),
-        ("gausslite_fusion_server", [], "numpy"),
-        ("gausslite_parser", [], "grpc"),
+        ("gausslite", ["demo", "--help"], "argparse", signal.SIGTERM),
+        ("gausslite", ["map", "--help"], "numpy", signal.SIGINT),
+        ("gausslite_agent", [], "asyncio", signal.SIGINT),
+        ("gausslite_agent", [], "cv2", signal.SIGTERM),
+        ("gausslite_fusion_server", [], "numpy", signal.SIGTERM),
+        ("gausslite_parser", [], "grpc", signal.SIGINT),
     ],
 )
 def test_a_signal_during_the_start_causes_no_traceback(

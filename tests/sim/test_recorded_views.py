@@ -7,7 +7,6 @@ import pytest
 
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.lens import Lens
 from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.ray_camera import RayCamera
@@ -77,14 +76,3 @@ def test_all_options_work_together() -> None:
     assert source.lens is None
     assert frame.has_depth
     assert frame.rgb.tobytes() == open_source(spec).frame(7).rgb.tobytes()
-
-
-@pytest.mark.parametrize("option", ["blur=10", "blur=101ms", "blur=-1ms", "lens=radtan", "lens=wide:1,2,3,4", "lens="])
-def test_wrong_options_are_refused(option: str) -> None:
-    with pytest.raises(DatasetError, match=r"sim:home: (blur|lens)"):
-        open_source(f"sim:home?{option}")
-
-
-def test_a_lens_that_cannot_be_inverted_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match="inverted"):
-        open_source("sim:home?size=80x60&lens=radtan:-3,0,0,0").frame(0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -11,13 +9,10 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.selection import select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import back_project
-from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid, transform_points
 from gausslite.domain.voxels import VoxelGrid
-from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.home_settings import TRAJECTORY_COUNT
-from gausslite_sim.scene import HomeScene
 from gausslite_sim.two_room_layout import TABLE_CENTRE_M, furnish
 from gausslite_sim.two_room_trajectories import TRAJECTORIES
 
@@ -181,28 +176,3 @@ def test_textures_hold_fine_detail() -> None:
     image = home(0, 12, "320x240", "0").frame(2).rgb.astype(np.float64).mean(axis=2)
     gradient = np.abs(np.diff(image, axis=1))
     assert (gradient > 4).mean() > 0.3
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("sim:garden", "sim:garden: expected sim:home"),
-        ("sim:home?trajectory=3", "trajectory: expected 0 to 2, got 3"),
-        ("sim:home?frames=0", "frames: expected 1 to 100000"),
-        ("sim:home?size=320", "size=320: expected seed=N"),
-        ("sim:home?size=4x4", "size: expected sides of 16"),
-        ("sim:home?noise=-1", "noise=-1: expected"),
-        ("sim:home?noise=nan", "noise=nan: expected"),
-        ("sim:home?colour=red", "colour=red: expected"),
-        ("sim:home?seed=9999999999", "seed: expected 0 to 4294967295"),
-    ],
-)
-def test_an_invalid_spec_is_an_error(spec: str, message: str) -> None:
-    with pytest.raises(DatasetError, match=message.replace("?", r"\?")):
-        open_source(spec)
-
-
-def test_without_the_ray_caster_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    with pytest.raises(DatasetError, match=r"pip install 'gausslite\[sim\]'"):
-        HomeScene(plan_home(0, seed=5))

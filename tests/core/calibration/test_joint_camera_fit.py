@@ -16,8 +16,12 @@ SIZE = (160, 120)
 HOME = f"sim:home-1?frames=90&size={SIZE[0]}x{SIZE[1]}&noise=0&exposure=0&speed=60"
 
 
-def test_both_radial_coefficients_and_the_readout_time_are_fitted_together() -> None:
-    moving = MovingPairs.read(open_source(f"{HOME}&shutter=30ms&lens=radtan:-0.2,0.03,0,0"), SIZE)
+@pytest.fixture(scope="module")
+def moving() -> MovingPairs:
+    return MovingPairs.read(open_source(f"{HOME}&shutter=30ms&lens=radtan:-0.2,0.03,0,0"), SIZE)
+
+
+def test_both_radial_coefficients_and_the_readout_time_are_fitted_together(moving: MovingPairs) -> None:
     fit = fit_camera(moving, CameraCorrection(Lens.parse("radtan:-0.15,0,0,0"), readout_s=0.02), fits_lens=True)
     assert fit is not None
     assert fit.correction.lens is not None
@@ -30,14 +34,5 @@ def test_both_radial_coefficients_and_the_readout_time_are_fitted_together() -> 
     assert 0.0 < fit.offset_std_s < 0.002
 
 
-def test_the_fit_of_an_ideal_camera_finds_no_readout_time() -> None:
-    fit = fit_camera(MovingPairs.read(open_source(HOME), SIZE), CameraCorrection(), fits_lens=False)
-    assert fit is not None
-    assert fit.correction.lens is None
-    assert abs(fit.correction.readout_s) < 0.003
-    assert abs(fit.correction.time_offset_s) < 0.002
-
-
-def test_without_comparable_pairs_there_is_no_fit() -> None:
-    moving = MovingPairs.read(open_source(HOME), SIZE)
+def test_without_comparable_pairs_there_is_no_fit(moving: MovingPairs) -> None:
     assert fit_camera(MovingPairs(moving.trajectory, (), moving.frames), CameraCorrection(), fits_lens=False) is None

@@ -46,48 +46,36 @@ def run_with_map(results, folder, gaussians):
     return folder
 
 
-@pytest.mark.parametrize("name", ALL_FORMATS)
-def test_an_empty_map_is_refused_by_every_format(results, tmp_path, name, capsys):
-    run = run_with_map(results, tmp_path / "empty", Gaussians.empty())
-    assert main(["export", str(run), "--to", name]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "expected a map with at least one Gaussian, got an empty map" in line
-    assert {file.name for file in run.iterdir()} == {"map.ply", "keyframes.json", "report.json"}
-
-
-@pytest.mark.parametrize("name", ALL_FORMATS)
-def test_a_mean_that_is_nan_is_refused_by_every_format(results, tmp_path, name, capsys):
+def test_an_empty_map_and_a_mean_that_is_nan_are_refused_by_every_format(results, tmp_path, capsys):
     gaussians = read_ply(results / "map.ply")
     gaussians.means_m[3, 1] = np.nan
-    run = run_with_map(results, tmp_path / "nan", gaussians)
-    assert main(["export", str(run), "--to", name, "--region", "all"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "column y: expected finite values" in line
+    empty = run_with_map(results, tmp_path / "empty", Gaussians.empty())
+    not_finite = run_with_map(results, tmp_path / "nan", gaussians)
+    for name in ALL_FORMATS:
+        for run, message in (
+            (empty, "expected a map with at least one Gaussian, got an empty map"),
+            (not_finite, "column y: expected finite values"),
+        ):
+            assert main(["export", str(run), "--to", name, "--region", "all"]) == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            assert message in line
+            assert {file.name for file in run.iterdir()} == {"map.ply", "keyframes.json", "report.json"}
 
 
-@pytest.mark.parametrize("column", ["means_m", "scales_m"])
 @pytest.mark.parametrize("name", ALL_FORMATS)
-def test_a_gaussian_far_outside_is_left_out_with_one_line(results, tmp_path, name, column, capsys):
+def test_gaussians_far_outside_are_left_out_with_one_line(results, tmp_path, name, capsys):
     gaussians = read_ply(results / "map.ply")
-    getattr(gaussians, column)[3, 1] = 1e30
+    gaussians.means_m[3, 1] = gaussians.scales_m[4, 1] = 1e30
     run = run_with_map(results, tmp_path / "far", gaussians)
     assert main(["export", str(run), "--to", name, "--region", "all", "--json", *OPTIONS.get(name, ())]) == 0
     captured = capsys.readouterr()
     report = json.loads(captured.out)
-    assert (report["gaussians"], report["left_out"]) == (len(gaussians) - 1, 1)
+    assert (report["gaussians"], report["left_out"]) == (len(gaussians) - 2, 2)
     notes = [line for line in captured.err.splitlines() if "left out" in line]
     assert notes == [
-        f"left out 1 of {len(gaussians)} Gaussians: expected coordinates and standard deviations up to "
+        f"left out 2 of {len(gaussians)} Gaussians: expected coordinates and standard deviations up to "
         f"{FORMATS[name].max_extent_m:g} m, got larger ones"
     ]
-
-
-def test_a_map_that_is_far_outside_as_a_whole_is_refused(results, tmp_path, capsys):
-    gaussians = read_ply(results / "map.ply")
-    gaussians.means_m[:] = 1e30
-    run = run_with_map(results, tmp_path / "far", gaussians)
-    assert main(["export", str(run), "--to", "nav2"]) == 2
-    assert "expected Gaussians within 100000 m of the origin, got none" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ALL_FORMATS)
@@ -113,6 +101,22 @@ def test_every_format_writes_its_default_file(results, name, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
+def test_the_map_itself_is_never_the_output(results, capsys):
+    before = (results / "map.ply").read_bytes()
+    out = str(results / "map.ply")
+    assert main(["export", str(results), "--to", "ply", "--out", out, "--overwrite"]) == 2
+    assert "not the input" in capsys.readouterr().err
+    assert (results / "map.ply").read_bytes() == before
+
+
+def test_the_objects_of_a_damaged_report_are_not_exported_as_none(results, tmp_path, capsys):
+    shutil.copy(results / "map.ply", tmp_path)
+    (tmp_path / "report.json").write_text("{")
+    assert main(["export", str(tmp_path), "--to", "json", "--region", "all"]) == 2
+    assert "report.json: expected the report of a run" in capsys.readouterr().err
+    assert not (tmp_path / "map.json").exists()
+
+
 @pytest.mark.parametrize(
     ("option", "message"),
     [
@@ -126,22 +130,11 @@ def test_an_option_without_effect_is_refused(results, capsys, option, message):
     assert message in capsys.readouterr().err
 
 
-def test_the_map_itself_is_never_the_output(results, capsys):
-    before = (results / "map.ply").read_bytes()
-    out = str(results / "map.ply")
-    assert main(["export", str(results), "--to", "ply", "--out", out, "--overwrite"]) == 2
-    assert "not the input" in capsys.readouterr().err
-    assert (results / "map.ply").read_bytes() == before
-
-
-def test_a_missing_run_is_one_line(tmp_path, capsys):
+def test_a_missing_run_and_a_map_far_outside_as_a_whole_are_refused(results, tmp_path, capsys):
     assert main(["export", str(tmp_path / "nothing"), "--to", "spz"]) == 2
     assert "map.ply" in capsys.readouterr().err
-
-
-def test_the_objects_of_a_damaged_report_are_not_exported_as_none(results, tmp_path, capsys):
-    shutil.copy(results / "map.ply", tmp_path)
-    (tmp_path / "report.json").write_text("{")
-    assert main(["export", str(tmp_path), "--to", "json", "--region", "all"]) == 2
-    assert "report.json: expected the report of a run" in capsys.readouterr().err
-    assert not (tmp_path / "map.json").exists()
+    gaussians = read_ply(results / "map.ply")
+    gaussians.means_m[:] = 1e30
+    run = run_with_map(results, tmp_path / "far", gaussians)
+    assert main(["export", str(run), "--to", "nav2"]) == 2
+    assert "expected Gaussians within 100000 m of the origin, got none" in capsys.readouterr().err

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.even_history import EvenHistory
 
 
@@ -56,8 +55,3 @@ def test_a_state_of_the_same_time_replaces_and_an_earlier_one_begins_again():
     assert history.is_due(5)
     history.add(5, "d")
     assert history.states == ("d",)
-
-
-def test_a_history_of_two_states_is_refused():
-    with pytest.raises(InvalidInputError, match="at least 3, got 2"):
-        EvenHistory(2)

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.lens import Lens
 
 SLOPES = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 200))
@@ -37,21 +36,8 @@ def test_text_form_round_trips() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "radtan", "radtan:1,2", "fisheye:1,2,3,4,5", "radtan:a,b,c,d", "radtan:nan,0,0,0"]
-)
-def test_a_wrong_lens_is_rejected(text: str) -> None:
-    with pytest.raises(InvalidInputError, match="lens"):
-        Lens.parse(text)
-
-
-@pytest.mark.parametrize(
     "text", ["radtan:-0.2,0.05,0.002,-0.001", "radtan:0.2624,-0.9531,-0.0054,0.0026,1.1633", "fisheye:0.1,0.02,0,0"]
 )
 def test_undistorted_points_are_distorted_back_to_where_they_were(text: str) -> None:
     lens, points = Lens.parse(text), 0.8 * SLOPES
     np.testing.assert_allclose(lens.distort(*lens.undistort(*points)), points, atol=1e-6)
-
-
-def test_a_point_that_no_ray_meets_has_no_slope() -> None:
-    with pytest.raises(InvalidInputError, match="inverted"):
-        Lens.parse("radtan:-1,0,0,0").undistort(np.array([0.1, 2.0]), np.array([0.0, 0.0]))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.trajectory import Trajectory, Twist
 
 
@@ -51,11 +49,6 @@ def test_a_single_pose_has_no_velocity() -> None:
     twist = Trajectory(np.zeros(1), np.eye(4)[None]).twist(0)
     assert not twist.angular_rad_s.any()
     assert not twist.linear_m_s.any()
-
-
-def test_times_that_decrease_are_rejected() -> None:
-    with pytest.raises(InvalidInputError, match="ascending"):
-        Trajectory(np.array([1.0, 0.0]), np.stack([np.eye(4)] * 2))
 
 
 def test_a_velocity_is_steady_if_it_is_similar_before_and_after() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.domain.errors import InvalidInputError, ShapeError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import select_prefix
 from gausslite.mapping.mapper import GaussianMapper
@@ -134,11 +134,6 @@ def test_a_frame_without_depth_is_skipped_and_counted() -> None:
     outcome = mapper.map_frame(frame, middle_relevance(frame))
     assert outcome.skipped == "no pixel has a depth reading"
     assert (outcome.index, outcome.iterations, mapper.count, mapper.revision, mapper.skipped) == (3, 0, 0, 0, 1)
-
-
-def test_a_relevance_map_of_another_size_is_refused() -> None:
-    with pytest.raises(ShapeError, match="relevance pixel_weights"):
-        mapper_of().map_frame(wall_frame(0, SIZE), RelevanceMap.empty(8, 8))
 
 
 def test_the_same_seed_gives_the_same_map_and_another_seed_another() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import disable
@@ -86,12 +86,6 @@ def test_a_damaged_state_is_refused() -> None:
     state["losses"] = -np.asarray(state["losses"])
     with pytest.raises(MapFileError, match="state saturation"):
         RegionSaturation(SETTINGS).restore(state)
-
-
-@pytest.mark.parametrize("values", [{"max_released": 1.5}, {"improving": 0.01}, {"saturated": math.nan}])
-def test_impossible_settings_are_refused(values: dict[str, float]) -> None:
-    with pytest.raises(InvalidInputError, match="saturation"):
-        SaturationSettings(**values)
 
 
 class CountingScheduler(CountedScheduler):

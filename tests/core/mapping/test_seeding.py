@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, rendering_of, wall_frame
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.coverage import RenderedView, rendered_behind, undersampled_roi
 from gausslite.mapping.seeding import Seeder, SeedingContext
@@ -138,9 +137,3 @@ def test_background_that_becomes_the_region_is_seeded() -> None:
     seeds = seeder(sb=True, sis=True).seed(frame, middle_relevance(frame), state)
     assert len(seeds.roi) > 0
     assert len(seeds.background) == 0
-
-
-@pytest.mark.parametrize("wrong", [{"roi_share": 1.5}, {"opacity": 1.0}, {"max_depth_m": 0.0}, {"later_seeds": 0}])
-def test_settings_name_what_is_wrong(wrong: dict[str, float]) -> None:
-    with pytest.raises(InvalidInputError, match=next(iter(wrong))):
-        SeedingSettings(**wrong)

@@ -11,7 +11,6 @@ from deferred_executor import DeferredExecutor
 from mapping_scenes import wall_frame
 from sample_gaussians import some_gaussians
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.region import BallRegion
@@ -252,8 +251,3 @@ def test_asynchronous_reevaluation_alternates_with_new_keyframes() -> None:
     executor.run_next()
     assert map_frames(task_mapper, 4, 5)[0].reevaluation.keyframes == 1
     assert executor.frames[-1] == 1
-
-
-def test_keyframes_per_frame_must_be_positive() -> None:
-    with pytest.raises(InvalidInputError, match="keyframes_per_frame"):
-        TaskChangeSettings(keyframes_per_frame=0)

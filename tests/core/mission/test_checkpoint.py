@@ -135,9 +135,9 @@ def test_saving_changes_nothing_and_restoring_gives_the_saved_state(tmp_path: Pa
     assert_same(same.state(), before)
 
 
-@pytest.fixture
-def saved(tmp_path: Path) -> Path:
-    run, path = make_task_mapper(), tmp_path / "run.state"
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run, path = make_task_mapper(), tmp_path_factory.mktemp("saved") / "run.state"
     changes_of_run(run, 0, 3)
     save_run(path, run, CONFIG, 2)
     return path
@@ -167,12 +167,12 @@ def test_a_mapper_that_is_too_small_is_refused(saved: Path) -> None:
         SavedRun.read(saved).restore(make_task_mapper(window=1))
 
 
-@pytest.mark.parametrize("config", ["", "[1]", '{"a": 1}', "[" * 100_000, "\0"])
-def test_a_config_that_is_not_json_objects_is_refused(config: str, saved: Path) -> None:
-    state = read_state(saved)
-    write_state(saved, {**state, "run/config": np.frombuffer(config.encode(), np.uint8)})
-    with pytest.raises(MapFileError, match=r"run\.state: state config: expected settings"):
-        SavedRun.read(saved)
+def test_a_config_that_is_not_json_objects_is_refused(saved: Path, tmp_path: Path) -> None:
+    state, damaged = read_state(saved), tmp_path / "run.state"
+    for config in ("", "[1]", '{"a": 1}', "[" * 100_000, "\0"):
+        write_state(damaged, {**state, "run/config": np.frombuffer(config.encode(), np.uint8)})
+        with pytest.raises(MapFileError, match=r"run\.state: state config: expected settings"):
+            SavedRun.read(damaged)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def forgeries(array: np.ndarray) -> Iterator[np.ndarray]:
     """Yield arrays of another length, another type, and with all bytes equal."""
     yield np.concatenate([array.ravel(), array.ravel(), np.zeros(1, array.dtype)])
     yield array.astype(np.float64 if array.dtype != np.float64 else np.float32)
-    for byte in (0, 1) if array.dtype == np.bool_ else (0, 1, 127, 128, 255):
+    for byte in (0, 1) if array.dtype == np.bool_ else (0, 127, 255):
         same = array.copy()
         same.reshape(-1).view(np.uint8)[:] = byte
         yield same

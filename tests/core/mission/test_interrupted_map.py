@@ -86,15 +86,6 @@ def test_a_second_ctrl_c_interrupts_at_once() -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_folder_in_place_of_the_state_file_is_refused_before_the_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sequence = write_seven_scenes(tmp_path / "kitchen")
-    assert mapped(sequence, tmp_path / "out", "--save-state", str(tmp_path)) == 2
-    assert "expected the name of a file, got a folder" in capsys.readouterr().err
-    assert not (tmp_path / "out" / "map.ply").exists()
-
-
 def test_a_resumed_run_without_new_frames_saves_its_state_again(tmp_path: Path) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen")
     first, second = tmp_path / "first.state", tmp_path / "second.state"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from pathlib import Path
 
 import pytest
@@ -11,25 +10,10 @@ from tiny_sequences import write_seven_scenes
 
 from gausslite.cli.main import main
 
-EMPTY_SAFETENSORS = struct.pack("<Q", 2) + b"{}"
-
 
 def map_command(folder: Path, out: Path, *more: str) -> list[str]:
     common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150", "--register-depth", "none"]
     return ["map", str(folder), *common, "--out", str(out), *more]
-
-
-@pytest.mark.parametrize("contents", [None, b"", b"remember the milk", EMPTY_SAFETENSORS[:8], EMPTY_SAFETENSORS])
-def test_a_file_that_is_not_a_saved_run_is_one_line(
-    contents: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "run.state"
-    if contents is not None:
-        path.write_bytes(contents)
-    sequence = write_seven_scenes(tmp_path / "kitchen")
-    assert main(map_command(sequence, tmp_path / "out", "--resume", str(path))) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert "run.state" in line
 
 
 def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -97,14 +81,6 @@ def test_registration_and_prior_of_the_saved_run_are_not_estimated_again(
     assert (report["frames"], report["colour_camera"], report["view_error"]) == (3, found[1], found[3])
     assert main([*rest, "--pose-prior", "none"]) == 2
     assert "--pose-prior '0.01,0.5,0.1,0.03' (got '0,0,0,0')" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["map.ply", "report.json", "preview.png"])
-def test_a_saved_run_cannot_replace_a_result(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sequence = write_seven_scenes(tmp_path / "kitchen")
-    assert main(map_command(sequence, tmp_path / "out", "--save-state", str(tmp_path / "out" / name))) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert f"{name}: expected a name other than that of a result in" in line
 
 
 def test_a_state_of_another_sequence_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

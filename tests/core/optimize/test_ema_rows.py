@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, OptimizationSettings, SeedingSettings
@@ -147,9 +145,3 @@ def test_training_is_independent_of_the_ema() -> None:
     assert len(current) == len(smoothed)
     assert np.abs(current.rgb - smoothed.rgb).max() > 1e-3
     assert_array_equal(with_ema.roi_gaussians().rgb, smoothed.rgb[smoothed.active])
-
-
-@pytest.mark.parametrize("updates", [-1.0, math.nan, math.inf])
-def test_invalid_horizon_is_rejected(updates: float) -> None:
-    with pytest.raises(InvalidInputError, match="ema_updates"):
-        replace(OptimizationSettings(), ema_updates=updates)

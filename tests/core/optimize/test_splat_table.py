@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sample_gaussians import some_gaussians
 
-from gausslite.domain.errors import InvalidInputError, QuotaError, ShapeError
+from gausslite.domain.errors import QuotaError
 from gausslite.optimize.splat_table import SplatTable
 
 
@@ -68,16 +68,3 @@ def test_to_gaussians_copies() -> None:
     expected = some_gaussians(5).take(np.array([4, 1]))
     np.testing.assert_allclose(copied.means_m, expected.means_m)
     np.testing.assert_array_equal(copied.kappa, expected.kappa)
-
-
-@pytest.mark.parametrize("capacity", [10**12, 10**18, 10**30])
-def test_capacity_beyond_memory_is_rejected(capacity: int) -> None:
-    with pytest.raises(InvalidInputError, match="max_gaussians: expected a table that fits in memory"):
-        SplatTable(capacity)
-
-
-def test_errors_name_invalid_arguments() -> None:
-    with pytest.raises(InvalidInputError, match="capacity"):
-        SplatTable(0)
-    with pytest.raises(ShapeError, match="keep mask"):
-        SplatTable(3).keep(np.ones(2, np.bool_))

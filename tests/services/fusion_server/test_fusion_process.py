@@ -15,6 +15,7 @@ from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import UnavailableError
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export, FusionClient
+from gausslite_fusion_server.program import run
 
 
 def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(tmp_path: Path) -> None:
@@ -43,14 +44,6 @@ def test_sigterm_ends_open_streams_and_the_process_with_code_0(tmp_path: Path) -
     assert log.read_text().rstrip().endswith("ended")
 
 
-def ends_with_one_line(*arguments: str) -> str:
-    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    [line] = done.stderr.splitlines()
-    return line
-
-
 class Hasty(FusionClient):
     keepalive_s = 0.5
 
@@ -64,24 +57,37 @@ def test_a_watcher_detects_a_server_that_stopped_answering() -> None:
             next(watch)
 
 
-def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(tmp_path: Path) -> None:
+def ends_with_one_line(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert run(arguments) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    [line] = output.err.splitlines()
+    return line
+
+
+def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     nonsense = tmp_path / "missions" / "notes.sqlite"
     nonsense.parent.mkdir()
     nonsense.write_text("remember the milk, " * 300)
-    assert "cannot be opened" in ends_with_one_line("--store", str(tmp_path / "no" / "folder" / "x.sqlite"))
-    assert "undamaged GaussLite store" in ends_with_one_line("--store", str(nonsense))
-    assert "--store memroy: expected memory or" in ends_with_one_line("--store", "memroy")
-    assert "a folder needs --shards" in ends_with_one_line("--store", str(tmp_path))
-    assert "start one server for each mission in the folder" in ends_with_one_line("--store", str(nonsense.parent))
-    assert "--health" in ends_with_one_line("--health", "nonsense")
-    assert "--voxel-size: expected 0.001 to 1000" in ends_with_one_line("--voxel-size", "0")
-    assert "--store-max-mb" in ends_with_one_line("--store-max-mb", "0")
-    assert "--refine-iterations" in ends_with_one_line("--refine-iterations", "1000000")
-    assert "mission: expected 1 to 64 letters" in ends_with_one_line("--mission", "husky-\udcff")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        assert "in use" in ends_with_one_line("--listen", f"127.0.0.1:{taken.getsockname()[1]}")
+        for arguments, expected in (
+            (("--store", str(tmp_path / "no" / "folder" / "x.sqlite")), "cannot be opened"),
+            (("--store", str(nonsense)), "undamaged GaussLite store"),
+            (("--store", "memroy"), "--store memroy: expected memory or"),
+            (("--store", str(tmp_path)), "a folder needs --shards"),
+            (("--store", str(nonsense.parent)), "start one server for each mission in the folder"),
+            (("--health", "nonsense"), "--health"),
+            (("--voxel-size", "0"), "--voxel-size: expected 0.001 to 1000"),
+            (("--store-max-mb", "0"), "--store-max-mb"),
+            (("--refine-iterations", "1000000"), "--refine-iterations"),
+            (("--mission", "husky-\udcff"), "mission: expected 1 to 64 letters"),
+            (("--listen", f"127.0.0.1:{taken.getsockname()[1]}"), "in use"),
+        ):
+            assert expected in ends_with_one_line(capsys, *arguments)
 
 
 def test_the_server_shows_itself_on_a_page(tmp_path: Path) -> None:
@@ -95,10 +101,3 @@ def test_the_server_shows_itself_on_a_page(tmp_path: Path) -> None:
                 assert b"<html" in page.read()
         finally:
             process.kill()
-
-
-def test_help_lists_the_options() -> None:
-    done = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0
-    for option in ("--listen", "--store", "--voxel-size", "--quota-gaussians", "--rasterizer"):
-        assert option in done.stdout

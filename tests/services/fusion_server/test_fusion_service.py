@@ -144,15 +144,16 @@ def test_another_mission_config_is_a_mismatch_that_names_both_values() -> None:
             t.contribute_subsets(session, subset, grid=coarse)
 
 
-@pytest.mark.parametrize("name", ["", "x" * 65, "-rf", "a b", "a\nb", "a/b", "\x1b[31m", "Ünal"])
-def test_names_of_agents_and_missions_have_a_safe_alphabet(name: str) -> None:
+def test_names_of_agents_and_missions_have_a_safe_alphabet() -> None:
     with fusion_server() as t:
-        with pytest.raises(InvalidInputError, match=r"agent_id: expected 1 to 64 letters, digits and \. _ -"):
-            t.client.join(name, GRID)
-        t.client.mission_id = name
-        if name:
-            with pytest.raises(InvalidInputError, match="mission_id: expected 1 to 64 letters"):
-                t.client.join("ant", GRID)
+        for name in ("", "x" * 65, "-rf", "a b", "a\nb", "a/b", "\x1b[31m", "Ünal"):
+            t.client.mission_id = ""
+            with pytest.raises(InvalidInputError, match=r"agent_id: expected 1 to 64 letters, digits and \. _ -"):
+                t.client.join(name, GRID)
+            t.client.mission_id = name
+            if name:
+                with pytest.raises(InvalidInputError, match="mission_id: expected 1 to 64 letters"):
+                    t.client.join("ant", GRID)
 
 
 def test_a_grid_is_required() -> None:
