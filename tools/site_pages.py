@@ -30,13 +30,9 @@ PAGES = {
     "ARCHITECTURE.md": "architecture.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
-    "services/agent/README.md": "services/agent.md",
-    "services/fusion_server/README.md": "services/fusion-server.md",
-    "services/parser/README.md": "services/parser.md",
     "native/README.md": "development/kernels.md",
-    "proto/gausslite/v1/README.md": "development/messages.md",
-    "src/gausslite/codec/README.md": "development/codec.md",
-    "src/gausslite/wire/README.md": "development/wire.md",
+    "bench/results/README.md": "results/index.md",
+    **{f"bench/results/{path.name}": f"results/{path.name}" for path in (ROOT / "bench/results").glob("20*.md")},
 }
 COMMANDS_PAGE = "reference/commands.md"
 SERVICES = {

@@ -1,4 +1,4 @@
-// The compressed columns of a message's body, and what surrounds them (docs/wire.md).
+// The compressed columns of a message's body, and what surrounds them (docs/reference/wire.md).
 //
 // SPDX-License-Identifier: Apache-2.0
 #pragma once

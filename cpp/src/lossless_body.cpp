@@ -1,4 +1,4 @@
-// Decode the lossless coding: every value as a float (docs/wire.md, "Lossless").
+// Decode the lossless coding: every value as a float (docs/reference/wire.md, "Lossless").
 //
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>

@@ -1,4 +1,4 @@
-// Decode the quantised coding: one byte a value, and positions as bit fields (docs/wire.md, "Quantised").
+// Decode the quantised coding: one byte a value, and positions as bit fields (docs/reference/wire.md, "Quantised").
 //
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>

@@ -45,13 +45,13 @@ class ParserScore:
 def load_sentences(path: Path = SENTENCES) -> list[TaskGraph]:
     """Return the expected graphs, with their sentence as text, of a JSON file. Raises InvalidInputError, OSError.
 
-    The file is a list of graphs in the form of `gausslite parse --json`, with the sentence as "text" (docs/tasks.md).
+    The file is a list of graphs in the form of `gausslite parse --json`, with the sentence as "text" (docs/guides/task.md).
     """
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
         graphs = [graph_from_json({**row, "text": row["text"]}) for row in rows]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        expected = "a list of text, targets, roles, anchors and relations as in docs/tasks.md"
+        expected = "a list of text, targets, roles, anchors and relations as in docs/guides/task.md"
         raise InvalidInputError(f"{path}: expected {expected}, got other content ({error})") from error
     if not graphs:
         raise InvalidInputError(f"{path}: expected at least one sentence, got none")

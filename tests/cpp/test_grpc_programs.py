@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
     if any(shutil.which(name) is None for name in ("cmake", "g++", "protoc", "grpc_cpp_plugin")):
-        pytest.skip("no C++ build tools: see docs/cpp.md")
+        pytest.skip("no C++ build tools: see docs/reference/wire.md")
     folder = Path(os.environ.get("GAUSSLITE_CPP_BUILD", tmp_path_factory.mktemp("cpp")))
     subprocess.run(["cmake", "-S", str(ROOT / "cpp"), "-B", str(folder)], check=True)
     subprocess.run(["cmake", "--build", str(folder), "--parallel", "2"], check=True)

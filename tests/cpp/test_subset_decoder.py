@@ -1,4 +1,4 @@
-"""The C++ decoder, written from docs/wire.md, gives the Python decoder's values and refuses damaged messages."""
+"""The C++ decoder, written from docs/reference/wire.md, gives the Python decoder's values and refuses damaged messages."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def messages():
     for batch in (group_by_voxel(crowd, GRID), merge_batches(group_by_voxel(small, GRID), removed), removed):
         for coding in SubsetCoding:
             yield encode_subset(RoiSubset("ant", "s", 3, 4, batch), GRID, coding)
-    page = (ROOT / "docs" / "wire.md").read_text()
+    page = (ROOT / "docs" / "reference" / "wire.md").read_text()
     for found in re.findall(r"(?:Quantised|Lossless), \d+ bytes:\n```\n(.*?)```", page, re.DOTALL):
         yield bytes.fromhex(found)
 

@@ -57,13 +57,14 @@ def test_a_page_that_loads_from_another_host_is_found(loading: str) -> None:
 def test_readme_is_the_home_page_and_its_links_lead_to_pages(site: Path) -> None:
     home = (site / "index.html").read_text(encoding="utf-8")
     assert 'href="architecture.html"' in home
-    assert 'src="demo.jpg"' in home
-    assert "docs/demo.jpg" not in home
+    assert 'src="gain.jpg"' in home
+    assert "docs/gain.jpg" not in home
+    assert 'href="results/index.html"' in home
 
 
 def test_the_reference_has_the_public_names_and_all_commands(site: Path) -> None:
     python = (site / "reference" / "python.html").read_text(encoding="utf-8")
     commands = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     assert "Map a sequence for a task" in python
-    for heading in ("gausslite-map", "gausslite-bench-quality", "gausslite-models-source", "gausslite-agent"):
+    for heading in ("gausslite-map", "gausslite-bench-quality", "gausslite-models-inspect", "gausslite-agent"):
         assert f'id="{heading}"' in commands

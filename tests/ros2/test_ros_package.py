@@ -60,7 +60,7 @@ def test_setup_installs_every_file_and_the_entry_point_exists() -> None:
 
 
 def test_the_page_lists_every_parameter() -> None:
-    page = (PACKAGE.parents[1] / "docs" / "robots.md").read_text()
+    page = (PACKAGE.parents[1] / "docs" / "guides" / "bag.md").read_text()
     rows = [line.split("|")[1] for line in page.partition("| parameter |")[2].splitlines() if line.startswith("|")]
     listed = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert listed == set(NodeParameters.defaults())

@@ -1,4 +1,4 @@
-// Decode the subset message of docs/wire.md: voxel updates of an agent or of a fused map.
+// Decode the subset message of docs/reference/wire.md: voxel updates of an agent or of a fused map.
 //
 // SPDX-License-Identifier: Apache-2.0
 #pragma once

@@ -27,7 +27,7 @@ _HANDOVER = {"agent": None, "yes": True, "no": False}
 
 @dataclass(frozen=True, slots=True)
 class NodeParameters:
-    """Parameters by their names in ROS; docs/robots.md lists them.
+    """Parameters by their names in ROS; docs/guides/bag.md lists them.
 
     color_info, depth_info "": the camera_info beside the images. camera "": the frame of the colour images.
     transform_tolerance_s: added to the time of the published tf. drain_s 0: as the agent's options. Raises

@@ -1,4 +1,4 @@
-"""Encode task graphs as JSON values, in the form of `gausslite parse --json` (docs/tasks.md)."""
+"""Encode task graphs as JSON values, in the form of `gausslite parse --json` (docs/guides/task.md)."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Predicate(StrEnum):
 
 
 class TargetRole(StrEnum):
-    """What the robot does with a target (docs/tasks.md)."""
+    """What the robot does with a target (docs/guides/task.md)."""
 
     OBJECT = "object"
     DESTINATION = "destination"
@@ -96,7 +96,7 @@ class TaskGraph:
 
     Targets, anchors and excluded objects are names: a noun, with the suffix _2, _3, ... for a further object of that
     noun with other attributes. roles has one role per target; an empty tuple means that every target is an object.
-    excluded: objects to leave out. context: rooms and places, which locate nothing. docs/tasks.md defines all of it.
+    excluded: objects to leave out. context: rooms and places, which locate nothing. See docs/guides/task.md.
     """
 
     task_id: str

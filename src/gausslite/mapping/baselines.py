@@ -5,7 +5,7 @@ to all policies: Adam's rates (ONLINE_RATES), the density limit of seeds near th
 appearance, pose refinement, and the views to train on. With so few iterations, the released rates would lose several
 decibels. The task policy trains on the 24 most recent keyframes and 24 frames that show the ROI; the baselines train on
 the 24 most recent keyframes and 24 others, spread over the mission. Two values were tuned in the baselines' favour
-(docs/quality.md): the initial scale of MonoGS and the number of SplaTAM's seeds.
+(bench/results): the initial scale of MonoGS and the number of SplaTAM's seeds.
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "lr-decay": _without_lr_decay,
     "saturation": _without_saturation,
 }
-"""Extensions of the paper's method that can be disabled, in the order of the ablation in docs/quality.md."""
+"""Extensions of the paper's method that can be disabled, in the order of the ablation in bench/results."""
 
 ABLATION_FLAGS = (*PAPER_FLAGS, *EXTENSION_FLAGS)
 """All names that `disable` accepts."""

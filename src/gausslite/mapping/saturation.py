@@ -3,7 +3,7 @@
 The loss of an active iteration is compared with that of the previous one on the same view, so that easy and hard views
 do not mix. The improvement per visit starts above 0.1 in a new region and falls where views contradict each other. On
 real cameras, released iterations cost the region nothing. The rest of the image gains 1 to 6 dB, and poses are fitted
-to all of it (docs/quality-experiments.md).
+to all of it (bench/results).
 """
 
 from __future__ import annotations

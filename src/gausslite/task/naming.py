@@ -1,4 +1,4 @@
-"""Name the objects of a sentence: one name per noun and attributes, "mug" and "mug_2" (docs/tasks.md)."""
+"""Name the objects of a sentence: one name per noun and attributes, "mug" and "mug_2" (docs/guides/task.md)."""
 
 from __future__ import annotations
 

@@ -337,7 +337,7 @@ class GetUpdateDigestsResponse(_message.Message):
     @_builtins.property
     def hashes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """For each tile the sum, modulo 2^64, of a hash of (voxel key, update_seq) over its voxels, tombstones included.
-        docs/wire.md defines the hash.
+        docs/reference/wire.md defines the hash.
         """
 
     def __init__(

@@ -81,7 +81,7 @@ class _TargetRoleEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_TargetRole
     """Not to be hit, touched or harmed."""
 
 class TargetRole(_TargetRole, metaclass=_TargetRoleEnumTypeWrapper):
-    """What the robot does with a target. docs/tasks.md defines the whole graph."""
+    """What the robot does with a target. docs/guides/task.md defines the whole graph."""
 
 TARGET_ROLE_UNSPECIFIED: TargetRole.ValueType  # 0
 """Read as OBJECT: graphs of older parsers have no roles."""

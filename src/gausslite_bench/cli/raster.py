@@ -42,7 +42,7 @@ def configure_raster(parser: argparse.ArgumentParser) -> None:
         "--external-rasterizer",
         metavar="LIB.so",
         type=Path,
-        help="also measure this rasterizer library, interleaved with GaussLite's (docs/performance.md)",
+        help="also measure this rasterizer library, interleaved with GaussLite's (bench/results)",
     )
     shares = ",".join(f"{share:g}" for share in SHARES_PERCENT)
     add(

@@ -1,4 +1,4 @@
-"""Exit codes are those of docs/command-line.md, and a signal ends every long command with one line."""
+"""Exit codes are those of docs/reference/commands.md, and a signal ends every long command with one line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tiny_sequences import write_tum
 from gausslite.cli.main import main
 from gausslite.process.interrupts import end_quietly_while_starting
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "command-line.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "commands.md"
 ROWS = re.findall(r"^\| (\d+) \| .+ \| (?:`gausslite (.+)` )?\|$", PAGE.read_text(), re.MULTILINE)
 
 

@@ -1,4 +1,4 @@
-"""The test vectors of docs/wire.md: the format does not change without a new version."""
+"""The test vectors of docs/reference/wire.md: the format does not change without a new version."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tombstones
 from gausslite.domain.voxels import VoxelGrid
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "wire.md"
 GRID = VoxelGrid(0.1)
 
 
