@@ -100,7 +100,16 @@ def _measure(page: MapPage, browser: Any, gaussians: int, size: tuple[int, int],
     moving_fps = _drag(tab, middle_px, drag_s)
     tab.mouse.up()
     shown = int(tab.evaluate("window.newestDrawn"))
-    return ViewRate(gaussians, shown, *size, drawn_s, interactive_s, settled_s, response_s, moving_fps)
+    return ViewRate(
+        gaussians,
+        shown,
+        *size,
+        drawn_s=drawn_s,
+        interactive_s=interactive_s,
+        settled_s=settled_s,
+        response_s=response_s,
+        moving_fps=moving_fps,
+    )
 
 
 def _settled_s(tab: Any) -> float:
@@ -153,14 +162,14 @@ def _wait(tab: Any, condition: Callable[[], bool]) -> None:
 def _room(count: int) -> ViewContents:
     rows = seed_rows(count, _OPACITY)
     gaussians = Gaussians(
-        np.ascontiguousarray(rows[:, MEAN]),
-        np.ascontiguousarray(rows[:, QUAT]),
-        np.exp(rows[:, LOG_SCALE]),
-        1.0 / (1.0 + np.exp(-rows[:, OPACITY_LOGIT].reshape(-1))),
-        np.clip(rows[:, RGB], 0.0, 1.0),
-        np.zeros(count, np.bool_),
-        np.zeros(count, np.uint32),
-        np.full(count, -1, np.int16),
+        means_m=np.ascontiguousarray(rows[:, MEAN]),
+        quats_wxyz=np.ascontiguousarray(rows[:, QUAT]),
+        scales_m=np.exp(rows[:, LOG_SCALE]),
+        opacities=1.0 / (1.0 + np.exp(-rows[:, OPACITY_LOGIT].reshape(-1))),
+        rgb=np.clip(rows[:, RGB], 0.0, 1.0),
+        active=np.zeros(count, np.bool_),
+        kappa=np.zeros(count, np.uint32),
+        target=np.full(count, -1, np.int16),
     )
     view = ViewContents.of_one_agent(gaussians)
     pose = inverse(held_out_view(320, 240).T_camera_world)[None]

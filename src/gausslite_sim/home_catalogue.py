@@ -69,11 +69,11 @@ def plan_home(number: int, seed: int) -> HomePlan:
     items = home.furnish(np.random.default_rng([seed, number, _FURNITURE_STREAM]))
     used = {part.texture for item in items for part in item.parts}
     return HomePlan(
-        seed,
-        items,
-        paint(home.painters(), used, seed),
-        home.lighting,
-        tuple(spline_trajectory(keys) for keys in home.trajectories),
-        _EXPOSURE_DRIFT,
-        _SENSOR,
+        seed=seed,
+        items=items,
+        textures=paint(home.painters(), used, seed),
+        lighting=home.lighting,
+        trajectories=tuple(spline_trajectory(keys) for keys in home.trajectories),
+        exposure_drift=_EXPOSURE_DRIFT,
+        sensor=_SENSOR,
     )

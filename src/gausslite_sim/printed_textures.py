@@ -38,8 +38,8 @@ def vase_print(rng: np.random.Generator) -> Texture:
         x = round((i + 0.5) * SIDE_PX / 12)
         for turn in range(0, 360, 60):
             tip = (x + round(17 * np.cos(np.radians(turn))), 132 + round(26 * np.sin(np.radians(turn))))
-            cv2.ellipse(picture, tip, (6, 18), turn + 90, 0, 360, blue, -1, cv2.LINE_AA)
-        cv2.ellipse(picture, (x, 300), (20, 50), 0, 180, 360, (60, 110, 190), 8, cv2.LINE_AA)
+            cv2.ellipse(picture, tip, (6, 18), turn + 90, 0, 360, color=blue, thickness=-1, lineType=cv2.LINE_AA)
+        cv2.ellipse(picture, (x, 300), (20, 50), 0, 180, 360, color=(60, 110, 190), thickness=8, lineType=cv2.LINE_AA)
     return Texture(picture)
 
 
@@ -132,7 +132,7 @@ def carton(rng: np.random.Generator, colour: Colour, word: str) -> Texture:
     for x in range(56, 266, 6):
         cv2.line(picture, (x, 336), (x, 420), (16, 16, 16), int(rng.integers(1, 5)))
     for x in (350, 430):
-        cv2.arrowedLine(picture, (x, 470), (x, 326), (30, 30, 30), 12, cv2.LINE_AA, 0, 0.35)
+        cv2.arrowedLine(picture, (x, 470), (x, 326), (30, 30, 30), 12, cv2.LINE_AA, shift=0, tipLength=0.35)
     return Texture(picture)
 
 
@@ -223,7 +223,7 @@ def leaf_veins(rng: np.random.Generator) -> Texture:
 
 
 def _write(picture: Picture | ndarray, text: str, at: tuple[int, int], scale: float, ink: _Ink, weight: int) -> None:
-    cv2.putText(picture, text, at, _FONT, scale, ink, weight, cv2.LINE_AA)
+    cv2.putText(picture, text, at, _FONT, scale, ink, thickness=weight, lineType=cv2.LINE_AA)
 
 
 def _ink(values: ndarray) -> _Ink:

@@ -57,8 +57,7 @@ class RayCamera:
         self, columns: Float32[ndarray, " n"], rows: Float32[ndarray, " n"]
     ) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
         """Return the slopes of the rays through these image coordinates. Raises InvalidInputError."""
-        x = (columns - np.float32(self.camera.cx_px)) / np.float32(self.camera.fx_px)
-        y = (rows - np.float32(self.camera.cy_px)) / np.float32(self.camera.fy_px)
+        x, y = self.camera.slopes(columns, rows)
         if self.lens is not None:
             x, y = self.lens.undistort(x.astype(np.float64), y.astype(np.float64))
         return x.astype(np.float32), y.astype(np.float32)

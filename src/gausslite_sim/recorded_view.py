@@ -71,5 +71,5 @@ def _exposure_samples(camera: RecordingCamera, poses_at: PosesAt) -> int:
     first, last = poses_at(np.array([-0.5, 0.5]) * camera.exposure_s)
     T_first_last = inverse(first) @ last
     turn_rad = math.acos(min(max(0.5 * (np.trace(T_first_last[:3, :3]) - 1.0), -1.0), 1.0))
-    motion_px = camera.camera.fx_px * (turn_rad + float(np.linalg.norm(T_first_last[:3, 3])) / _NEAR_M)
+    motion_px = camera.camera.angle_px(turn_rad + float(np.linalg.norm(T_first_last[:3, 3])) / _NEAR_M)
     return min(2 * math.ceil(0.5 * motion_px / _SAMPLE_STEP_PX) + 1, _MAX_SAMPLES)

@@ -28,8 +28,8 @@ def keys(rng: np.random.Generator) -> Texture:
                 SMALL_FONT,
                 0.9,
                 (215, 215, 220),
-                2,
-                cv2.LINE_AA,
+                thickness=2,
+                lineType=cv2.LINE_AA,
             )
     return Texture(picture)
 
@@ -40,11 +40,13 @@ def code_screen(rng: np.random.Generator) -> Texture:
     cv2.rectangle(picture, (0, 0), (110, SIDE_PX), (34, 37, 50), -1)
     inks = ((120, 180, 240), (230, 150, 110), (150, 210, 130), (214, 214, 220), (200, 130, 220))
     for y in range(24, 508, 21):
-        cv2.putText(picture, any_word(rng), (8, y), SMALL_FONT, 0.5, (150, 155, 170), 1, cv2.LINE_AA)
+        cv2.putText(picture, any_word(rng), (8, y), SMALL_FONT, 0.5, (150, 155, 170), thickness=1, lineType=cv2.LINE_AA)
         x = 124 + 24 * int(rng.integers(0, 4))
         while x < 430 and rng.random() < 0.86:
             word = any_word(rng)
-            cv2.putText(picture, word, (x, y), SMALL_FONT, 0.56, inks[int(rng.integers(5))], 2, cv2.LINE_AA)
+            cv2.putText(
+                picture, word, (x, y), SMALL_FONT, 0.56, inks[int(rng.integers(5))], thickness=2, lineType=cv2.LINE_AA
+            )
             x += 13 * len(word) + 8
     return Texture(picture, gloss=0.14)
 
@@ -53,7 +55,7 @@ def slide_screen(rng: np.random.Generator) -> Texture:
     """A slide with a title, bars and bullet points."""
     picture = np.full((SIDE_PX, SIDE_PX, 3), (238, 240, 244), np.uint8)
     cv2.rectangle(picture, (0, 0), (SIDE_PX, 84), (30, 62, 110), -1)
-    cv2.putText(picture, "QUARTER 3", (24, 62), FONT, 2.0, (250, 250, 250), 5, cv2.LINE_AA)
+    cv2.putText(picture, "QUARTER 3", (24, 62), FONT, 2.0, (250, 250, 250), thickness=5, lineType=cv2.LINE_AA)
     for i in range(6):
         top = int(rng.integers(150, 400))
         cv2.rectangle(picture, (30 + 40 * i, top), (58 + 40 * i, 450), ink_of(rng.integers(40, 220, 3)), -1)
@@ -92,7 +94,7 @@ def clock_face(rng: np.random.Generator) -> Texture:
     for hour in range(1, 13):
         a = np.pi * hour / 6
         at = (round(236 + 180 * np.sin(a)) - 14 * (hour > 9), round(272 - 180 * np.cos(a)))
-        cv2.putText(picture, str(hour), at, FONT, 1.7, DARK_INK, 5, cv2.LINE_AA)
+        cv2.putText(picture, str(hour), at, FONT, 1.7, DARK_INK, thickness=5, lineType=cv2.LINE_AA)
     for k in range(60):
         a = np.pi * k / 30
         ends = [(round(256 + r * np.sin(a)), round(256 - r * np.cos(a))) for r in (228, 246)]
@@ -116,8 +118,8 @@ def whiteboard(rng: np.random.Generator) -> Texture:
             cv2.FONT_HERSHEY_SCRIPT_SIMPLEX,
             0.9,
             pens[i],
-            2,
-            cv2.LINE_AA,
+            thickness=2,
+            lineType=cv2.LINE_AA,
         )
         cv2.arrowedLine(picture, (low[0] + 86, low[1] + 30), (low[0] + 118, low[1] + 34), pens[3], 3, cv2.LINE_AA)
     cv2.polylines(
@@ -127,7 +129,16 @@ def whiteboard(rng: np.random.Generator) -> Texture:
         cv2.arrowedLine(picture, *ends, pens[3], 4, cv2.LINE_AA)
     for y in range(240, 480, 34):
         text = " ".join(any_word(rng) for _ in range(2))
-        cv2.putText(picture, text, (290, y), cv2.FONT_HERSHEY_SCRIPT_SIMPLEX, 1.0, pens[(y // 34) % 4], 2, cv2.LINE_AA)
+        cv2.putText(
+            picture,
+            text,
+            (290, y),
+            cv2.FONT_HERSHEY_SCRIPT_SIMPLEX,
+            1.0,
+            pens[(y // 34) % 4],
+            thickness=2,
+            lineType=cv2.LINE_AA,
+        )
     cv2.rectangle(picture, (0, 0), (SIDE_PX - 1, SIDE_PX - 1), (150, 152, 156), 12)
     return Texture(picture, gloss=0.15)
 

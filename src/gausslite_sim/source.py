@@ -71,9 +71,8 @@ class SimulatedHome:
     def __init__(self, settings: HomeSettings, up_axis: UpAxis | None = None) -> None:
         require_ray_caster()
         width, height = settings.size_px
-        focal = _FOCAL_PER_WIDTH * width
         self._settings = settings
-        self._camera = Camera(focal, focal, width / 2, height / 2, width, height)
+        self._camera = Camera.centred(_FOCAL_PER_WIDTH * width, width, height)
         self._up_axis = unit_up_axis(up_axis or (0.0, 0.0, 1.0))
 
     @property

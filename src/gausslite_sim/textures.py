@@ -106,7 +106,7 @@ def wallpaper(rng: np.random.Generator, ground: Colour, motif: Colour) -> Textur
                     centre[0] + round(26 * np.sin(np.radians(turn))),
                     centre[1] - round(26 * np.cos(np.radians(turn))),
                 )
-                cv2.ellipse(mask, tip, (9, 26), turn, 0, 360, 255, -1, cv2.LINE_AA)
+                cv2.ellipse(mask, tip, (9, 26), turn, 0, 360, color=255, thickness=-1, lineType=cv2.LINE_AA)
             cv2.line(mask, centre, (centre[0], centre[1] + 34), 255, 4, cv2.LINE_AA)
     alpha = (mask / 255.0)[..., None]
     veins = tint(shade * (0.9 + 0.2 * (y % 6 < 2)), motif)

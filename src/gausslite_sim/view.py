@@ -86,7 +86,7 @@ def _shade(
     """Return the shaded colour of each hit, black without a hit, and |cos| of the incidence."""
     facing = facing_of(scene, hits, rays.directions)
     # geometric mean of the pixel's footprints across and along the slope
-    pixel_m = hits.distance / np.float32(camera.camera.fx_px) / np.sqrt(np.maximum(facing, 0.05))
+    pixel_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(np.maximum(facing, 0.05))
     rgb = diffuse_colour(scene, hits, pixel_m)
     if mirror > 0:
         add_reflections(scene, rgb, hits, rays.directions, rays.origins_m, mirror)

@@ -15,9 +15,9 @@ from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.frame_stream import FrameStream, region_file_note
 from gausslite.mission.results import prepare_file, prepare_folder
 from gausslite.mission.settings import SceneInfo
+from gausslite.process.siblings import Sibling, sibling
 from gausslite.task.parser import TaskParser
 from gausslite.task.rules import RuleParser
-from gausslite.view.live_page import own_page
 from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.process import run_service
@@ -101,7 +101,9 @@ async def _serve(settings: AgentSettings) -> int:
         can_detect = stream is not None or settings.perception.model is not None
         mission = AgentMission(settings, worker, first_parser, resumed, can_detect)
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
-        stack.enter_context(own_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
+        if settings.view is not None:
+            live = sibling(Sibling.LIVE_PAGE)
+            stack.enter_context(live.own_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
         run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
         lost = mission.describe_lost_data()

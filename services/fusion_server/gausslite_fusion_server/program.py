@@ -8,6 +8,7 @@ import secrets
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from gausslite.fusion.joint_refinement import rasterizer_of_backend
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.view.live_page import own_page
+from gausslite.process.siblings import Sibling, sibling
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
@@ -116,7 +117,10 @@ async def _serve_mission(
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
             servicer.drain()
 
-    page = own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
+    page: AbstractContextManager[None] = nullcontext()
+    if settings.view is not None:
+        live = sibling(Sibling.LIVE_PAGE)
+        page = live.own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
     with metrics_server(settings.metrics, engine), page:
         await serve_until_stopped(
             settings.listen, [servicer.service()], work_until_stopped, settings.tls, settings.limits, settings.health

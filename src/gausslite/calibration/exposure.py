@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.calibration.view_residuals import (
+from gausslite.calibration.alignment import (
     MIN_PIXELS,
+    NormalEquations,
     comparable_pixels,
     independent_share,
+    robust_weights,
     shrinkage,
-    solve_with_prior,
 )
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
@@ -61,8 +62,9 @@ def fit_exposure(rendering: Rendering, frame: Frame, prior: PoseExposurePrior) -
     residual = _blurred(frame.rgb.astype(np.float32) / np.float32(255.0))[pixels] - model
     prior_std, gain, offset = np.array([prior.gain, prior.offset]), np.ones(3), np.zeros(3)
     for channel in range(3):
-        jacobian = np.stack([model[:, channel], np.ones(len(model))], axis=1)
-        change = solve_with_prior(jacobian, residual[:, channel], np.zeros(2), prior_std, independent_share(rendering))
+        jacobian = -np.stack([model[:, channel], np.ones(len(model))], axis=1)
+        weights = independent_share(rendering) * robust_weights(residual[:, channel])
+        change = NormalEquations.of(jacobian, residual[:, channel], weights).solve(np.zeros(2), prior_std)
         gain[channel] += change[0] * shrinkage(prior.gain, _FIT_GAIN_STD)
         offset[channel] += change[1] * shrinkage(prior.offset, _FIT_OFFSET_STD)
     return AffineExposure(gain, offset)

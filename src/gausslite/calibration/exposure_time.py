@@ -157,19 +157,16 @@ def _points(frame: Frame) -> Float64[ndarray, "h w 3"]:
     known = frame.depth_m > 0
     z_m = np.where(known, frame.depth_m, np.median(frame.depth_m[known])).astype(np.float64)
     camera = frame.camera
-    x = ((np.arange(camera.width_px) + 0.5 - camera.cx_px) / camera.fx_px)[None, :]
-    y = ((np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px)[:, None]
-    return np.stack([x * z_m, y * z_m, z_m], axis=2)
+    x, y = camera.slopes(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    return np.stack([x[None, :] * z_m, y[:, None] * z_m, z_m], axis=2)
 
 
 def _image_motion(points: Float64[ndarray, "h w 3"], camera: Camera, twist: Twist) -> Float32[ndarray, "h w 2"]:
     """Return the image velocity of points in the camera's axes, in pixels per second."""
     z_m = np.maximum(points[..., 2], 1e-2)
-    velocity = -(np.cross(twist.angular_rad_s, points) + twist.linear_m_s) / z_m[..., None]
-    x, y = points[..., 0] / z_m, points[..., 1] / z_m
-    u = camera.fx_px * (velocity[..., 0] - x * velocity[..., 2])
-    v = camera.fy_px * (velocity[..., 1] - y * velocity[..., 2])
-    return np.stack([u, v], axis=2).astype(np.float32)
+    rate = -(np.cross(twist.angular_rad_s, points) + twist.linear_m_s) / z_m[..., None]
+    motion_px_s = camera.pixels_per_s(points[..., 0] / z_m, points[..., 1] / z_m, rate)
+    return np.stack(motion_px_s, axis=2).astype(np.float32)
 
 
 def _blur(image: Image, motion_px: Float32[ndarray, "h w 2"]) -> Image:

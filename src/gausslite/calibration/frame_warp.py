@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.calibration.view_residuals import MAX_RELATIVE_DEPTH_ERROR
+from gausslite.calibration.alignment import MAX_RELATIVE_DEPTH_ERROR
 from gausslite.datasets.registered_source import register_depth
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
@@ -36,8 +36,8 @@ class FrameWarp:
         depth_m = register_depth(frame.depth_m, frame.camera, other.camera, T_other_frame)
         points = transform_points(inverse(T_other_frame), back_project(depth_m, other.camera).reshape(-1, 3))
         z_m = np.maximum(points[:, 2], NEAR_M)
-        columns = (points[:, 0] / z_m * frame.camera.fx_px + frame.camera.cx_px - 0.5).astype(np.float32)
-        rows = (points[:, 1] / z_m * frame.camera.fy_px + frame.camera.cy_px - 0.5).astype(np.float32)
+        # pixel centres at integers, as in cv2.remap
+        columns, rows = (axis - 0.5 for axis in frame.camera.pixels(points[:, 0] / z_m, points[:, 1] / z_m))
         columns, rows, z_m = (values.reshape(depth_m.shape) for values in (columns, rows, z_m))
         depth_error_m = np.abs(cv2.remap(frame.depth_m, columns, rows, cv2.INTER_NEAREST) - z_m)
         alpha = ((depth_m > 0) & (depth_error_m < MAX_RELATIVE_DEPTH_ERROR * depth_m)).astype(np.float32)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
+from gausslite.domain.camera import lift
 from gausslite.domain.frame import Frame
 
 _JUMP_M, _JUMP_SHARE = 0.06, 0.05
@@ -41,9 +41,9 @@ class ColourGradients:
 def depth_edges(frame: Frame) -> DepthEdges:
     """Return points on pixel borders where depth jumps, at the smaller of both depths."""
     rows, columns, z_m = _jumps(frame.depth_m)
-    along_rows = _lift(columns + 1.0, rows + 0.5, z_m, frame.camera)
+    along_rows = lift(np.stack([columns + 1.0, rows + 0.5], axis=1), z_m, frame.camera)
     columns, rows, z_m = _jumps(np.ascontiguousarray(frame.depth_m.T))
-    return DepthEdges(along_rows, _lift(columns + 0.5, rows + 1.0, z_m, frame.camera))
+    return DepthEdges(along_rows, lift(np.stack([columns + 0.5, rows + 1.0], axis=1), z_m, frame.camera))
 
 
 def _jumps(depth_m: Float32[ndarray, "h w"]) -> tuple[ndarray, ndarray, Float64[ndarray, " n"]]:
@@ -64,13 +64,6 @@ def _fill_occlusions(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"
     after = np.minimum.accumulate(np.where(valid, columns, 2 * width)[:, ::-1], axis=1)[:, ::-1]
     ends = [np.take_along_axis(depth_m, np.clip(end, 0, width - 1), axis=1) for end in (before, after)]
     return np.where(~valid & (after - before <= _MAX_GAP_PX), np.maximum(*ends), depth_m)
-
-
-def _lift(
-    u_px: Float64[ndarray, " n"], v_px: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], camera: Camera
-) -> Float64[ndarray, "n 3"]:
-    x_m, y_m = (u_px - camera.cx_px) / camera.fx_px * z_m, (v_px - camera.cy_px) / camera.fy_px * z_m
-    return np.stack([x_m, y_m, z_m], axis=1)
 
 
 def relative_gradients(rgb: UInt8[ndarray, "h w 3"], blur_px: float) -> ColourGradients:

@@ -16,22 +16,21 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.frame_warp import FrameWarp
-from gausslite.calibration.luminance_alignment import (
-    LuminancePair,
-    blurred_luminance,
-    linearise,
-    sample_bilinear,
-    with_gradients,
-)
-from gausslite.calibration.moving_pairs import MIN_COMPARABLE_SHARE, MovingPairs
-from gausslite.calibration.view_residuals import (
+from gausslite.calibration.alignment import (
     MAX_PIXELS,
     OPAQUE_ALPHA,
+    NormalEquations,
+    VisiblePoints,
+    blurred_luminance,
     comparable_pixels,
     independent_share,
+    luminance_residuals,
+    rendered_luminance,
     robust_weights,
+    with_gradients,
 )
+from gausslite.calibration.frame_warp import FrameWarp
+from gausslite.calibration.moving_pairs import MIN_COMPARABLE_SHARE, MovingPairs
 from gausslite.datasets.camera_correction import correct_frame, recorded_pixels
 from gausslite.domain.camera import back_project
 from gausslite.domain.camera_correction import CameraCorrection
@@ -217,34 +216,35 @@ def _pair_system(pair: tuple[int, int], first: _View, second: _View, poses: _Pai
     if len(pixels) < MIN_COMPARABLE_SHARE * min(warped.alpha.size, MAX_PIXELS):
         return []
     camera, T_camera_stated = second.frame.camera, poses.T_camera_stated[pair]
-    images = LuminancePair.of(warped, second.frame, pixels, second.blur_px)
     points = back_project(warped.expected_depth_m(OPAQUE_ALPHA), camera).reshape(-1, 3)[pixels]
-    linear = linearise(images, points, T_camera_stated, camera)
+    visible = VisiblePoints.of(points.astype(np.float64), T_camera_stated, camera)
+    [model] = rendered_luminance(warped.rgb, pixels[visible.index], (second.blur_px,))
+    photograph = with_gradients(blurred_luminance(second.frame.rgb, second.blur_px))
+    by_pair, residual = luminance_residuals(model, photograph, visible, camera)
     count = first.derivatives.shape[2]
-    of_first = warp.apply(first.derivatives).reshape(-1, count)[pixels][linear.is_inside]
-    shared = sample_bilinear(second.derivatives, linear.pixels) - of_first
-    jacobian = np.hstack([linear.jacobian, shared])
-    weighted = jacobian * (robust_weights(linear.residual) * independent_share(warped))[:, None]
+    of_first = warp.apply(first.derivatives).reshape(-1, count)[pixels[visible.index]]
+    jacobian = np.hstack([by_pair, visible.sample(second.derivatives) - of_first])
+    equations = NormalEquations.of(jacobian, residual, robust_weights(residual) * independent_share(warped))
     offset_twist = _offset_twist(first, second)
     # the deviation of the pose from the stated one, which the offset moves, has the prior's precision
     deviation_by = np.hstack([np.eye(6), np.zeros((6, 2 + count))])
     deviation_by[:, 8 + _OFFSET] = -offset_twist
     weighted_prior = deviation_by.T * poses.precision
-    information = weighted.T @ jacobian + weighted_prior @ deviation_by
-    vector = -weighted.T @ linear.residual - weighted_prior @ twist_of(T_camera_stated)
+    information = equations.information + weighted_prior @ deviation_by
+    vector = equations.gradient - weighted_prior @ twist_of(T_camera_stated)
     # a weak prior of the pair's gain and offset
     information[[6, 7], [6, 7]] += 1.0
     covariance = np.linalg.inv(information[:8, :8])
     slope, gain = covariance @ information[:8, 8:], covariance @ vector[:8]
     return [
         _PairSystem(
-            pair,
-            information[8:, 8:] - information[8:, :8] @ slope,
-            vector[8:] - information[8:, :8] @ gain,
-            gain,
-            slope,
-            covariance,
-            offset_twist,
+            pair=pair,
+            information=information[8:, 8:] - information[8:, :8] @ slope,
+            vector=vector[8:] - information[8:, :8] @ gain,
+            gain=gain,
+            slope=slope,
+            covariance=covariance,
+            offset_twist=offset_twist,
         )
     ]
 

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from gausslite.calibration.alignment import MAX_PIXELS, comparable_pixels, fit_pose, luminance_residual
 from gausslite.calibration.frame_warp import warp_into
-from gausslite.calibration.pose_fit import fit_pose, luminance_residual
-from gausslite.calibration.view_residuals import MAX_PIXELS, comparable_pixels
 from gausslite.datasets.camera_correction import correct_frame
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source

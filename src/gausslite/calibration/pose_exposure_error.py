@@ -13,10 +13,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy import ndarray
 
+from gausslite.calibration.alignment import comparable_pixels, fit_pose
 from gausslite.calibration.exposure import fit_exposure
 from gausslite.calibration.frame_warp import warp_into
-from gausslite.calibration.pose_fit import fit_pose
-from gausslite.calibration.view_residuals import comparable_pixels
 from gausslite.datasets.corrected_source import CorrectedSource
 from gausslite.datasets.selection import downscaled_size
 from gausslite.datasets.source import Source

@@ -20,8 +20,8 @@ from numpy import ndarray
 from gausslite.calibration.image_edges import ColourGradients, DepthEdges, depth_edges, relative_gradients
 from gausslite.datasets.selection import select_frames
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import Camera
-from gausslite.domain.depth_registration import DepthRegistration, FileIntrinsics
+from gausslite.domain.camera import Camera, FileIntrinsics
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
@@ -154,10 +154,11 @@ def _registration_of(candidate: Float64[ndarray, "6"], depth_camera: Camera, ref
     offset would compensate each other.
     """
     zoom, shift_x_px, shift_y_px, offset_x_m, offset_y_m, roll_deg = candidate.tolist()
-    fx, fy = depth_camera.fx_px * zoom, depth_camera.fy_px * zoom
-    cx = depth_camera.cx_px - 0.5 + shift_x_px - fx * offset_x_m / reference_m
-    cy = depth_camera.cy_px - 0.5 + shift_y_px - fy * offset_y_m / reference_m
-    intrinsics = FileIntrinsics(round(fx, 2), round(fy, 2), round(cx, 2), round(cy, 2))
+    zoomed = depth_camera.zoomed(zoom)
+    cx, cy = zoomed.pixels(-offset_x_m / reference_m, -offset_y_m / reference_m)
+    intrinsics = FileIntrinsics(
+        round(zoomed.fx_px, 2), round(zoomed.fy_px, 2), round(cx - 0.5 + shift_x_px, 2), round(cy - 0.5 + shift_y_px, 2)
+    )
     return DepthRegistration(
         intrinsics, (round(offset_x_m, 4), round(offset_y_m, 4), 0.0), (0.0, 0.0, round(roll_deg, 3))
     )
@@ -220,9 +221,9 @@ def _sample(
 ) -> Float32[ndarray, " k"]:
     """Return bilinear values of the image at the projected points; points outside the image are dropped."""
     points = transform_points(registration.extrinsics(), points)
-    k, z_m = registration.intrinsics, points[:, 2]
-    columns = (points[:, 0] / z_m * k.fx + k.cx).astype(np.float32)
-    rows = (points[:, 1] / z_m * k.fy + k.cy).astype(np.float32)
+    camera, z_m = registration.camera(image.shape[1], image.shape[0]), points[:, 2]
+    # pixel centres at integers, as in cv2.remap
+    columns, rows = ((axis - 0.5).astype(np.float32) for axis in camera.pixels(points[:, 0] / z_m, points[:, 1] / z_m))
     inside = (columns >= 0) & (columns <= image.shape[1] - 1) & (rows >= 0) & (rows <= image.shape[0] - 1)
     return _bilinear(image, columns[inside], rows[inside])
 

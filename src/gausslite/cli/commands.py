@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 from collections.abc import Collection
+from importlib import import_module
 
 from gausslite.config.command_parser import CommandParser
+from gausslite.process.siblings import Sibling, sibling
 
 SUMMARIES = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",
@@ -30,7 +31,7 @@ SUMMARIES = {
     "doctor": "check the machine and the installation: CPU, GPU, memory, disk, clock, ports, models, extras",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }
-_MODULES = {name: f"gausslite.cli.{name}_command" for name in SUMMARIES} | {"bench": "gausslite_bench.cli.main"}
+_SIBLINGS = {"report": Sibling.REPORT_COMMAND, "view": Sibling.VIEW_COMMAND, "bench": Sibling.BENCH_COMMAND}
 
 
 class _PrintVersion(argparse.Action):
@@ -54,5 +55,7 @@ def build_parser(configured: Collection[str] = tuple(SUMMARIES)) -> argparse.Arg
     for name, summary in SUMMARIES.items():
         command = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
         if name in configured:
-            importlib.import_module(_MODULES[name]).configure(command)
+            of_sibling = _SIBLINGS.get(name)
+            module = import_module(f"gausslite.cli.{name}_command") if of_sibling is None else sibling(of_sibling)
+            module.configure(command)
     return parser

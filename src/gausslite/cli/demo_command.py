@@ -44,8 +44,7 @@ from gausslite.mission.build import open_models
 from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import prepare_folder, require_writable, write_json
 from gausslite.process.messages import print_message
-from gausslite.report.page import PAGE, write_page
-from gausslite.report.run_results import read_results
+from gausslite.process.siblings import Sibling, sibling
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -110,8 +109,8 @@ def run(options: argparse.Namespace) -> int:
     write_json(options.out / "report.json", report)
     _write_pictures(options.out / "pictures", result)
     print(report_tables(agents, result.scores, scenario.fit_views))
-    write_page(options.out / PAGE, read_results([options.out]))
-    print(f"maps and pictures are in {options.out}; {options.out / PAGE} shows them")
+    sibling(Sibling.REPORT).write_report(options.out / REPORT_PAGE, [options.out])
+    print(f"maps and pictures are in {options.out}; {options.out / REPORT_PAGE} shows them")
     return 0
 
 
@@ -121,9 +120,7 @@ def _page(options: argparse.Namespace, fusion_address: str) -> Iterator[None]:
     if options.view is None:
         yield
         return
-    from gausslite.view.live_page import live_page
-
-    with live_page(options.view, fusion_address, is_agent=False) as url:
+    with sibling(Sibling.LIVE_PAGE).live_page(options.view, fusion_address, is_agent=False) as url:
         print_message(f"the page is at {url}")
         yield
 

@@ -56,6 +56,7 @@ from gausslite.mission.task_schedule import ScheduledTaskMapper, TaskSchedule
 from gausslite.mission.timeline import Timeline
 from gausslite.process.interrupts import DeferredInterrupt
 from gausslite.process.messages import print_message
+from gausslite.process.siblings import Sibling, sibling
 from gausslite.render.choose import choose_rasterizer
 
 _NOT_RESUMED = -1
@@ -285,10 +286,9 @@ def _view(
     """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
     if port is None:
         return nullcontext(lambda _outcome: None)
-    # the page needs an extra
-    from gausslite.view.mission_view import mission_view
-
-    return mission_view(port, mapper, task_at)
+    page: AbstractContextManager[Callable[[FrameOutcome], None]]
+    page = sibling(Sibling.MISSION_PAGE).mission_view(port, mapper, task_at)
+    return page
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str:

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 
 from gausslite.config.paths import read_path
-from gausslite.mission.results import as_text, prepare_folder
+from gausslite.mission.results import REPORT_PAGE, as_text, prepare_folder
 from gausslite.process.messages import print_message
-from gausslite.report.page import PAGE, require_replaceable, write_page
+from gausslite.report.page import require_replaceable, write_page
 from gausslite.report.run_results import read_results
 
 
@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE",
         type=read_path,
-        help=f"the page; an earlier report is replaced (default: RUN/{PAGE}, ./{PAGE} for several runs)",
+        help=f"the page; an earlier report is replaced (default: RUN/{REPORT_PAGE}, ./{REPORT_PAGE} for several runs)",
     )
     add("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read the runs and write the page. Raises MapFileError for a folder without a run, StorageError."""
-    out = options.out or (options.runs[0] / PAGE if len(options.runs) == 1 else Path(PAGE))
+    out = options.out or (options.runs[0] / REPORT_PAGE if len(options.runs) == 1 else Path(REPORT_PAGE))
     contents = read_results(options.runs)
     for note in (note for each in contents.runs for note in each.notes):
         print_message(note)

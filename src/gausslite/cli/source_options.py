@@ -9,7 +9,6 @@ from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues,
 from gausslite.config.source_options import add_frames
 from gausslite.config.values import NONE, read_names, read_numbers
 from gausslite.datasets.open import open_source
-from gausslite.datasets.ros.bag_source import BagSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
@@ -18,6 +17,7 @@ from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
 from gausslite.mission.frame_stream import region_file_note
 from gausslite.process.messages import print_message
+from gausslite.process.siblings import Sibling, sibling
 
 
 def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> None:
@@ -37,7 +37,7 @@ def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True)
     Raises DatasetError, InvalidInputError.
     """
     source = open_source(spec, up_axis, require_poses=require_poses)
-    if isinstance(source, BagSource):
+    if isinstance(source, sibling(Sibling.BAGS).BagSource):
         print_message(f"{spec}: {source.description}")
     if source.excluded_frames:
         print_message(f"{spec}: {source.excluded_frames}")

@@ -42,7 +42,16 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
     keys, offsets = decode_voxels(raw[:3], layout)
     active, kappa, target = decode_labels(raw[-3:])
     means_m, quats_wxyz, scales_m, opacities, rgb = (each.astype(np.float32) for each in raw[3:-3])
-    gaussians = Gaussians(means_m, quats_wxyz, scales_m, opacities, rgb, active, kappa, target)
+    gaussians = Gaussians(
+        means_m=means_m,
+        quats_wxyz=quats_wxyz,
+        scales_m=scales_m,
+        opacities=opacities,
+        rgb=rgb,
+        active=active,
+        kappa=kappa,
+        target=target,
+    )
     require_encodable(gaussians)
     batch = VoxelBatch(keys, decode_kappa_sums(raw[:3], gaussians, offsets), raw[2].astype(np.uint32), gaussians)
     if not _are_inside(batch, grid):

@@ -71,14 +71,14 @@ def object_from_json(value: Mapping[str, Any]) -> ObjectLandmark:
         x, y, z = (float(each) for each in value["centroid_m"])
         low, high = ([float(each) for each in value[name]] for name in ("min_m", "max_m"))
         return ObjectLandmark(
-            str(value["id"]),
-            str(value["noun"]),
-            ObjectRole(value["role"]),
-            (x, y, z),
-            AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2])),
-            float(value["confidence"]),
-            int(value["first_seen_ns"]),
-            int(value["last_seen_ns"]),
+            object_id=str(value["id"]),
+            noun=str(value["noun"]),
+            role=ObjectRole(value["role"]),
+            centroid_m=(x, y, z),
+            extent_m=AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+            confidence=float(value["confidence"]),
+            first_seen_ns=int(value["first_seen_ns"]),
+            last_seen_ns=int(value["last_seen_ns"]),
         )
     except (KeyError, TypeError, ValueError, IndexError, GaussLiteError) as error:
         raise CodecError(f"object: expected the JSON of a landmark, got other values ({error})") from error

@@ -122,14 +122,14 @@ def gaussians_from_ply(data: bytes) -> Gaussians:
 def _to_gaussians(raw: dict[str, NDArray[Any]], count: int) -> Gaussians:
     logits = np.clip(raw["opacity"].astype(np.float64), -60, 60)
     return Gaussians(
-        _stack(raw, _POSITIONS),
-        _stack(raw, _ROTATIONS),
-        np.exp(_stack(raw, _SCALES)),
-        (1 / (1 + np.exp(-logits))).astype(np.float32),
-        _stack(raw, _COLOURS) * np.float32(SH_C0) + np.float32(0.5),
-        raw.get("active", np.zeros(count)) != 0,
-        _to_integers(raw.get("kappa", np.zeros(count)), np.uint32),
-        _to_integers(raw.get("target", np.full(count, NO_TARGET)), np.int16),
+        means_m=_stack(raw, _POSITIONS),
+        quats_wxyz=_stack(raw, _ROTATIONS),
+        scales_m=np.exp(_stack(raw, _SCALES)),
+        opacities=(1 / (1 + np.exp(-logits))).astype(np.float32),
+        rgb=_stack(raw, _COLOURS) * np.float32(SH_C0) + np.float32(0.5),
+        active=raw.get("active", np.zeros(count)) != 0,
+        kappa=_to_integers(raw.get("kappa", np.zeros(count)), np.uint32),
+        target=_to_integers(raw.get("target", np.full(count, NO_TARGET)), np.int16),
     )
 
 

@@ -84,14 +84,14 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
     cells = positions.decode_positions(lengths, packed, bits, starts, layout.precision.coarse_bits)
     active, kappa, target = decode_labels(labels)
     gaussians = Gaussians(
-        positions.centres_of(cells, np.repeat(grid.indices(keys), counts, axis=0), bits, grid),
-        columns.decode_quats(largest, np.stack(rest[:3], axis=1), steps),
-        columns.decode_scales(scales),
-        columns.decode_opacities(rest[3]),
-        columns.decode_rgb(decode_differences(np.stack(rest[4:], axis=1))),
-        active,
-        kappa,
-        target,
+        means_m=positions.centres_of(cells, np.repeat(grid.indices(keys), counts, axis=0), bits, grid),
+        quats_wxyz=columns.decode_quats(largest, np.stack(rest[:3], axis=1), steps),
+        scales_m=columns.decode_scales(scales),
+        opacities=columns.decode_opacities(rest[3]),
+        rgb=columns.decode_rgb(decode_differences(np.stack(rest[4:], axis=1))),
+        active=active,
+        kappa=kappa,
+        target=target,
     )
     return VoxelBatch(keys, decode_kappa_sums(of_voxels, gaussians, offsets), raw[2].astype(np.uint32), gaussians)
 

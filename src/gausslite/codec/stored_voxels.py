@@ -125,14 +125,14 @@ def _decode(
     voxel = np.repeat(grid.indices(keys), counts, axis=0)
     scales, packed, label = codes["scales"], codes["largest_and_opacity"], codes["active_and_target"]
     return Gaussians(
-        positions.points_of(codes["fractions"], voxel, grid),
-        columns.decode_quats(packed >> _OPACITY_BITS, codes["quats"], columns.quat_steps(scales)),
-        columns.decode_scales(scales),
-        columns.decode_opacities(packed & (1 << _OPACITY_BITS) - 1),
-        columns.decode_rgb(codes["rgb"]),
-        (label >> _TARGET_BITS).astype(np.bool_),
-        codes["kappa"].astype(np.uint32),
-        (label & (1 << _TARGET_BITS) - 1).astype(np.int16) - np.int16(1),
+        means_m=positions.points_of(codes["fractions"], voxel, grid),
+        quats_wxyz=columns.decode_quats(packed >> _OPACITY_BITS, codes["quats"], columns.quat_steps(scales)),
+        scales_m=columns.decode_scales(scales),
+        opacities=columns.decode_opacities(packed & (1 << _OPACITY_BITS) - 1),
+        rgb=columns.decode_rgb(codes["rgb"]),
+        active=(label >> _TARGET_BITS).astype(np.bool_),
+        kappa=codes["kappa"].astype(np.uint32),
+        target=(label & (1 << _TARGET_BITS) - 1).astype(np.int16) - np.int16(1),
     )
 
 

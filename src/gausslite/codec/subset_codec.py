@@ -159,7 +159,15 @@ def _open_envelope(data: bytes, limits: CodecLimits) -> tuple[_Envelope, bytes]:
         raise CodecError(f"subset: declares {body_start + body_bytes + _TRAILER.size} bytes, got {len(data)}")
     layout = BodyLayout(voxels, gaussians, kappa_bytes, target_bytes, PositionPrecision(coarse_bits, scale_code))
     agent, session = data[_HEADER.size : session_start], data[session_start:body_start]
-    envelope = _Envelope(SubsetCoding(coding), layout, size_m, message_seq, update_seq, agent, session)
+    envelope = _Envelope(
+        coding=SubsetCoding(coding),
+        layout=layout,
+        size_m=size_m,
+        message_seq=message_seq,
+        update_seq=update_seq,
+        agent=agent,
+        session=session,
+    )
     return envelope, data[body_start : -_TRAILER.size]
 
 

@@ -33,16 +33,16 @@ def graph_from_json(value: Mapping[str, Any]) -> TaskGraph:
     if unknown:
         raise ValueError(f"roles: expected targets, got {', '.join(sorted(map(str, unknown)))}")
     return TaskGraph(
-        str(value.get("task_id", "")),
-        str(value.get("text", "")),
-        targets,
-        _names(value.get("anchors", ())),
-        tuple(_relation_from_json(each) for each in value.get("relations", ())),
-        _names(value.get("warnings", ())),
-        tuple(TargetRole(roles.get(target, TargetRole.OBJECT)) for target in targets),
-        tuple(_attributes_from_json(name, each) for name, each in value.get("attributes", {}).items()),
-        _names(value.get("excluded", ())),
-        _names(value.get("context", ())),
+        task_id=str(value.get("task_id", "")),
+        text=str(value.get("text", "")),
+        targets=targets,
+        anchors=_names(value.get("anchors", ())),
+        relations=tuple(_relation_from_json(each) for each in value.get("relations", ())),
+        warnings=_names(value.get("warnings", ())),
+        roles=tuple(TargetRole(roles.get(target, TargetRole.OBJECT)) for target in targets),
+        attributes=tuple(_attributes_from_json(name, each) for name, each in value.get("attributes", {}).items()),
+        excluded=_names(value.get("excluded", ())),
+        context=_names(value.get("context", ())),
     )
 
 

@@ -38,18 +38,12 @@ def ideal_camera(camera: Camera, correction: CameraCorrection, angular_speed_rad
     if correction.lens is not None and not correction.lens.is_identity:
         camera = _undistorted(camera, correction.lens)
     swing_rad = 0.5 * abs(correction.readout_s) * angular_speed_rad_s
-    margin_px = math.ceil(swing_rad * max(camera.fx_px, camera.fy_px))
+    width_px, height_px = camera.width_px, camera.height_px
+    margin_px = math.ceil(camera.length_px(swing_rad, 1.0))
     if margin_px == 0:
         return camera
-    zoom_x = camera.width_px / max(camera.width_px - 2 * margin_px, 1)
-    zoom_y = camera.height_px / max(camera.height_px - 2 * margin_px, 1)
-    return replace(
-        camera,
-        fx_px=camera.fx_px * zoom_x,
-        fy_px=camera.fy_px * zoom_y,
-        cx_px=(camera.cx_px - margin_px) * zoom_x,
-        cy_px=(camera.cy_px - margin_px) * zoom_y,
-    )
+    inner = camera.cropped(margin_px, margin_px, max(width_px - 2 * margin_px, 1), max(height_px - 2 * margin_px, 1))
+    return inner.resized(width_px, height_px)
 
 
 def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twist: Twist) -> Frame:
@@ -98,8 +92,7 @@ def _recorded_row_shares(recorded: Camera, lens: Lens | None, ideal: Camera) -> 
 
     Rows in between are nearly linear: distortion bends them by a few pixels, which the readout passes in microseconds.
     """
-    x = np.full(2, (0.5 * ideal.width_px - ideal.cx_px) / ideal.fx_px)
-    y = (np.array([0.0, ideal.height_px]) - ideal.cy_px) / ideal.fy_px
+    x, y = ideal.slopes(np.full(2, 0.5 * ideal.width_px), np.array([0.0, ideal.height_px]))
     first, last = (_pixels(x, y, recorded, lens)[1] + 0.5) / recorded.height_px
     return float(first), float(last)
 
@@ -131,15 +124,14 @@ def _pinhole_lookup(camera: Camera, lens: Lens) -> tuple[Float32[ndarray, "h w"]
 def _undistorted(camera: Camera, lens: Lens) -> Camera:
     """Return the pinhole camera whose whole image the distorted image covers. Raises InvalidInputError."""
     size = camera.width_px, camera.height_px
-    K = np.array([[camera.fx_px, 0, camera.cx_px - 0.5], [0, camera.fy_px, camera.cy_px - 0.5], [0, 0, 1]])
+    K = camera.opencv_matrix
     D = np.array(lens.coefficients)
     try:
         if lens.model is LensModel.FISHEYE:
             K_ideal = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, D, size, np.eye(3), balance=0.0)
         else:
             K_ideal, _ = cv2.getOptimalNewCameraMatrix(K, D, size, 0.0)
-        fx_px, fy_px, cx_px, cy_px = (float(K_ideal[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        ideal = replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
+        ideal = camera.with_opencv_matrix(K_ideal)
         _require_invertible(lens, ideal)
         return ideal
     except (cv2.error, InvalidInputError) as error:
@@ -149,7 +141,7 @@ def _undistorted(camera: Camera, lens: Lens) -> Camera:
 def _require_invertible(lens: Lens, camera: Camera) -> None:
     """Raise InvalidInputError if the lens folds the image of this pinhole camera, by its Jacobian at sampled points."""
     columns, rows = np.linspace(0, camera.width_px, _SAMPLES), np.linspace(0, camera.height_px, _SAMPLES)
-    x, y = np.meshgrid((columns - camera.cx_px) / camera.fx_px, (rows - camera.cy_px) / camera.fy_px)
+    x, y = np.meshgrid(*camera.slopes(columns, rows))
     h = _SLOPE_STEP
     right, left, below, above = (lens.distort(x + dx, y + dy) for dx, dy in ((h, 0), (-h, 0), (0, h), (0, -h)))
     determinant = (right[0] - left[0]) * (below[1] - above[1]) - (below[0] - above[0]) * (right[1] - left[1])
@@ -168,8 +160,7 @@ def recorded_pixels(
     """
     height, width = ideal.height_px, ideal.width_px
     grid_rows, grid_columns = np.arange(0, height + _GRID_PX, _GRID_PX), np.arange(0, width + _GRID_PX, _GRID_PX)
-    x = ((grid_columns + 0.5 - ideal.cx_px) / ideal.fx_px)[None, :]
-    y = ((grid_rows + 0.5 - ideal.cy_px) / ideal.fy_px)[:, None]
+    x, y = ideal.slopes((grid_columns + 0.5)[None, :], (grid_rows + 0.5)[:, None])
     z_m = depth_m[np.minimum(grid_rows, height - 1)[:, None], np.minimum(grid_columns, width - 1)[None, :]]
     inverse_z = np.where(z_m > 0, 1.0 / np.maximum(z_m, _MIN_DEPTH_M), 0.0)
     (wx, wy, wz), (vx, vy, vz) = twist.angular_rad_s, twist.linear_m_s
@@ -186,7 +177,8 @@ def recorded_pixels(
 def _pixels(x: ndarray, y: ndarray, camera: Camera, lens: Lens | None) -> tuple[ndarray, ndarray]:
     if lens is not None:
         x, y = lens.distort(x, y)
-    return camera.fx_px * x + (camera.cx_px - 0.5), camera.fy_px * y + (camera.cy_px - 0.5)
+    columns, rows = camera.pixels(x, y)
+    return columns - 0.5, rows - 0.5
 
 
 def _interpolated(grid: Float64[ndarray, "m n"], width: int, height: int) -> Float32[ndarray, "h w"]:

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gausslite.datasets.text_files import parse_numbers, read_rows, read_text
-from gausslite.domain.camera import Camera
-from gausslite.domain.depth_registration import FileIntrinsics
+from gausslite.domain.camera import Camera, FileIntrinsics
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.lens import Lens, LensModel
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 
 from gausslite.datasets.record3d import Record3dSource
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
-from gausslite.datasets.ros.address import BagAddress
-from gausslite.datasets.ros.bag_source import BagSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
@@ -20,6 +17,7 @@ from gausslite.datasets.zed import ZedSource
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis
+from gausslite.process.siblings import Sibling, sibling
 
 _READERS = (TumSource, SevenScenesSource, ReplicaSource, ZedSource, Record3dSource)
 _LAYOUTS = (
@@ -28,7 +26,6 @@ _LAYOUTS = (
     "or Record3D (metadata, rgbd/0.jpg)"
 )
 _SIMULATED = "sim:"
-_SIMULATOR = "gausslite_sim.source"
 
 
 def open_source(
@@ -65,13 +62,12 @@ def open_reference(spec: str, depth_registration: DepthRegistration | None = Non
 
 def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
     if spec.startswith(_SIMULATED):
-        # the core does not import the simulator package
-        open_simulated: Callable[[str, UpAxis | None], Source] = import_module(_SIMULATOR).open_simulated
-
+        open_simulated: Callable[[str, UpAxis | None], Source] = sibling(Sibling.SIMULATOR).open_simulated
         return open_simulated(spec.removeprefix(_SIMULATED), up_axis)
-    bag = BagAddress.parse(spec)
+    open_bag: Callable[[str, UpAxis | None, bool], Source | None] = sibling(Sibling.BAGS).open_bag
+    bag = open_bag(spec, up_axis, require_poses)
     if bag is not None:
-        return BagSource(bag, up_axis, require_poses)
+        return bag
     folder = Path(spec).expanduser()
     if not folder.is_dir() and not _recognised(folder):
         found = "a file" if folder.is_file() else "nothing there"

@@ -93,7 +93,7 @@ def register_depth(
     # in bands, so that temporary arrays stay in the cache
     for first in range(0, len(depth_m), _BAND_ROWS):
         band_m = depth_m[first : first + _BAND_ROWS]
-        band_camera = replace(depth_camera, cy_px=depth_camera.cy_px - first, height_px=len(band_m))
+        band_camera = depth_camera.cropped(0, first, depth_camera.width_px, len(band_m))
         _splat(nearest, band_m, band_camera, colour_camera, T_colour_depth)
     nearest[np.isinf(nearest)] = 0.0
     return nearest
@@ -110,8 +110,7 @@ def _splat(
     height, width = nearest.shape
     column_px, row_px, z_m = _project_image(depth_m, depth_camera, colour_camera, T_colour_depth)
     spread = np.minimum(_OVERLAP * depth_m / z_m, _MAX_SPREAD)
-    width_px = spread * np.float32(colour_camera.fx_px / depth_camera.fx_px)
-    height_px = spread * np.float32(colour_camera.fy_px / depth_camera.fy_px)
+    width_px, height_px = (spread * np.float32(zoom) for zoom in colour_camera.magnification(depth_camera))
     left, top = column_px - 0.5 * width_px, row_px - 0.5 * height_px
     for row_step in range(_steps(height_px)):
         row, in_row = _pixels_covered(top, height_px, row_step, height)
@@ -134,13 +133,12 @@ def _project_image(
     """
     # separate coordinate planes are three times faster than an array of points
     height, width = depth_m.shape
-    x = ((np.arange(width) + 0.5 - depth_camera.cx_px) / depth_camera.fx_px).astype(np.float32)[None, :]
-    y = ((np.arange(height) + 0.5 - depth_camera.cy_px) / depth_camera.fy_px).astype(np.float32)[:, None]
+    slopes = depth_camera.slopes((np.arange(width) + 0.5)[None, :], (np.arange(height) + 0.5)[:, None])
+    x, y = (axis.astype(np.float32) for axis in slopes)
     T = T_colour_depth.astype(np.float32)
     x_m, y_m, z_m = ((T[i, 0] * x + T[i, 1] * y + T[i, 2]) * depth_m + T[i, 3] for i in range(3))
     z_m = np.where((depth_m > 0) & (z_m > 0), z_m, np.float32(np.inf))
-    column_px = x_m / z_m * np.float32(colour_camera.fx_px) + np.float32(colour_camera.cx_px)
-    row_px = y_m / z_m * np.float32(colour_camera.fy_px) + np.float32(colour_camera.cy_px)
+    column_px, row_px = colour_camera.pixels(x_m / z_m, y_m / z_m)
     return column_px, row_px, z_m
 
 

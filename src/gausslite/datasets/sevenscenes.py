@@ -14,7 +14,7 @@ from gausslite.datasets.images import DepthUnits, first_readable_size
 from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
 from gausslite.datasets.poses import FIRST_VIEW_UP, estimate_up
 from gausslite.datasets.text_files import parse_numbers, read_rows
-from gausslite.domain.depth_registration import FileIntrinsics
+from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis, unit_up_axis
 

@@ -18,7 +18,7 @@ from gausslite.datasets.pose_track import PoseTrack
 from gausslite.datasets.poses import FIRST_VIEW_UP, is_lost, pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.datasets.text_files import parse_numbers, read_rows
-from gausslite.domain.depth_registration import FileIntrinsics
+from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.lens import Lens, LensModel

@@ -1,4 +1,4 @@
-"""The pinhole camera model: back-projection of pixels and projection of points.
+"""The pinhole camera model: projection, back-projection, rays, crops and sizes, for all modules but the rasterizers.
 
 Pixel (column u, row v) has its centre at (u + 0.5, v + 0.5). If a dataset's principal point assumes integer pixel
 centres, its reader adds 0.5 to cx and cy.
@@ -6,15 +6,17 @@ centres, its reader adds 0.5 to cx and cy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 from numpy import ndarray
 
 from gausslite.domain.arguments import require_whole
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import DatasetError, InvalidInputError
 
+Value = TypeVar("Value", float, ndarray)
 _MAX_SIDE_PX = 16384
 _MAX_FOCAL_PX = 1e6
 """Larger focal lengths overflow float32 in products with pixels; real cameras have a hundredth of it."""
@@ -57,10 +59,106 @@ class Camera:
                     f"got {focal_px} with c{axis}_px {centre_px} and {side_px} pixels"
                 )
 
+    @classmethod
+    def centred(cls, focal_px: float, width_px: int, height_px: int) -> Camera:
+        """Return the camera with square pixels and the principal point in the middle of the image."""
+        return cls(focal_px, focal_px, width_px / 2, height_px / 2, width_px, height_px)
+
+    @property
+    def opencv_matrix(self) -> Float64[ndarray, "3 3"]:
+        """The matrix K of OpenCV, whose pixel centres lie at integers."""
+        return np.array([[self.fx_px, 0, self.cx_px - 0.5], [0, self.fy_px, self.cy_px - 0.5], [0, 0, 1]])
+
+    def with_opencv_matrix(self, K: Float64[ndarray, "3 3"]) -> Camera:
+        """Return the camera of the same image size with this matrix K of OpenCV."""
+        fx_px, fy_px, cx_px, cy_px = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return replace(self, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px + 0.5, cy_px=cy_px + 0.5)
+
     def resized(self, width_px: int, height_px: int) -> Camera:
         """Return the camera for an image scaled to this size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return Camera(self.fx_px * sx, self.fy_px * sy, self.cx_px * sx, self.cy_px * sy, width_px, height_px)
+
+    def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> Camera:
+        """Return the camera for the part of the image of this size that begins at this column and row."""
+        return Camera(self.fx_px, self.fy_px, self.cx_px - left_px, self.cy_px - top_px, width_px, height_px)
+
+    def zoomed(self, factor: float) -> Camera:
+        """Return the camera with its focal lengths multiplied, about the principal point."""
+        return replace(self, fx_px=self.fx_px * factor, fy_px=self.fy_px * factor)
+
+    def magnification(self, other: Camera) -> tuple[float, float]:
+        """Return how many times more columns and rows than the other camera this one shows the same angle with."""
+        return self.fx_px / other.fx_px, self.fy_px / other.fy_px
+
+    def pixels(self, x: Value, y: Value) -> tuple[Value, Value]:
+        """Return the image coordinates (columns, rows) of rays of slopes x and y, X / Z and Y / Z; keeps the dtype."""
+        return x * self.fx_px + self.cx_px, y * self.fy_px + self.cy_px
+
+    def slopes(self, columns: Value, rows: Value) -> tuple[Value, Value]:
+        """Return the slopes of the rays through these image coordinates: the inverse of `pixels`."""
+        return (columns - self.cx_px) / self.fx_px, (rows - self.cy_px) / self.fy_px
+
+    def corner_rays(self) -> Float64[ndarray, "4 3"]:
+        """Return the rays through the corners of the image, at a depth of 1, clockwise from the top left."""
+        width, height = self.width_px, self.height_px
+        x, y = self.slopes(np.array((0, width, width, 0)), np.array((0, 0, height, height)))
+        return np.column_stack([x, y, np.ones(4)])
+
+    def pixels_per_s(self, x: ndarray, y: ndarray, rate: Float64[ndarray, "*n 3"]) -> tuple[ndarray, ndarray]:
+        """Return the image velocity of points at slopes x and y; rate: their velocity divided by their depth."""
+        return self.fx_px * (rate[..., 0] - x * rate[..., 2]), self.fy_px * (rate[..., 1] - y * rate[..., 2])
+
+    def gradient_by_point(
+        self, by_column: ndarray, by_row: ndarray, points: Float64[ndarray, "n 3"]
+    ) -> tuple[ndarray, ndarray, ndarray]:
+        """Return the gradient by X, Y and Z of points, from that of the image at their pixels."""
+        x, y, z = points.T
+        by_x, by_y = by_column * self.fx_px / z, by_row * self.fy_px / z
+        return by_x, by_y, -(by_x * x + by_y * y) / z
+
+    def length_m(self, length_px: Value | float, depth_m: Value) -> Value:
+        """Return the length in metres that covers this many pixels of a row at this depth."""
+        return length_px * depth_m / self.fx_px
+
+    def length_px(self, length_m: float, depth_m: Value) -> Value:
+        """Return the most pixels that a length parallel to the image covers at this depth."""
+        return max(self.fx_px, self.fy_px) * length_m / depth_m
+
+    def angle_px(self, angle_rad: float) -> float:
+        """Return the pixels of a row that a small angle covers near the principal point."""
+        return self.fx_px * angle_rad
+
+    def unit_depth_size(self, width_px: float, height_px: float) -> tuple[float, float]:
+        """Return the size of a part of the image, divided by the depth of what it shows."""
+        return width_px / self.fx_px, height_px / self.fy_px
+
+    @property
+    def vertical_fov_rad(self) -> float:
+        """The vertical field of view."""
+        return float(2 * np.arctan(self.height_px / (2 * self.fy_px)))
+
+
+@dataclass(frozen=True, slots=True)
+class FileIntrinsics:
+    """Focal lengths and principal point in pixels, in the data set's convention (pixel centres at integers)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def camera(self, place: str, width_px: int, height_px: int) -> Camera:
+        """Return the Camera, with 0.5 px added to the principal point. Raises DatasetError with the place."""
+        try:
+            return Camera(self.fx, self.fy, self.cx + 0.5, self.cy + 0.5, width_px, height_px)
+        except InvalidInputError as error:
+            raise DatasetError(f"{place}: {error}") from None
+
+    def scaled(self, x_factor: float, y_factor: float) -> FileIntrinsics:
+        """Return the intrinsics for images larger by these factors."""
+        cx, cy = (self.cx + 0.5) * x_factor - 0.5, (self.cy + 0.5) * y_factor - 0.5
+        return FileIntrinsics(self.fx * x_factor, self.fy * y_factor, cx, cy)
 
 
 def back_project(
@@ -72,8 +170,7 @@ def back_project(
     """
     height, width = depth_m.shape
     columns, rows = np.arange(left_px, left_px + width), np.arange(top_px, top_px + height)
-    x = ((columns.astype(np.float32) + 0.5) - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
-    y = ((rows.astype(np.float32) + 0.5) - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
+    x, y = camera.slopes(columns.astype(np.float32) + np.float32(0.5), rows.astype(np.float32) + np.float32(0.5))
     points = np.empty((height, width, 3), np.float32)
     points[..., 0] = x[None, :] * depth_m
     points[..., 1] = y[:, None] * depth_m
@@ -81,22 +178,14 @@ def back_project(
     return points
 
 
-def lift(
-    pixels_px: Float64[ndarray, "n 2"], depths_m: Float64[ndarray, " n"], camera: Camera
-) -> Float64[ndarray, "n 3"]:
+def lift(pixels_px: Float[ndarray, "n 2"], depths_m: Float[ndarray, " n"], camera: Camera) -> Float[ndarray, "n 3"]:
     """Return camera-frame points at image coordinates (column, row) and depths; pixel centres are at +0.5."""
-    principal_px, focal_px = np.array([camera.cx_px, camera.cy_px]), np.array([camera.fx_px, camera.fy_px])
-    rays = (pixels_px - principal_px) / focal_px
-    return np.concatenate([rays * depths_m[:, None], depths_m[:, None]], axis=1)
+    x, y = camera.slopes(pixels_px[:, 0], pixels_px[:, 1])
+    return np.stack([x * depths_m, y * depths_m, depths_m], axis=1)
 
 
 def project(points_camera: Float32[ndarray, "n 3"], camera: Camera) -> Float32[ndarray, "n 2"]:
     """Project camera-frame points with z > 0 to image coordinates (column, row) in pixels."""
     inverse_z = 1.0 / points_camera[:, 2]
-    return np.stack(
-        [
-            points_camera[:, 0] * inverse_z * camera.fx_px + camera.cx_px,
-            points_camera[:, 1] * inverse_z * camera.fy_px + camera.cy_px,
-        ],
-        axis=1,
-    ).astype(np.float32)
+    columns, rows = camera.pixels(points_camera[:, 0] * inverse_z, points_camera[:, 1] * inverse_z)
+    return np.stack([columns, rows], axis=1).astype(np.float32)

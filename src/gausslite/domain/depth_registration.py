@@ -10,28 +10,11 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.camera import Camera, FileIntrinsics
+from gausslite.domain.errors import InvalidInputError
 
 _MAX_BASELINE_M = 1.0
 _MAX_ROTATION_DEG = 45.0
-
-
-@dataclass(frozen=True, slots=True)
-class FileIntrinsics:
-    """Focal lengths and principal point in pixels, in the data set's convention (pixel centres at integers)."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def camera(self, place: str, width_px: int, height_px: int) -> Camera:
-        """Return the Camera, with 0.5 px added to the principal point. Raises DatasetError with the place."""
-        try:
-            return Camera(self.fx, self.fy, self.cx + 0.5, self.cy + 0.5, width_px, height_px)
-        except InvalidInputError as error:
-            raise DatasetError(f"{place}: {error}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +77,7 @@ class DepthRegistration:
 
     def scaled(self, x_factor: float, y_factor: float) -> DepthRegistration:
         """Return the registration for images larger by these factors."""
-        k = self.intrinsics
-        cx, cy = (k.cx + 0.5) * x_factor - 0.5, (k.cy + 0.5) * y_factor - 0.5
-        return replace(self, intrinsics=FileIntrinsics(k.fx * x_factor, k.fy * y_factor, cx, cy))
+        return replace(self, intrinsics=self.intrinsics.scaled(x_factor, y_factor))
 
     def camera(self, width_px: int, height_px: int) -> Camera:
         """Return the colour camera (pixel centres at +0.5)."""

@@ -47,14 +47,14 @@ class Gaussians:
     def empty(cls) -> Gaussians:
         """Return a set without Gaussians."""
         return cls(
-            np.zeros((0, 3), np.float32),
-            np.zeros((0, 4), np.float32),
-            np.zeros((0, 3), np.float32),
-            np.zeros(0, np.float32),
-            np.zeros((0, 3), np.float32),
-            np.zeros(0, np.bool_),
-            np.zeros(0, np.uint32),
-            np.zeros(0, np.int16),
+            means_m=np.zeros((0, 3), np.float32),
+            quats_wxyz=np.zeros((0, 4), np.float32),
+            scales_m=np.zeros((0, 3), np.float32),
+            opacities=np.zeros(0, np.float32),
+            rgb=np.zeros((0, 3), np.float32),
+            active=np.zeros(0, np.bool_),
+            kappa=np.zeros(0, np.uint32),
+            target=np.zeros(0, np.int16),
         )
 
     def take(self, rows: NDArray[Any]) -> Gaussians:

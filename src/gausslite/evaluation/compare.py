@@ -111,13 +111,13 @@ def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDi
     roi = None
     if view.shows_region:
         roi = RoiScore(
-            min(psnr(rendering.rgb, rgb, view.roi), MAX_PSNR_DB),
-            float(similarity[view.roi].mean()),
-            depth_l1_m(depth_m, view.frame.depth_m, view.roi),
-            covered_share(depth_m, view.frame.depth_m, view.roi),
-            None if distance is None else float(distance[view.roi].mean()),
-            laplacian_ratio(rendering.rgb, rgb, view.roi),
-            gradient_deviation(rendering.rgb, rgb, view.roi),
+            psnr=min(psnr(rendering.rgb, rgb, view.roi), MAX_PSNR_DB),
+            ssim=float(similarity[view.roi].mean()),
+            depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m, view.roi),
+            covered=covered_share(depth_m, view.frame.depth_m, view.roi),
+            lpips=None if distance is None else float(distance[view.roi].mean()),
+            laplacian_ratio=laplacian_ratio(rendering.rgb, rgb, view.roi),
+            gradient_deviation=gradient_deviation(rendering.rgb, rgb, view.roi),
         )
     return ViewScore(
         index=view.frame.index,

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from gausslite.calibration.alignment import fit_pose
 from gausslite.calibration.exposure import fit_exposure
-from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.pose_exposure_prior import HANDHELD_PRIOR, PoseExposurePrior

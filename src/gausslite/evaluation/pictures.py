@@ -130,7 +130,7 @@ def labelled_image(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray,
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.55
     text_width = cv2.getTextSize(label, font, scale, 1)[0][0]
     scale *= min(1.0, (width - 12) / max(1, text_width))
-    cv2.putText(header, label, (6, _HEADER_PX - 8), font, scale, _TEXT_RGB, 1, cv2.LINE_AA)
+    cv2.putText(header, label, (6, _HEADER_PX - 8), font, scale, _TEXT_RGB, thickness=1, lineType=cv2.LINE_AA)
     return np.concatenate([header, image])
 
 

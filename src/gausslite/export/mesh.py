@@ -95,8 +95,7 @@ class TsdfVolume:
         points = transform_points(inverse(view.T_world_camera), self._centres_m)
         depth_m = points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            columns = camera.fx_px * points[:, 0] / depth_m + camera.cx_px
-            image_rows = camera.fy_px * points[:, 1] / depth_m + camera.cy_px
+            columns, image_rows = camera.pixels(points[:, 0] / depth_m, points[:, 1] / depth_m)
         inside = (depth_m > self.voxel_m) & (columns >= 0) & (columns < camera.width_px)
         inside &= (image_rows >= 0) & (image_rows < camera.height_px)
         rows = np.flatnonzero(inside)

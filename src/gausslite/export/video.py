@@ -94,5 +94,4 @@ def smooth_path(T_world_camera: Float64[ndarray, "k 4 4"], count: int) -> Float6
 
 def _even_size(camera: Camera) -> Camera:
     """Return the camera without the last column or row of an odd size, which the codec refuses."""
-    width_px, height_px = camera.width_px // 2 * 2, camera.height_px // 2 * 2
-    return Camera(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, width_px, height_px)
+    return camera.cropped(0, 0, camera.width_px // 2 * 2, camera.height_px // 2 * 2)

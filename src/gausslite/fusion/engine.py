@@ -21,7 +21,6 @@ from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.change_follower import ChangeFollower
-from gausslite.fusion.engine_parts import EngineParts
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.keyframes import (
     AgentKeyframe,
@@ -32,6 +31,7 @@ from gausslite.fusion.keyframes import (
 )
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.mission_data import MissionData
 from gausslite.fusion.mission_status import mission_status
 from gausslite.fusion.refined_map import save_refinement
 from gausslite.fusion.storage_probe import StorageProbe
@@ -87,7 +87,7 @@ class FusionEngine:
         if first_revision is None:
             first_revision = time.time_ns() // 1000
         self._decode_keyframe, self._leads = decode_keyframe, leads
-        self._parts, self._follower = self._open_parts(first_revision)
+        self._mission, self._follower = self._open_mission(first_revision)
         self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_update)
 
     @property
@@ -104,7 +104,7 @@ class FusionEngine:
     def mission_config(self) -> MissionConfig:
         """The mission's configuration, with default names in place of empty ones."""
         with self._lock:
-            return self._parts.members.mission_config
+            return self._mission.members.mission_config
 
     @property
     def incarnation_id(self) -> str:
@@ -127,12 +127,12 @@ class FusionEngine:
     @property
     def revision(self) -> int:
         """The revision of the vote; it increases with every change."""
-        return self._parts.maps.revision()
+        return self._mission.maps.revision()
 
     @property
     def maps(self) -> FusedMapLayers:
         """The layers of the fused map."""
-        return self._parts.maps
+        return self._mission.maps
 
     def require_mission(self, mission_id: str) -> None:
         """Raise MismatchError unless the id is this mission's, or empty."""
@@ -148,25 +148,25 @@ class FusionEngine:
         """
         with self._committer.committing, self._lock:
             self._apply_new_changes()
-            self._parts.members.admit(agent_id, requested, token)
-            session = self._parts.members.open_session(agent_id, token)
+            self._mission.members.admit(agent_id, requested, token)
+            session = self._mission.members.open_session(agent_id, token)
             # from now on, no server stores anything of an earlier session
             self._apply_new_changes()
             if fresh_map:
-                self._parts.data.begin_new_map(agent_id)
-                self._parts.members.save_token(agent_id, token)
-            self._parts.checks.record_join(agent_id)
+                self._mission.agents.begin_new_map(agent_id)
+                self._mission.members.save_token(agent_id, token)
+            self._mission.checks.record_join(agent_id)
             return JoinResult(
                 session,
                 self.highest_update_seq(agent_id),
-                self._parts.maps.revision(),
-                self._parts.keyframes.indices(agent_id),
+                self._mission.maps.revision(),
+                self._mission.keyframes.indices(agent_id),
             )
 
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
         with self._lock:
-            return self._parts.members.session(session_id)
+            return self._mission.members.session(session_id)
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Store an agent's voxel updates; they are durable on return, if the store is.
@@ -203,11 +203,11 @@ class FusionEngine:
         It takes up to seconds, mostly without the lock. Call it from one thread at a time. Raises StorageError.
         """
         changed = False
-        for agent_id in self._parts.aligner.due() if self._leads() else ():
-            keys = self._parts.aligner.estimate(agent_id)
+        for agent_id in self._mission.aligner.due() if self._leads() else ():
+            keys = self._mission.aligner.estimate(agent_id)
             with self._lock:
-                self._parts.maps.record(agent_id, keys)
-                changed |= self._parts.data.drop_contradicted(agent_id) or len(keys) > 0
+                self._mission.maps.record(agent_id, keys)
+                changed |= self._mission.agents.drop_contradicted(agent_id) or len(keys) > 0
         return changed
 
     def follow(self) -> bool:
@@ -224,13 +224,13 @@ class FusionEngine:
     def save_leases(self) -> None:
         """Tell the other servers of the store which agents are alive. Raises StorageError."""
         with self._lock:
-            self._parts.members.save_leases()
+            self._mission.members.save_leases()
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
         """Set the motion from the agent's frame to the fused map's that the agent declares. Raises StorageError."""
         with self._lock:
-            self._parts.alignments.declare(agent_id, T_fused_agent)
-            self._parts.maps.record(agent_id, self._parts.votes.refresh(agent_id))
+            self._mission.alignments.declare(agent_id, T_fused_agent)
+            self._mission.maps.record(agent_id, self._mission.votes.refresh(agent_id))
 
     def contribute_free_space(self, session_id: str, blocks: FreeSpace, grid: VoxelGrid) -> int:
         """Replace what an agent observed as free in these blocks; returns its number of free voxels.
@@ -238,17 +238,17 @@ class FusionEngine:
         Raises SessionUnknownError, MismatchError (another grid), QuotaError, StorageError.
         """
         with self._lock:
-            agent_id = self._parts.members.session(session_id).agent_id
+            agent_id = self._mission.members.session(session_id).agent_id
             if grid != self.grid:
                 raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
-            self._parts.free_space.contribute(agent_id, blocks)
-            self._parts.aligner.record_free_space(agent_id)
-            return self._parts.free_space.free_voxels(agent_id)
+            self._mission.free_space.contribute(agent_id, blocks)
+            self._mission.aligner.record_free_space(agent_id)
+            return self._mission.free_space.free_voxels(agent_id)
 
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         with self._lock:
-            self._parts.traffic.record(agent_id, traffic)
+            self._mission.traffic.record(agent_id, traffic)
 
     def add_keyframe(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store a keyframe for the refinement; the agent's others that are not `selected` are deleted.
@@ -256,27 +256,27 @@ class FusionEngine:
         An empty `selected` deletes none. Raises QuotaError, StorageError.
         """
         with self._lock:
-            self._parts.keyframes.add(keyframe, selected)
+            self._mission.keyframes.add(keyframe, selected)
 
     def encoded_keyframe(self, agent_id: str, index: int | None = None) -> tuple[bytes, tuple[int, ...]]:
         """Return a keyframe of the agent (see KeyframePool.find) and the indices of all. Raises InvalidInputError."""
         with self._lock:
-            return self._parts.keyframes.find(agent_id, index), self._parts.keyframes.indices(agent_id)
+            return self._mission.keyframes.find(agent_id, index), self._mission.keyframes.indices(agent_id)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""
         with self._lock:
-            self._parts.objects.report(self._parts.members.session(session_id).agent_id, report)
+            self._mission.objects.report(self._mission.members.session(session_id).agent_id, report)
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
         with self._lock:
-            return self._parts.objects.of_task(agent_id, graph)
+            return self._mission.objects.of_task(agent_id, graph)
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
         with self._lock:
-            reports, frames = self._parts.objects.reports(), self._parts.alignments.transforms()
+            reports, frames = self._mission.objects.reports(), self._mission.alignments.transforms()
         return find_objects(reports, frames, noun)
 
     def evict(self, agent_id: str, ban: bool = False) -> int:
@@ -288,45 +288,45 @@ class FusionEngine:
         with self._committer.committing, self._lock:
             self._apply_new_changes()
             voxels = self._store.totals(agent_id).voxels
-            self._parts.members.require_evictable(agent_id, ban)
-            self._parts.members.end_agent(agent_id)
-            self._parts.data.remove(agent_id)
+            self._mission.members.require_evictable(agent_id, ban)
+            self._mission.members.end_agent(agent_id)
+            self._mission.agents.remove(agent_id)
             if ban:
-                self._parts.members.ban(agent_id)
+                self._mission.members.ban(agent_id)
             return voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
         with self._committer.committing, self._lock:
             self._apply_new_changes()
-            self._parts.members.unban(agent_id)
+            self._mission.members.unban(agent_id)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._committer.committing, self._lock:
-            agent_id = self._parts.members.session(session_id).agent_id
+            agent_id = self._mission.members.session(session_id).agent_id
             if forget:
-                self._parts.data.remove(agent_id)
-            self._parts.members.end_session(session_id)
-            return self._parts.maps.revision()
+                self._mission.agents.remove(agent_id)
+            self._mission.members.end_session(session_id)
+            return self._mission.maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
         """Return the fused map, all agents' keyframes, and the map's revision. Raises MismatchError if one is empty."""
         with self._lock:
-            revision = self._parts.maps.revision()
-            encoded, gaussians = self._parts.keyframes.encoded(), self._parts.maps.voted_map().gaussians
+            revision = self._mission.maps.revision()
+            encoded, gaussians = self._mission.keyframes.encoded(), self._mission.maps.voted_map().gaussians
         if not encoded or len(gaussians) == 0:
             raise MismatchError(
                 f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
                 f"{len(encoded)} keyframes; agents send keyframes with --handover"
             )
-        return gaussians, self.in_fused_frame(self._parts.keyframes.decode(encoded)), revision
+        return gaussians, self.in_fused_frame(self._mission.keyframes.decode(encoded)), revision
 
     def store_refined(self, gaussians: Gaussians, revision: int) -> None:
         """Store the result of a refinement of the vote at this revision. Raises RevisionGoneError, StorageError."""
         # no update may be in the store without being in the change log
         with self._committer.committing:
-            stored = self._parts.maps.show_refined(gaussians, revision)
+            stored = self._mission.maps.show_refined(gaussians, revision)
         save_refinement(self._store, stored)
 
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
@@ -335,19 +335,19 @@ class FusionEngine:
         Those of quarantined agents, and those too far from the origin, are left out.
         """
         with self._lock:
-            frames, quarantined = self._parts.alignments.transforms(), self._parts.alignments.quarantined
+            frames, quarantined = self._mission.alignments.transforms(), self._mission.alignments.quarantined
         moved = (in_fused_frame(each, frames) for each in keyframes if each.agent_id not in quarantined)
         return [each for each in moved if each is not None]
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
         with self._lock:
-            return mission_status(self._store, self._parts)
+            return mission_status(self._store, self._mission)
 
     def save_counters(self) -> None:
         """Save the agents' counters, which are otherwise saved every 10 s. Raises StorageError."""
         with self._lock:
-            self._parts.traffic.save()
+            self._mission.traffic.save()
 
     def close(self) -> None:
         """Close the store."""
@@ -362,20 +362,20 @@ class FusionEngine:
         changes = self._store.take_changes()
         if ContentReplaced() in changes:
             newest = max(self.maps.revision(layer) for layer in MapLayer)
-            self._parts, self._follower = self._open_parts(newest + 1)
+            self._mission, self._follower = self._open_mission(newest + 1)
         else:
             self._follower.apply(changes)
 
-    def _open_parts(self, first_revision: int) -> tuple[EngineParts, ChangeFollower]:
-        parts = EngineParts.open(self._store, self._settings, self._lock, first_revision, self._decode_keyframe)
-        return parts, ChangeFollower(parts, self._leads)
+    def _open_mission(self, first_revision: int) -> tuple[MissionData, ChangeFollower]:
+        mission = MissionData.open(self._store, self._settings, self._lock, first_revision, self._decode_keyframe)
+        return mission, ChangeFollower(mission, self._leads)
 
     def _check_update(self, update: PendingUpdate) -> RoiSubset:
         """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
-        self._parts.members.session(update.session_id)
+        self._mission.members.session(update.session_id)
         if update.outcomes:
             return update.subset
-        subset = self._parts.checks.check(update.subset)
+        subset = self._mission.checks.check(update.subset)
         require_storable(subset)
         require_within_quotas(subset, self._store, self._settings.quotas)
         return subset
@@ -383,8 +383,10 @@ class FusionEngine:
     def _record_update(self, subset: RoiSubset, outcome: PutOutcome) -> None:
         """Update the fused map after a commit."""
         if self._leads():
-            self._parts.aligner.record(subset.agent_id, outcome.accepted)
+            self._mission.aligner.record(subset.agent_id, outcome.accepted)
         if len(outcome.accepted):
-            self._parts.maps.record(subset.agent_id, self._parts.votes.changed_keys(subset.agent_id, outcome.accepted))
-            self._parts.data.drop_outgrown(subset.agent_id)
-        self._parts.traffic.save_if_due()
+            self._mission.maps.record(
+                subset.agent_id, self._mission.votes.changed_keys(subset.agent_id, outcome.accepted)
+            )
+            self._mission.agents.drop_outgrown(subset.agent_id)
+        self._mission.traffic.save_if_due()

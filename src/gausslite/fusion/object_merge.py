@@ -100,14 +100,14 @@ def _merge(cluster: Sequence[_Observed]) -> TeamObject:
     high_x, high_y, high_z = (max(each.extent_m.max_m[axis] for each in landmarks) for axis in range(3))
     is_target = any(each.role is ObjectRole.TARGET for each in landmarks)
     merged = ObjectLandmark(
-        team_object_id(members[0].agent_id, landmarks[0].object_id),
-        landmarks[0].noun,
-        ObjectRole.TARGET if is_target else ObjectRole.ANCHOR,
-        (x, y, z),
-        AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z)),
-        1.0 - math.prod(1.0 - each.confidence for each in landmarks),
-        min(each.first_seen_ns for each in landmarks),
-        max(each.last_seen_ns for each in landmarks),
+        object_id=team_object_id(members[0].agent_id, landmarks[0].object_id),
+        noun=landmarks[0].noun,
+        role=ObjectRole.TARGET if is_target else ObjectRole.ANCHOR,
+        centroid_m=(x, y, z),
+        extent_m=AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z)),
+        confidence=1.0 - math.prod(1.0 - each.confidence for each in landmarks),
+        first_seen_ns=min(each.first_seen_ns for each in landmarks),
+        last_seen_ns=max(each.last_seen_ns for each in landmarks),
     )
     observers = tuple(
         ObjectObserver(

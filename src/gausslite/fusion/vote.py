@@ -87,13 +87,13 @@ def rank_voxels(scores: VoxelScoreTable) -> VoteResult:
     order, is_first = _ranking(scores)
     keys = scores.keys[order]
     return VoteResult(
-        scores.agents,
-        keys[is_first],
-        np.append(np.flatnonzero(is_first), len(order)).astype(np.int64),
-        scores.agent_index[order],
-        scores.update_seqs[order],
-        scores.kappa_sums[order],
-        scores.counts[order],
+        agents=scores.agents,
+        keys=keys[is_first],
+        offsets=np.append(np.flatnonzero(is_first), len(order)).astype(np.int64),
+        agent_index=scores.agent_index[order],
+        update_seqs=scores.update_seqs[order],
+        kappa_sums=scores.kappa_sums[order],
+        counts=scores.counts[order],
     )
 
 

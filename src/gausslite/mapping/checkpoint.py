@@ -42,7 +42,15 @@ def frame_from_state(state: State) -> Frame:
     rgb = get_array(state, "rgb", (*depth_m.shape, 3), np.uint8).copy()
     T_world_camera = get_array(state, "T_world_camera", (4, 4), np.float64).copy()
     motion = _motion_from_state(select_prefix(state, "motion"))
-    return Frame(index, capture_time_ns, rgb, depth_m, camera, T_world_camera, motion)
+    return Frame(
+        index=index,
+        capture_time_ns=capture_time_ns,
+        rgb=rgb,
+        depth_m=depth_m,
+        camera=camera,
+        T_world_camera=T_world_camera,
+        motion=motion,
+    )
 
 
 def _motion_state(motion: CameraMotion | None) -> dict[str, NDArray[Any]]:

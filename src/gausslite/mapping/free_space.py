@@ -75,7 +75,7 @@ class FreeSpaceMap:
         rows, cells = np.nonzero((z_m > _NEAR_M + half_m) & (z_m < min(_MAX_RANGE_M, float(frame.depth_m.max()))))
         points = corners[rows] + steps[cells]
         pixels = np.floor(project(points, camera)).astype(np.int64)
-        radius_px = np.ceil(max(camera.fx_px, camera.fy_px) * half_m / points[:, 2]).astype(np.int64)
+        radius_px = np.ceil(camera.length_px(half_m, points[:, 2])).astype(np.int64)
         far_m = (points[:, 2] + half_m) * (1.0 + _SLACK_SHARE) + _SLACK_M
         size_px = (camera.width_px, camera.height_px)
         inside = ((pixels >= radius_px[:, None]) & (pixels < size_px - radius_px[:, None])).all(axis=1)
@@ -104,8 +104,7 @@ def _nearest_depth(depth_m: Float32[ndarray, "h w"], radius_px: int) -> Float32[
 def _blocks_in_view(frame: Frame, size_m: float) -> Int64[ndarray, "b 3"]:
     """Return the blocks that touch the view up to its farthest depth; the nearest ones if they have too many voxels."""
     camera, block_m = frame.camera, size_m * BLOCK_SIDE
-    corners_px = np.array([(0, 0), (camera.width_px, 0), (camera.width_px, camera.height_px), (0, camera.height_px)])
-    rays = np.column_stack([(corners_px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px), np.ones(4)])
+    rays = camera.corner_rays()
     reach_m = min(_MAX_RANGE_M, float(frame.depth_m.max()))
     hull = transform_points(frame.T_world_camera, np.vstack([rays * reach_m, rays * _NEAR_M]))
     low, high = np.floor(hull.min(axis=0) / block_m), np.ceil(hull.max(axis=0) / block_m)

@@ -75,7 +75,7 @@ def motion_blur_px(frame: Frame) -> float:
     rotation_rad_s, speed_m_s = (
         float(np.linalg.norm(v)) for v in (motion.twist.angular_rad_s, motion.twist.linear_m_s)
     )
-    return frame.camera.fx_px * (rotation_rad_s + speed_m_s / distance_m) * motion.exposure_s / 12**0.5
+    return frame.camera.angle_px(rotation_rad_s + speed_m_s / distance_m) * motion.exposure_s / 12**0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

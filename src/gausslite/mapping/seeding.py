@@ -144,7 +144,7 @@ class Seeder:
         if len(pixels) == 0:
             return Gaussians.empty()
         distance_px = neighbour_distance_px(pixels, pool.pixels, pool.stratified)
-        spacing_m = initial_spacing_m(distance_px, frame.depth_m.ravel()[pixels], frame.camera.fx_px)
+        spacing_m = initial_spacing_m(distance_px, frame.depth_m.ravel()[pixels], frame.camera)
         return self._init_gaussians(frame, relevance, pixels, spacing_m)
 
     def _init_gaussians(

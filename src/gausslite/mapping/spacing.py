@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
+from gausslite.domain.camera import Camera
+
 _BLOCK_PX = 16
 _MEDIAN_POISSON = float(np.sqrt(1.6783 / np.pi))
 _MEDIAN_STRATIFIED = 0.89
@@ -39,10 +41,10 @@ def neighbour_distance_px(
 
 
 def initial_spacing_m(
-    distance_px: Float32[ndarray, " n"], depth_m: Float32[ndarray, " n"], focal_px: float
+    distance_px: Float32[ndarray, " n"], depth_m: Float32[ndarray, " n"], camera: Camera
 ) -> Float32[ndarray, " n"]:
     """Return s0 in metres at each seed's depth; its square is at least 1e-7."""
-    squared = np.square(distance_px * depth_m / np.float32(focal_px))
+    squared = np.square(camera.length_m(distance_px, depth_m))
     spacing: Float32[ndarray, " n"] = np.sqrt(np.maximum(squared, np.float32(_MIN_SQUARED_M)))
     return spacing
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.calibration.alignment import fit_pose
 from gausslite.calibration.exposure import fit_exposure
-from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.frame import Frame

@@ -27,6 +27,8 @@ from gausslite.mapping.pose_history import PoseHistory
 _MAP, _REPORT = "map.ply", "report.json"
 _FIRST_BYTES = 512
 PREVIEW = "preview.png"
+REPORT_PAGE = "report.html"
+"""Name of the page that `gausslite report` and `gausslite demo` write."""
 EVALUATION = "evaluation.json"
 MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
 

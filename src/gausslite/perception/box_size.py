@@ -75,5 +75,5 @@ def box_extent_m(box_px: Box, frame: Frame) -> float | None:
     known = depths_m[depths_m > 0]
     if len(known) < max(_MIN_SAMPLES, _MIN_KNOWN_SHARE * depths_m.size):
         return None
-    side_per_m = max((box_px[2] - box_px[0]) / frame.camera.fx_px, (box_px[3] - box_px[1]) / frame.camera.fy_px)
+    side_per_m = max(frame.camera.unit_depth_size(box_px[2] - box_px[0], box_px[3] - box_px[1]))
     return float(side_per_m * np.percentile(known, _DEPTH_PERCENTILE))

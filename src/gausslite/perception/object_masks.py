@@ -101,7 +101,7 @@ def _resolved(votes: SurfaceVotes, frame: Frame) -> SurfaceVotes:
     """Return the votes in voxels that the frame resolves: of a pixel's width, and of twice its depth's deviation."""
     z_m = transform_points(inverse(frame.T_world_camera), votes.surface_m.astype(np.float64))[:, 2]
     middle_m = max(_MIN_Z_M, float(np.median(z_m))) if len(z_m) else _MIN_Z_M
-    return votes.resolved(max(middle_m / frame.camera.fx_px, 2.0 * depth_deviation_m(middle_m)))
+    return votes.resolved(max(frame.camera.length_m(1.0, middle_m), 2.0 * depth_deviation_m(middle_m)))
 
 
 def depth_deviation_m(depth_m: float) -> float:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
@@ -134,19 +133,15 @@ def crop(frame: Frame, tile: Tile) -> Frame:
     scale = np.array(recorded.shape[:2]) / frame.depth_m.shape
     top, bottom = np.rint(np.array([tile.top_px, tile.bottom_px]) * scale[0]).astype(int)
     left, right = np.rint(np.array([tile.left_px, tile.right_px]) * scale[1]).astype(int)
-    camera = frame.camera
     return Frame(
         frame.index,
         frame.capture_time_ns,
         np.ascontiguousarray(frame.rgb[rows, columns]),
         np.ascontiguousarray(frame.depth_m[rows, columns]),
-        Camera(
-            camera.fx_px, camera.fy_px, camera.cx_px - tile.left_px, camera.cy_px - tile.top_px,
-            tile.right_px - tile.left_px, tile.bottom_px - tile.top_px,
-        ),
+        frame.camera.cropped(tile.left_px, tile.top_px, tile.right_px - tile.left_px, tile.bottom_px - tile.top_px),
         frame.T_world_camera,
         recorded_rgb=np.ascontiguousarray(recorded[top:bottom, left:right]),
-    )  # fmt: skip
+    )
 
 
 def _is_whole_and_small(detection: Detection, tile: Tile, size_px: tuple[int, ...]) -> bool:

@@ -111,17 +111,19 @@ class TableBinding:
         loss, adam = settings
         counts = None if update_counter is None else update_counter.counts
         mask = None if update_counter is None else update_counter.mask
-        passed = contiguous(trainable), counts, contiguous(mask)
+        flags, mask_flags = contiguous(trainable), contiguous(mask)
         native: _kernels.StepTraining = load_kernels().StepTraining(
-            tables,
-            (loss.colour, loss.depth, loss.ssim, loss.normalise_by_image),
-            _row_rates(adam),
-            (adam.beta1, adam.beta2, adam.epsilon, adam.decay_after_updates),
-            masked,
-            *passed,
-            self._binding_id if is_bound else 0,
+            tables=tables,
+            loss=(loss.colour, loss.depth, loss.ssim, loss.normalise_by_image),
+            rates=_row_rates(adam),
+            adam=(adam.beta1, adam.beta2, adam.epsilon, adam.decay_after_updates),
+            masked=masked,
+            trainable=flags,
+            update_counts=counts,
+            count_mask=mask_flags,
+            binding_id=self._binding_id if is_bound else 0,
         )
-        if is_bound and passed[0] is trainable and passed[2] is mask:
+        if is_bound and flags is trainable and mask_flags is mask:
             self._trainings[masked] = _CachedArguments(arguments, native)
         return native
 

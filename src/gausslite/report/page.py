@@ -23,12 +23,10 @@ from gausslite.report.figures import (
 )
 from gausslite.report.plan_view import PlanCamera, plan_view
 from gausslite.report.plots import Line, bar_chart, line_chart, run_colour, run_legend
-from gausslite.report.run_results import ReportContents, RunResults
+from gausslite.report.run_results import ReportContents, RunResults, read_results
 from gausslite.report.task_section import nouns_table, objects_table, task_column
 from gausslite.report.view_comparison import kappa_gaussians, kappa_legend, shared_views, view_sections
 
-PAGE = "report.html"
-"""Default name of the page."""
 _GENERATOR = "gausslite report"
 # the browser itself refuses every request and every script
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -41,6 +39,11 @@ _LINES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("region's share of the pixels", "roi_share", as_percent),
     ("training iterations of each frame", "iterations", as_count),
 )
+
+
+def write_report(path: Path, folders: Sequence[Path]) -> None:
+    """Write the page of results folders. Raises MapFileError for a folder without a run, StorageError."""
+    write_page(path, read_results(folders))
 
 
 def write_page(path: Path, contents: ReportContents) -> int:
@@ -60,12 +63,15 @@ def require_replaceable(path: Path) -> None:
 
 def _document(contents: ReportContents) -> Element:
     title = f"GaussLite: {', '.join(contents.folders)}"
+    metadata: tuple[dict[str, str], ...] = (
+        {"charset": "utf-8"},
+        {"name": "generator", "content": _GENERATOR},
+        {"http-equiv": "Content-Security-Policy", "content": _POLICY},
+        {"name": "viewport", "content": "width=device-width, initial-scale=1"},
+    )
     head = element(
         "head",
-        element("meta", attributes={"charset": "utf-8"}),
-        element("meta", attributes={"name": "generator", "content": _GENERATOR}),
-        element("meta", attributes={"http-equiv": "Content-Security-Policy", "content": _POLICY}),
-        element("meta", attributes={"name": "viewport", "content": "width=device-width, initial-scale=1"}),
+        *(element("meta", attributes=attributes) for attributes in metadata),
         element("title", title),
         element("style", (files("gausslite.report") / "page.css").read_text()),
     )

@@ -62,11 +62,8 @@ class PlanCamera:
     def project(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
         """Return the pixels of points in world coordinates."""
         p_camera = (points_m - self.T_world_camera[:3, 3]) @ self.T_world_camera[:3, :3]
-        camera = self.camera
-        focal_px = np.array((camera.fx_px, camera.fy_px))
-        centre_px = np.array((camera.cx_px, camera.cy_px))
-        pixels: Float64[ndarray, "n 2"] = p_camera[:, :2] / p_camera[:, 2:] * focal_px + centre_px
-        return pixels
+        x, y = (p_camera[:, :2] / p_camera[:, 2:]).T
+        return np.stack(self.camera.pixels(x, y), axis=1)
 
     def below_ceiling(self, gaussians: Gaussians) -> Bool[ndarray, " n"]:
         """Return which Gaussians are below the ceiling, which would hide the rest."""
@@ -109,8 +106,7 @@ def _camera(extent_m: Float64[ndarray, "2"]) -> Camera:
     extent_m = np.maximum(extent_m, _MIN_EXTENT_M)
     px_per_m = min(_WIDTH_PX / extent_m[0], _MAX_HEIGHT_PX / extent_m[1])
     width, height = (max(1, round(float(px_per_m * side))) for side in extent_m)
-    focal_px = float(px_per_m * _DISTANCE_M)
-    return Camera(focal_px, focal_px, width / 2, height / 2, width, height)
+    return Camera.centred(float(px_per_m * _DISTANCE_M), width, height)
 
 
 def _pose(axes: Float64[ndarray, "3 3"], centre_m: Float64[ndarray, "2"], ceiling_m: float) -> Float64[ndarray, "4 4"]:
@@ -147,7 +143,7 @@ def _marked_object(landmark: ObjectLandmark, plan: PlanCamera) -> list[Element]:
 
 
 def _scale_bar(camera: Camera) -> list[Element]:
-    px_per_m = camera.fx_px / _DISTANCE_M
+    px_per_m = camera.length_px(1.0, _DISTANCE_M)
     length_m = max([each for each in _SCALES_M if each * px_per_m < camera.width_px / 3], default=_SCALES_M[0])
     x, y = 12, camera.height_px - 12
     points = f"{x},{y - 5} {x},{y} {x + length_m * px_per_m:.1f},{y} {x + length_m * px_per_m:.1f},{y - 5}"

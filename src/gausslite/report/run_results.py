@@ -89,15 +89,15 @@ def _read_run(folder: Path, name: str, scores: Mapping[str, object] | None = Non
             scores = {}
             notes.append(f"{error}; the page has no scores of it")
     return RunResults(
-        name,
-        file,
-        read_contents(folder),
-        read_world_frame(file),
-        report,
-        scores,
-        read_timeline(folder),
-        read_view_images(folder),
-        notes,
+        name=name,
+        map_file=file,
+        contents=read_contents(folder),
+        world_frame=read_world_frame(file),
+        report=report,
+        scores=scores,
+        timeline=read_timeline(folder),
+        views=read_view_images(folder),
+        notes=notes,
     )
 
 

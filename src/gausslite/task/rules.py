@@ -26,13 +26,13 @@ class RuleParser:
             raise TaskError(_no_object_message(text, tuple(draft.excluded)))
         draft.warnings += [f"{each!r} is not understood: it is dropped" for each in comparisons(normalise_text(text))]
         parsed = ParsedPhrases(
-            {target: draft.roles[target] for target in draft.targets},
-            draft.anchors,
-            draft.relations,
-            draft.excluded,
-            draft.context,
-            draft.warnings,
-            draft.mentions,
+            targets={target: draft.roles[target] for target in draft.targets},
+            anchors=draft.anchors,
+            relations=draft.relations,
+            excluded=draft.excluded,
+            context=draft.context,
+            warnings=draft.warnings,
+            mentions=draft.mentions,
         )
         return grounded_graph(text, parsed, draft)
 

@@ -6,10 +6,11 @@ import statistics
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
-if TYPE_CHECKING:
-    from gausslite.view.splat_layer import Splats
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
 
 PREVIEW_COUNT = 2_000
 """Splats that a new browser gets first: in software rendering about 20 frames a second."""
@@ -27,6 +28,25 @@ _RETRY_S = 30.0
 _ANSWERS = 5
 _ANSWER_LIMIT_S = 60.0
 _STORAGE_KEY = "gausslite-answer"
+_SPLATS = "/splats"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Splats:
+    """What a browser draws, in the order in which it is added: each prefix is spread evenly over the map."""
+
+    means_m: Float32[ndarray, "n 3"]
+    covariances_m2: Float32[ndarray, "n 3 3"]
+    rgb: UInt8[ndarray, "n 3"]
+    opacities: Float32[ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.means_m)
+
+    def add_to(self, scene: Any, count: int) -> Any:
+        """Add the first `count` splats to a scene of viser, in place of those of before; return their handle."""
+        arrays = (self.means_m, self.covariances_m2, self.rgb, self.opacities[:, None])
+        return scene.add_gaussian_splats(_SPLATS, *(array[:count] for array in arrays))
 
 
 def next_count(shown: int, total: int, response_s: float) -> int:

@@ -76,4 +76,4 @@ def _write(image: UInt8[ndarray, "h w 3"], text: str, corner_px: tuple[int, int]
     # a dark ground, as the image may be as light as the text
     ground = (origin[0] - 1, origin[1] - height_px - 1), (origin[0] + width_px, origin[1] + 3)
     cv2.rectangle(image, *ground, _GROUND_RGB, cv2.FILLED)
-    cv2.putText(image, ascii_text, origin, _FONT, _FONT_SCALE, colour, 1, cv2.LINE_AA)
+    cv2.putText(image, ascii_text, origin, _FONT, _FONT_SCALE, colour, thickness=1, lineType=cv2.LINE_AA)

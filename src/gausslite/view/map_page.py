@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from gausslite.domain.important_gaussians import choose_gaussians
+from gausslite.view.browser_detail import Splats
 from gausslite.view.colours import ColourMode, colours_of, legend_of
 from gausslite.view.contents import ViewContents
 from gausslite.view.level_of_detail import DEFAULT_LIMIT, covariances_m2, spread_order
 from gausslite.view.local_server import LOOPBACK, LocalServer
 from gausslite.view.scene_markers import SceneMarkers
-from gausslite.view.splat_layer import SplatLayer, Splats
+from gausslite.view.splat_layer import SplatLayer
 from gausslite.view.start_view import StartView, start_view
 from gausslite.view.time_scrub import PastMap, TimeScrub
 

@@ -135,10 +135,9 @@ class SceneMarkers:
         colour: tuple[int, int, int],
         scale: float = 0.08,
     ) -> Any:
-        fov_rad = 2 * np.arctan(camera.height_px / (2 * camera.fy_px))
         return self._server.scene.add_camera_frustum(
             name,
-            float(fov_rad),
+            camera.vertical_fov_rad,
             camera.width_px / camera.height_px,
             scale=scale,
             thickness=0.004,

@@ -3,34 +3,10 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from typing import Any
 
-from jaxtyping import Float32, UInt8
-from numpy import ndarray
-
-from gausslite.view.browser_detail import PREVIEW_COUNT, BrowserDetail
+from gausslite.view.browser_detail import PREVIEW_COUNT, BrowserDetail, Splats
 from gausslite.view.local_server import LocalServer
-
-_SPLATS = "/splats"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Splats:
-    """What a browser draws, in the order in which it is added: each prefix is spread evenly over the map."""
-
-    means_m: Float32[ndarray, "n 3"]
-    covariances_m2: Float32[ndarray, "n 3 3"]
-    rgb: UInt8[ndarray, "n 3"]
-    opacities: Float32[ndarray, " n"]
-
-    def __len__(self) -> int:
-        return len(self.means_m)
-
-    def add_to(self, scene: Any, count: int) -> Any:
-        """Add the first `count` splats to a scene of viser, in place of those of before; return their handle."""
-        arrays = (self.means_m, self.covariances_m2, self.rgb, self.opacities[:, None])
-        return scene.add_gaussian_splats(_SPLATS, *(array[:count] for array in arrays))
 
 
 class SplatLayer:

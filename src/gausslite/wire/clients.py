@@ -215,13 +215,13 @@ class FusionClient(ServiceChannel):
         )
         response = self._call(self._stub.JoinSession, request)
         return Session(
-            response.session_id,
-            response.highest_update_seq,
-            response.fused_revision,
-            response.max_subset_bytes,
-            response.max_gaussians,
-            tuple(response.keyframes),
-            response.incarnation_id,
+            session_id=response.session_id,
+            highest_update_seq=response.highest_update_seq,
+            fused_revision=response.fused_revision,
+            max_subset_bytes=response.max_subset_bytes,
+            max_gaussians=response.max_gaussians,
+            keyframes=tuple(response.keyframes),
+            incarnation_id=response.incarnation_id,
         )
 
     def keep_session(self, session_id: str) -> fusion_service_pb2.KeepSessionResponse:

@@ -145,13 +145,13 @@ def _decode_images(message: geometry_pb2.EncodedFrame) -> Frame:
     camera = camera_from_message(message.camera)
     motion = motion_from_message(message)
     return Frame(
-        message.index,
-        message.capture_time_ns,
-        decode_colour(message.colour, camera.width_px, camera.height_px),
-        decode_depth(message.depth_png, camera.width_px, camera.height_px),
-        camera,
-        transform_from_message("frame t_world_camera", message.t_world_camera),
-        motion,
+        index=message.index,
+        capture_time_ns=message.capture_time_ns,
+        rgb=decode_colour(message.colour, camera.width_px, camera.height_px),
+        depth_m=decode_depth(message.depth_png, camera.width_px, camera.height_px),
+        camera=camera,
+        T_world_camera=transform_from_message("frame t_world_camera", message.t_world_camera),
+        motion=motion,
     )
 
 
@@ -199,4 +199,12 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     if len(winner) not in (0, 0 if batch is None else len(batch)) or any(i >= len(names) for i in winner):
         raise InvalidInputError("map block provenance: expected one known agent for each voxel")
     winners = tuple(names[i] for i in winner)
-    return MapUpdate(message.revision, message.snapshot, first, message.last, batch, grid, winners)
+    return MapUpdate(
+        revision=message.revision,
+        snapshot=message.snapshot,
+        first=first,
+        last=message.last,
+        batch=batch,
+        grid=grid,
+        winners=winners,
+    )

@@ -54,14 +54,14 @@ def object_from_message(message: objects_pb2.ObjectLandmark) -> ObjectLandmark:
         raise InvalidInputError(f"object role: expected TARGET or ANCHOR, got {message.role}")
     centroid = message.centroid_m
     return ObjectLandmark(
-        message.id,
-        message.noun,
-        role,
-        (centroid.x, centroid.y, centroid.z),
-        box_from_message(message.extent_m),
-        message.confidence,
-        message.first_seen_ns,
-        message.last_seen_ns,
+        object_id=message.id,
+        noun=message.noun,
+        role=role,
+        centroid_m=(centroid.x, centroid.y, centroid.z),
+        extent_m=box_from_message(message.extent_m),
+        confidence=message.confidence,
+        first_seen_ns=message.first_seen_ns,
+        last_seen_ns=message.last_seen_ns,
     )
 
 

@@ -60,19 +60,19 @@ def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
     """Decode a task graph and check it with `domain.task_limits`. Raises TaskError."""
     _require_known_numbers(message)
     graph = TaskGraph(
-        message.task_id,
-        message.text,
-        tuple(message.targets),
-        tuple(message.anchors),
-        tuple(_relation_from_message(each) for each in message.relations),
-        tuple(message.warnings),
-        tuple(_ROLE_BY_NUMBER[role] for role in message.roles),
-        tuple(
+        task_id=message.task_id,
+        text=message.text,
+        targets=tuple(message.targets),
+        anchors=tuple(message.anchors),
+        relations=tuple(_relation_from_message(each) for each in message.relations),
+        warnings=tuple(message.warnings),
+        roles=tuple(_ROLE_BY_NUMBER[role] for role in message.roles),
+        attributes=tuple(
             ObjectAttributes(each.name, each.colour or None, _SUPERLATIVE_BY_NUMBER[each.superlative])
             for each in message.attributes
         ),
-        tuple(message.excluded),
-        tuple(message.context),
+        excluded=tuple(message.excluded),
+        context=tuple(message.context),
     )
     require_graph(graph)
     return graph

@@ -42,11 +42,11 @@ def stored_keyframe_from_message(message: pb.GetKeyframeResponse) -> StoredKeyfr
     camera = camera_from_message(message.camera)
     has_pose = message.HasField("t_world_camera")
     return StoredKeyframe(
-        message.index,
-        message.capture_time_ns,
-        decode_colour(message.colour, camera.width_px, camera.height_px),
-        camera,
-        transform_from_message("keyframe t_world_camera", message.t_world_camera) if has_pose else None,
-        tuple(message.indices),
-        region_from_png(message.region_png, camera),
+        index=message.index,
+        capture_time_ns=message.capture_time_ns,
+        rgb=decode_colour(message.colour, camera.width_px, camera.height_px),
+        camera=camera,
+        T_world_camera=transform_from_message("keyframe t_world_camera", message.t_world_camera) if has_pose else None,
+        indices=tuple(message.indices),
+        roi=region_from_png(message.region_png, camera),
     )

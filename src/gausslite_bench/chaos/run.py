@@ -247,21 +247,21 @@ class _ChaosRun:
         self._kill_server()
         parts, last = list(self.team.acknowledged.values()), self.comparisons[-1]
         return ChaosResult(
-            {str(fault): self.faults[fault] for fault in Fault},
-            sum(each.messages for each in parts),
-            sum(each.updates for each in parts),
-            self._disk_errors(),
-            len(self.comparisons),
-            last.voxels,
-            len(offline.batch),
-            sum(each.lost for each in self.comparisons),
-            sum(each.wrong for each in self.comparisons),
-            last.extra,
-            exported == ply_bytes(offline.gaussians),
-            same_watch,
-            self.server.log.read_text(errors="replace").count("Traceback"),
-            time.monotonic() - begin_s,
-            (rss_mib, max(self._peak_mib, rss_mib)),
+            faults={str(fault): self.faults[fault] for fault in Fault},
+            acknowledged_messages=sum(each.messages for each in parts),
+            acknowledged_updates=sum(each.updates for each in parts),
+            disk_errors=self._disk_errors(),
+            comparisons=len(self.comparisons),
+            voxels=last.voxels,
+            fused_voxels=len(offline.batch),
+            lost=sum(each.lost for each in self.comparisons),
+            wrong=sum(each.wrong for each in self.comparisons),
+            extra_at_end=last.extra,
+            same_map=exported == ply_bytes(offline.gaussians),
+            same_watch=same_watch,
+            server_errors=self.server.log.read_text(errors="replace").count("Traceback"),
+            time_s=time.monotonic() - begin_s,
+            rss_mib=(rss_mib, max(self._peak_mib, rss_mib)),
         )
 
 

@@ -40,14 +40,14 @@ def run_server(options: argparse.Namespace) -> int:
     if not options.seconds > 0:
         raise InvalidInputError(f"--seconds: expected more than 0, got {options.seconds:g}")
     settings = ServerBenchSettings(
-        _numbers("--held", options.held, 0),
-        _numbers("--agents", options.agents, 1),
-        options.seconds,
-        options.server,
-        options.store,
-        options.watchers,
-        options.hostile,
-        options.servers,
+        held=_numbers("--held", options.held, 0),
+        agents=_numbers("--agents", options.agents, 1),
+        seconds=options.seconds,
+        command=options.server,
+        store=options.store,
+        watchers=options.watchers,
+        hostile=options.hostile,
+        servers=options.servers,
     )
     with progress_bar(len(settings.held), "server", "server") as progress:
         results = []

@@ -190,10 +190,10 @@ def _trials(options: argparse.Namespace, plan: TeamPlan, size: tuple[int, int]) 
     policy = plan.pose_policy
     return [
         TeamTrial(
-            plan,
-            name,
-            seed,
-            MissionSettings(
+            plan=plan,
+            policy=name,
+            seed=seed,
+            settings=MissionSettings(
                 policy=name,
                 max_gaussians=options.max_gaussians,
                 iterations=options.iterations,
@@ -201,10 +201,10 @@ def _trials(options: argparse.Namespace, plan: TeamPlan, size: tuple[int, int]) 
                 threads=options.threads,
                 pose_prior=options.pose_prior or policy.pose_prior,
             ),
-            size,
-            options.refine_iterations,
-            policy.fit_views if options.fit_views is None else options.fit_views,
-            options.frame_error,
+            size=size,
+            refine_iterations=options.refine_iterations,
+            fit_views=policy.fit_views if options.fit_views is None else options.fit_views,
+            frame_error=options.frame_error,
         )
         for name in options.policies
         for seed in options.seeds

@@ -78,7 +78,17 @@ def measure_formats(
                 if content == "hand-over" and shown:
                     loss, fidelity = _lost(gaussians, decoded, shown, threads)
             scores.append(
-                CodecScore(scene, content, each.name, len(chosen), size, 1e3 * encode_s, decode_ms, loss, fidelity)
+                CodecScore(
+                    scene=scene,
+                    content=content,
+                    format=each.name,
+                    gaussians=len(chosen),
+                    bytes_per_gaussian=size,
+                    encode_ms=1e3 * encode_s,
+                    decode_ms=decode_ms,
+                    roi_psnr_loss_db=loss,
+                    fidelity_db=fidelity,
+                )
             )
     return scores
 

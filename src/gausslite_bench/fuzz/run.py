@@ -107,13 +107,13 @@ def _fuzz_service(run: _Run, options: Sequence[str]) -> FuzzResult:
 
 def _result(target: str, outcomes: Outcomes, logged: int, rss_mib: tuple[float, float]) -> FuzzResult:
     return FuzzResult(
-        target,
-        outcomes.messages,
-        dict(Counter(outcomes.results).most_common()),
-        max(len(outcomes.crashes), logged),
-        len(outcomes.hangs),
-        outcomes.slowest_s,
-        rss_mib[1],
-        rss_mib[1] - rss_mib[0],
-        [*outcomes.crashes, *outcomes.hangs],
+        target=target,
+        messages=outcomes.messages,
+        results=dict(Counter(outcomes.results).most_common()),
+        crashes=max(len(outcomes.crashes), logged),
+        hangs=len(outcomes.hangs),
+        slowest_s=outcomes.slowest_s,
+        rss_mib=rss_mib[1],
+        growth_mib=rss_mib[1] - rss_mib[0],
+        faults=[*outcomes.crashes, *outcomes.hangs],
     )

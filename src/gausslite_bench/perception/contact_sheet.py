@@ -56,5 +56,14 @@ def _draw_boxes(image: UInt8[ndarray, "h w 3"], detections: Sequence[Detection])
         left, top, right, bottom = (round(edge) for edge in detection.box_px)
         cv2.rectangle(out, (left, top), (right, bottom), _BOX_RGB, 1)
         corner = (left + 2, max(top - 3, 10))
-        cv2.putText(out, f"{detection.score:.2f}", corner, cv2.FONT_HERSHEY_SIMPLEX, 0.35, _BOX_RGB, 1, cv2.LINE_AA)
+        cv2.putText(
+            out,
+            f"{detection.score:.2f}",
+            corner,
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.35,
+            _BOX_RGB,
+            thickness=1,
+            lineType=cv2.LINE_AA,
+        )
     return out

@@ -91,7 +91,8 @@ class ExternalRasterizer:
 
     def _step(self, mode: int) -> None:
         table = self._table
-        self._lib.gl_step(
+        # in the order of the library's function
+        arguments = (
             self._handle,
             table.rows.ctypes.data,
             table.count,
@@ -106,6 +107,7 @@ class ExternalRasterizer:
             1,
             mode,
         )
+        self._lib.gl_step(*arguments)
 
 
 def _load(library: Path) -> ctypes.CDLL:

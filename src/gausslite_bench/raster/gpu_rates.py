@@ -164,12 +164,12 @@ class _OwnSteps:
                 table.rows,
                 table.first_moment,
                 table.second_moment,
-                self.view,
-                self._pose,
-                _LOSS,
-                ZERO_LEARNING_RATES,
-                masked,
-                subset,
+                view=self.view,
+                T_camera_world=self._pose,
+                loss=_LOSS,
+                adam=ZERO_LEARNING_RATES,
+                masked=masked,
+                subset=subset,
             )
         return report.loss
 

@@ -106,8 +106,7 @@ def _spacing_m(points: Float32[ndarray, "n 3"]) -> Float32[ndarray, " n"]:
 
 
 def _camera(width_px: int, height_px: int) -> Camera:
-    focal_px = _FOCAL_PER_WIDTH * width_px
-    return Camera(focal_px, focal_px, width_px / 2, height_px / 2, width_px, height_px)
+    return Camera.centred(_FOCAL_PER_WIDTH * width_px, width_px, height_px)
 
 
 def _ring_pose(position: float) -> Float64[ndarray, "4 4"]:

@@ -84,12 +84,12 @@ class RepeatedStep:
         """Run one iteration."""
         self._rasterizer.step(
             *self._tables,
-            self._view,
-            self._pose,
-            loss,
-            ZERO_LEARNING_RATES,
-            self._masked,
-            self._subset,
+            view=self._view,
+            T_camera_world=self._pose,
+            loss=loss,
+            adam=ZERO_LEARNING_RATES,
+            masked=self._masked,
+            subset=self._subset,
         )
 
 

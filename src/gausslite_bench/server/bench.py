@@ -102,7 +102,15 @@ def _measure(
     watchers_mib = _idle_watchers_mib(server, settings.watchers)
     restart_s = server.restart()
     return StoredSizeResult(
-        held, tuple(loads), hostile, fill_s, snapshot_s, status_ms, restart_s, rss_mib, watchers_mib
+        held=held,
+        loads=tuple(loads),
+        hostile=hostile,
+        fill_s=fill_s,
+        snapshot_s=snapshot_s,
+        status_ms=status_ms,
+        restart_s=restart_s,
+        rss_mib=rss_mib,
+        watchers_mib=watchers_mib,
     )
 
 

@@ -28,14 +28,14 @@ def voxels_batch(first: int, count: int, seed: int) -> VoxelBatch:
     n = len(cells)
     means_m = (corners + rng.uniform(0.05, 0.95, (n, 3))) * GRID.size_m
     gaussians = Gaussians(
-        means_m.astype(np.float32),
-        rng.normal(size=(n, 4)).astype(np.float32),
-        rng.uniform(0.005, 0.05, (n, 3)).astype(np.float32),
-        rng.uniform(0.1, 0.9, n).astype(np.float32),
-        rng.uniform(0, 1, (n, 3)).astype(np.float32),
-        np.ones(n, np.bool_),
-        rng.integers(1, 500, n).astype(np.uint32),
-        np.zeros(n, np.int16),
+        means_m=means_m.astype(np.float32),
+        quats_wxyz=rng.normal(size=(n, 4)).astype(np.float32),
+        scales_m=rng.uniform(0.005, 0.05, (n, 3)).astype(np.float32),
+        opacities=rng.uniform(0.1, 0.9, n).astype(np.float32),
+        rgb=rng.uniform(0, 1, (n, 3)).astype(np.float32),
+        active=np.ones(n, np.bool_),
+        kappa=rng.integers(1, 500, n).astype(np.uint32),
+        target=np.zeros(n, np.int16),
     )
     return group_by_voxel(gaussians, GRID)
 

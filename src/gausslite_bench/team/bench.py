@@ -103,14 +103,14 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
         sum(values) for values in zip(*((len(m.gaussians), m.gaussians.active.sum()) for m in maps), strict=True)
     )
     return TeamResult(
-        trial,
-        score_team(viewers, scene.views, trial.fit_views, sheets=0).scores,
-        100.0 * float(active) / max(total, 1),
-        sum(each.bytes_sent for each in maps),
-        sum(each.gaussians_sent for each in maps),
-        total,
-        sum(each.bytes_whole for each in maps),
-        {each.agent_id: str(each.alignment.state) for each in engine.status().agents},
+        trial=trial,
+        scores=score_team(viewers, scene.views, trial.fit_views, sheets=0).scores,
+        share_percent=100.0 * float(active) / max(total, 1),
+        bytes_sent=sum(each.bytes_sent for each in maps),
+        gaussians_sent=sum(each.gaussians_sent for each in maps),
+        gaussians=total,
+        bytes_whole=sum(each.bytes_whole for each in maps),
+        alignment={each.agent_id: str(each.alignment.state) for each in engine.status().agents},
     )
 
 

@@ -109,14 +109,14 @@ def map_agent(
     whole = split_batch(group_by_voxel(gaussians, grid), _SUBSET_BYTES)
     bytes_whole = sum(len(encode_subset(RoiSubset(agent.agent_id, "", 1, 1, part), grid)) for part in whole)
     return AgentMap(
-        agent.agent_id,
-        gaussians,
-        keyframes,
-        tuple(sent.messages),
-        sent.byte_count,
-        gaussians_sent,
-        bytes_whole,
-        _observe_free_space(agent, grid),
+        agent_id=agent.agent_id,
+        gaussians=gaussians,
+        keyframes=keyframes,
+        messages=tuple(sent.messages),
+        bytes_sent=sent.byte_count,
+        gaussians_sent=gaussians_sent,
+        bytes_whole=bytes_whole,
+        free_space=_observe_free_space(agent, grid),
     )
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
+from gausslite.calibration.alignment import fit_pose
 from gausslite.calibration.exposure import AffineExposure, fit_exposure
-from gausslite.calibration.pose_fit import fit_pose
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m

@@ -13,8 +13,8 @@ from gausslite.calibration.registration import RegistrationEstimate, estimate_fr
 from gausslite.datasets.images import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
 from gausslite.datasets.registered_source import register_depth
-from gausslite.domain.camera import Camera
-from gausslite.domain.depth_registration import DepthRegistration, FileIntrinsics
+from gausslite.domain.camera import Camera, FileIntrinsics
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse

@@ -11,8 +11,8 @@ from tiny_sequences import write_seven_scenes
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.registered_source import RegisteredSource, register_depth
-from gausslite.domain.camera import Camera
-from gausslite.domain.depth_registration import DepthRegistration, FileIntrinsics
+from gausslite.domain.camera import Camera, FileIntrinsics
+from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite_agent.settings import parse_arguments
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gausslite.domain.camera import Camera
 from gausslite.mapping.sampling import edge_magnitude, sample_pixels, sample_stratified
 from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
 
@@ -109,5 +110,5 @@ def test_spacing_in_a_narrow_strip_uses_neighbours_within_it() -> None:
 
 def test_spacing_in_metres_grows_with_depth_and_is_clamped() -> None:
     distance_px = np.array([2.0, 2.0, 1.0], np.float32)
-    spacing = initial_spacing_m(distance_px, np.array([1.0, 3.0, 1e-3], np.float32), 100.0)
+    spacing = initial_spacing_m(distance_px, np.array([1.0, 3.0, 1e-3], np.float32), Camera.centred(100.0, 64, 48))
     np.testing.assert_allclose(spacing, [0.02, 0.06, np.sqrt(1e-7)], rtol=1e-5)

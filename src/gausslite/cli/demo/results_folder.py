@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gausslite.mission.results import require_absent, require_no_map
-from gausslite.report.page import PAGE
+from gausslite.mission.results import REPORT_PAGE, require_absent, require_no_map
 
 STORE = "fusion.sqlite"
 """Name of the fusion server's file; it holds the voxels of all agents."""
@@ -25,7 +24,7 @@ def require_no_demo(out: Path) -> None:
 
 def remove_results(out: Path) -> None:
     """Remove the report, its page and pictures, the fused maps and the fusion server's store of an earlier demo."""
-    for name in (_REPORT, PAGE, *_FUSED_MAPS, STORE, f"{STORE}-wal", f"{STORE}-shm"):
+    for name in (_REPORT, REPORT_PAGE, *_FUSED_MAPS, STORE, f"{STORE}-wal", f"{STORE}-shm"):
         (out / name).unlink(missing_ok=True)
     for sheet in out.glob(_SHEETS):
         sheet.unlink()

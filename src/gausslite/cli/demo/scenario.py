@@ -110,7 +110,14 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
     found = calibrate_with_messages(options.source, recorded, stated)
     views = tuple(FrameStream(found.source, positions, size) for positions in held_out_positions)
     return Scenario(
-        tuple(agents), size, _TEST_EVERY, views, regions, found.registration, found.correction, found.pose_prior
+        agents=tuple(agents),
+        size=size,
+        test_every=_TEST_EVERY,
+        held_out=views,
+        regions=regions,
+        depth_registration=found.registration,
+        camera_correction=found.correction,
+        pose_prior=found.pose_prior,
     )
 
 

@@ -42,6 +42,15 @@ class _Match:
     T_world_camera: Float64[ndarray, "4 4"]
 
 
+def open_bag(spec: str, up_axis: UpAxis | None, require_poses: bool) -> BagSource | None:
+    """Return the sequence of "bag:PATH?color=TOPIC&...", or of a path that is a bag; None for other sources.
+
+    Raises DatasetError, PoseError, InvalidInputError.
+    """
+    address = BagAddress.parse(spec)
+    return None if address is None else BagSource(address, up_axis, require_poses)
+
+
 class BagSource:
     """The frames of a bag's colour topic, each with the nearest depth image and the camera's pose at its stamp.
 

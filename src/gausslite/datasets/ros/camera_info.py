@@ -6,7 +6,7 @@ from typing import Any
 
 from gausslite.datasets.intrinsics import FolderCamera, lens_of
 from gausslite.datasets.ros.messages import float_field
-from gausslite.domain.depth_registration import FileIntrinsics
+from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError
 
 _LENS_COEFFICIENTS = 8

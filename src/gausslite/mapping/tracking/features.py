@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
-from gausslite.domain.camera import Camera
+from gausslite.domain.camera import Camera, lift
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import orthonormal
@@ -77,9 +77,7 @@ def detect_features(frame: Frame) -> FeatureView:
     columns = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, camera.width_px - 1)
     rows = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, camera.height_px - 1)
     z_m = frame.depth_m[rows, columns]
-    x_m = (pixels[:, 0] + 0.5 - camera.cx_px) / camera.fx_px * z_m
-    y_m = (pixels[:, 1] + 0.5 - camera.cy_px) / camera.fy_px * z_m
-    return FeatureView(pixels, np.stack([x_m, y_m, z_m], axis=1).astype(np.float32), descriptors)
+    return FeatureView(pixels, lift(pixels + np.float32(0.5), z_m, camera), descriptors)
 
 
 def relative_pose(reference: FeatureView, current: FeatureView, camera: Camera) -> RelativePose | None:
@@ -100,7 +98,7 @@ def relative_pose(reference: FeatureView, current: FeatureView, camera: Camera) 
     found, rotation_rad, translation_m, inliers = cv2.solvePnPRansac(
         points,
         pixels,
-        np.array([[camera.fx_px, 0, camera.cx_px - 0.5], [0, camera.fy_px, camera.cy_px - 0.5], [0, 0, 1]]),
+        camera.opencv_matrix,
         None,
         iterationsCount=_RANSAC_ITERATIONS,
         reprojectionError=_MAX_REPROJECTION_PX,

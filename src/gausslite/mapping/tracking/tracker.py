@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.calibration.alignment import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
 from gausslite.domain.camera import Camera
 from gausslite.domain.camera_motion import CameraMotion
 from gausslite.domain.errors import MapFileError
@@ -18,7 +19,6 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose import inverse, orthonormal, require_rigid, transform_of, twist_of
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
-from gausslite.mapping.tracking.alignment import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
 from gausslite.mapping.tracking.features import FeatureView, detect_features, relative_pose
 from gausslite.mapping.tracking.relocalisation import KeyframeIndex
 from gausslite.render.rasterizer import Rendering

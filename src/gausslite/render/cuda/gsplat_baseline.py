@@ -62,15 +62,15 @@ class GsplatBaseline:
         means_m, quats_wxyz, log_scales, logits, rgb = self._parameters
         camera = self._view.camera
         images, alphas, _ = self._rasterization(
-            means_m,
-            quats_wxyz,
-            log_scales.exp(),
-            logits.sigmoid(),
-            rgb,
-            self._pose,
-            self._intrinsics,
-            camera.width_px,
-            camera.height_px,
+            means=means_m,
+            quats=quats_wxyz,
+            scales=log_scales.exp(),
+            opacities=logits.sigmoid(),
+            colors=rgb,
+            viewmats=self._pose,
+            Ks=self._intrinsics,
+            width=camera.width_px,
+            height=camera.height_px,
             near_plane=NEAR_M,
             render_mode="RGB+D",
         )

@@ -132,11 +132,11 @@ class GsplatKernels:
             footprints.conics[None],
             footprints.channels[None],
             footprints.opacities[None],
-            width_px,
-            height_px,
-            TILE_PX,
-            self._gsplat.isect_offset_encode(crossings, 1, tile_columns, tile_rows),
-            owners,
+            image_width=width_px,
+            image_height=height_px,
+            tile_size=TILE_PX,
+            isect_offsets=self._gsplat.isect_offset_encode(crossings, 1, tile_columns, tile_rows),
+            flatten_ids=owners,
             masks=None if tiles is None else tiles[None],
         )
         if tiles is None:
@@ -204,7 +204,13 @@ class _Composite(torch.autograd.Function):
         columns = (column[order].double() for column in (means_px, conics, opacities, channels, radius_px))
         means_px, conics, opacities, channels, radius_px = columns
         ctx.ellipses = Ellipses(
-            order, means_px, conics, opacities, channels[:, :3], channels[:, 3], torch.ceil(radius_px)
+            row_ids=order,
+            means_px=means_px,
+            conics=conics,
+            opacities=opacities,
+            rgb=channels[:, :3],
+            z_m=channels[:, 3],
+            half_box_px=torch.ceil(radius_px),
         )
         # compositing uses only the image size of a camera
         ctx.camera = Camera(1.0, 1.0, 0.0, 0.0, width_px, height_px)

@@ -113,20 +113,28 @@ class CudaView:
         blurred = _blur(torch.cat([planes, planes * planes]))
         means = blurred[:3]
         ssim_terms = torch.cat([means, blurred[3:] - means * means])
-        unmasked = LossTarget(Window.whole(camera), colours, measured_m, ssim_terms, None, float(depth_m.size), 1.0)
+        unmasked = LossTarget(
+            window=Window.whole(camera),
+            rgb=colours,
+            depth_m=measured_m,
+            ssim_terms=ssim_terms,
+            pixel_weights=None,
+            weight_sum=float(depth_m.size),
+            share=1.0,
+        )
         device_camera = DeviceCamera.of(camera, device, motion)
         if pixel_weights is None:
             return cls(camera, device_camera, unmasked, unmasked)
         window = Window.around(pixel_weights, camera)
         part, weight_sum = (window.rows, window.columns), float(pixel_weights.sum(dtype=np.float64))
         masked = LossTarget(
-            window,
-            colours[part],
-            measured_m[part],
-            ssim_terms[:, window.rows, window.columns],
-            to_device(pixel_weights[part], device),
-            weight_sum,
-            weight_sum / depth_m.size,
+            window=window,
+            rgb=colours[part],
+            depth_m=measured_m[part],
+            ssim_terms=ssim_terms[:, window.rows, window.columns],
+            pixel_weights=to_device(pixel_weights[part], device),
+            weight_sum=weight_sum,
+            share=weight_sum / depth_m.size,
         )
         return cls(camera, device_camera, unmasked, masked)
 

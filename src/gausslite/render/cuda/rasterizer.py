@@ -199,7 +199,15 @@ class CudaRasterizer:
         if self._bound is None:
             with self.bind_tables(rows, first_moment, second_moment):
                 return self.step(
-                    *tables.arrays, view, T_camera_world, loss, adam, masked, subset, trainable, update_counter
+                    *tables.arrays,
+                    view=view,
+                    T_camera_world=T_camera_world,
+                    loss=loss,
+                    adam=adam,
+                    masked=masked,
+                    subset=subset,
+                    trainable=trainable,
+                    update_counter=update_counter,
                 )
         if not self._bound.host.same_memory_as(tables):
             raise InvalidInputError("step: expected the bound tables, got others")

@@ -43,18 +43,26 @@ class Ellipses:
     def detached(self) -> Ellipses:
         """Return the same ellipses as leaves of a new graph."""
         means_px, conics, opacities, rgb, z_m = (column.detach().requires_grad_() for column in self.differentiable)
-        return Ellipses(self.row_ids, means_px, conics, opacities, rgb, z_m, self.half_box_px)
+        return Ellipses(
+            row_ids=self.row_ids,
+            means_px=means_px,
+            conics=conics,
+            opacities=opacities,
+            rgb=rgb,
+            z_m=z_m,
+            half_box_px=self.half_box_px,
+        )
 
     def take(self, chosen: Tensor) -> Ellipses:
         """Return the ellipses at these positions, or where this mask is True, in the same order."""
         return Ellipses(
-            self.row_ids[chosen],
-            self.means_px[chosen],
-            self.conics[chosen],
-            self.opacities[chosen],
-            self.rgb[chosen],
-            self.z_m[chosen],
-            self.half_box_px[chosen],
+            row_ids=self.row_ids[chosen],
+            means_px=self.means_px[chosen],
+            conics=self.conics[chosen],
+            opacities=self.opacities[chosen],
+            rgb=self.rgb[chosen],
+            z_m=self.z_m[chosen],
+            half_box_px=self.half_box_px[chosen],
         )
 
 
@@ -111,7 +119,15 @@ def _ellipses(
     # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
     reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
     half_box_px = torch.sqrt(reach[:, None] * torch.stack([variance_x, variance_y], dim=1).detach())
-    return Ellipses(row_ids, means_px, conics, opacities, kept[:, RGB], z, half_box_px)
+    return Ellipses(
+        row_ids=row_ids,
+        means_px=means_px,
+        conics=conics,
+        opacities=opacities,
+        rgb=kept[:, RGB],
+        z_m=z,
+        half_box_px=half_box_px,
+    )
 
 
 def _low_passed(covariances: Covariances) -> Covariances:

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from gausslite.calibration.alignment import align
 from gausslite.datasets.open import open_source
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
@@ -16,7 +17,6 @@ from gausslite.domain.motion_model import MotionModel
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.domain.trajectory import Trajectory
 from gausslite.evaluation.trajectory_error import trajectory_error
-from gausslite.mapping.tracking.alignment import align
 from gausslite.mapping.tracking.features import detect_features, relative_pose
 from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.build import build_mapper, build_tracker

@@ -1,4 +1,4 @@
-"""The parts of a fusion engine that hold data of one mission, opened on one store."""
+"""The data of one mission, opened on one store."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from gausslite.fusion.vote_input import VoteInput
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EngineParts:
-    """Each part reads its data from the store when it is opened. FusionEngine guards them with one lock."""
+class MissionData:
+    """Each member reads its data from the store when it is opened. FusionEngine guards them with one lock."""
 
     members: Membership
     keyframes: KeyframePool
@@ -35,13 +35,13 @@ class EngineParts:
     votes: VoteInput
     aligner: FrameAligner
     maps: FusedMapLayers
-    data: AgentData
+    agents: AgentData
 
     @classmethod
     def open(
         cls, store: FusionStore, settings: FusionSettings, lock: RLock, first_revision: int, decode: FrameDecoder
-    ) -> EngineParts:
-        """Open all parts. Raises MismatchError, CodecError for damaged records, StorageError."""
+    ) -> MissionData:
+        """Read the data. Raises MismatchError, CodecError for damaged records, StorageError."""
         grid, quotas = settings.grid, settings.quotas
         members = Membership(store, settings)
         keyframes = KeyframePool(store, quotas.keyframe_limits, decode)
@@ -52,5 +52,16 @@ class EngineParts:
         refined = load_refinement(store)
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
         of_agents = aligner, free_space, checks, traffic, keyframes, objects
-        data = AgentData(store, votes, maps, alignments, of_agents)
-        return cls(members, keyframes, objects, checks, traffic, alignments, free_space, votes, aligner, maps, data)
+        return cls(
+            members=members,
+            keyframes=keyframes,
+            objects=objects,
+            checks=checks,
+            traffic=traffic,
+            alignments=alignments,
+            free_space=free_space,
+            votes=votes,
+            aligner=aligner,
+            maps=maps,
+            agents=AgentData(store, votes, maps, alignments, of_agents),
+        )
