@@ -157,6 +157,21 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
     assert done.stdout == ""
 
 
+@pytest.mark.parametrize(
+    ("program", "unused"),
+    [
+        ("gausslite_parser.program", ("datasets", "mapping", "render", "perception", "calibration", "fusion", "view")),
+        ("gausslite_fusion_server.program", ("datasets", "perception", "mapping.tracking", "calibration", "view")),
+    ],
+)
+def test_a_program_imports_what_it_uses(program: str, unused: tuple[str, ...]) -> None:
+    code = f"import sys, {program}; print(*[name for name in sys.modules if name.startswith('gausslite.')])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    packages = tuple(f"gausslite.{package}" for package in unused)
+    assert [name for name in done.stdout.split() if belongs_to(name, packages)] == []
+
+
 def test_help_lists_every_command_without_numpy() -> None:
     code = (
         "import sys\nfrom gausslite.cli.main import main\n"

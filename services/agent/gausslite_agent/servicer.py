@@ -10,7 +10,6 @@ from typing import Any
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxel_operations import crop_to_box
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mission.live_frame import correct_live_frame
 from gausslite.task.parser import TaskParser
@@ -25,11 +24,11 @@ from gausslite.wire.convert import (
     transform_from_message,
 )
 from gausslite.wire.convert_task import graph_from_message, graph_to_message
-from gausslite.wire.map_blocks import map_blocks
+from gausslite.wire.map_changes import EncodedPartCache, follow
 from gausslite.wire.server import Service
 from gausslite.wire.uplink_values import UplinkCounters
 from gausslite_agent.agent_mission import AgentMission
-from gausslite_agent.map_changes import MapChangeLog
+from gausslite_agent.map_changes import AgentMapReader, MapChangeLog, MapChanges
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import (
     blank_view,
@@ -56,6 +55,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     ) -> None:
         self._agent_id, self._worker, self._mission = agent_id, worker, mission
         self._parser, self._changes = parser, changes
+        self._encoded_parts = EncodedPartCache()
         # used on the worker thread only
         self._change_logs = {roi_only: MapChangeLog(worker.grid, roi_only) for roi_only in (False, True)}
 
@@ -130,23 +130,18 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         """Yield a snapshot of the map, then its changes. A slow reader gets merged changes; nothing is queued."""
         region = box_from_message(request.region) if request.HasField("region") else None
         change_log = self._change_logs[request.roi_only]
-        since = request.since_revision
 
-        def changed_blocks(mapper: GaussianMapper) -> list[pb.WatchMapResponse]:
-            change_log.update(mapper.gaussians(), self._worker.revision())
-            batch = change_log.since(since)
-            if region is not None:
-                batch = crop_to_box(batch, region, self._worker.grid)
-            blocks = map_blocks(batch, self._worker.grid, self._agent_id, change_log.revision, snapshot=since == 0)
-            return [pb.WatchMapResponse(block=block) for block in blocks]
+        async def read(since_revision: int) -> AgentMapReader:
+            def read_changes(mapper: GaussianMapper) -> MapChanges:
+                change_log.update(mapper.gaussians(), self._worker.revision())
+                return change_log.since(since_revision)
 
-        while True:
-            notification = self._changes.subscribe()
-            if since == 0 or since != self._worker.revision():
-                for response in await asyncio.wrap_future(self._worker.run(changed_blocks)):
-                    yield response
-                    since = response.block.revision
-            await notification.wait()
+            changes = await asyncio.wrap_future(self._worker.run(read_changes))
+            return AgentMapReader(changes, region, self._worker.grid, self._agent_id, self._encoded_parts)
+
+        blocks = follow(read, self._worker.revision, request.since_revision, self._changes, asyncio.to_thread)
+        async for block in blocks:
+            yield pb.WatchMapResponse(block=block)
 
     async def _read_task(self, request: pb.AssignTaskRequest) -> TaskGraph:
         match request.WhichOneof("task"):

@@ -1,4 +1,4 @@
-"""Stream a layer of the fused map and its changes to a watcher, tile by tile, without holding the map for it."""
+"""Read a layer of the fused map and its changes for a watcher, tile by tile, without holding the map for it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite.domain.errors import InvalidInputError, RevisionGoneError
-from gausslite.domain.voxel_operations import crop_to_box
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxel_operations import crop_to_box, merge_batches, tombstones
 from gausslite.domain.voxels import TILE_VOXELS, AxisAlignedBox, VoxelGrid
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer, WonVoxels
-from gausslite.v1.gaussians_pb2 import MapBlock
-from gausslite_fusion_server.encoded_blocks import EncodedPart, EncodedPartCache, encode_parts
+from gausslite.v1.gaussians_pb2 import Provenance
+from gausslite.wire.map_changes import EncodedPart, EncodedPartCache, Parts, encode_parts
+
+_SENDER = "fusion-server"
+"""The agent id inside the subset bytes of fused voxels; readers use the provenance instead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,92 +33,82 @@ class WatchedPart:
             raise InvalidInputError("exclude_agent_id: expected none with REFINED, whose voxels belong to everyone")
 
 
-class ChangeBlocks:
-    """Encodes blocks for all watchers of a map. Thread-safe; each iterator belongs to one watcher."""
+@dataclass(frozen=True, slots=True, eq=False)
+class FusedMapReader:
+    """Reads what one watcher wants; a tile is read when its block is due. The cache is that of all watchers."""
 
-    def __init__(self, engine: FusionEngine) -> None:
-        self._engine, self._grid = engine, engine.grid
-        self._cache = EncodedPartCache()
+    engine: FusionEngine
+    watched: WatchedPart
+    cache: EncodedPartCache
 
-    def blocks(self, watched: WatchedPart, since_revision: int) -> Iterator[MapBlock]:
-        """Yield the blocks that lead from a revision (0: nothing) to the current one, at least one; the last is marked.
+    def snapshot(self) -> tuple[int, Parts]:
+        """Return the current revision and the tiles of the layer, each as it is when it is read."""
+        revision, tiles = self.engine.maps.tiles(self.watched.layer)
+        return revision, self._tiles(self._in_region(tiles))
 
-        A tile is read when its block is due. What changes in the meantime follows before the last block. So the reader
-        then has the map at the revision of the last block. Raises RevisionGoneError.
-        """
-        waiting: MapBlock | None = None
-        snapshot = since_revision == 0
-        revision = since_revision
-        if snapshot:
-            revision, tiles = self._engine.maps.tiles(watched.layer)
-            for tile in self._in_region(tiles, watched.region).tolist():
-                for part in self._tile(watched, tile):
-                    if waiting is not None:
-                        yield waiting
-                    waiting = _block(part, revision, snapshot)
-        try:
-            end, parts = self._changes(watched, revision)
-        except RevisionGoneError:
-            if not snapshot:
-                raise
-            # more was removed during the snapshot than is recorded; from this revision the watcher gets a new one
-            end, parts = revision, ()
-        for part in parts:
-            if waiting is not None:
-                yield waiting
-            waiting = _block(part, end, snapshot)
-        waiting = waiting or MapBlock(snapshot=snapshot)
-        waiting.revision, waiting.last = end, True
-        yield waiting
-
-    def _changes(self, watched: WatchedPart, since_revision: int) -> tuple[int, tuple[EncodedPart, ...]]:
-        """Return the current revision and what changed since."""
-        if self._engine.maps.revision(watched.layer) == since_revision:
+    def changes(self, since_revision: int) -> tuple[int, Parts]:
+        """Return the current revision and what changed since. Raises RevisionGoneError."""
+        if self.engine.maps.revision(self.watched.layer) == since_revision:
             return since_revision, ()
-        changes = self._engine.maps.changes(since_revision, watched.layer)
+        changes = self.engine.maps.changes(since_revision, self.watched.layer)
 
         def encode() -> tuple[EncodedPart, ...]:
-            won = self._select(watched, changes.won)
+            won = self._select(self.watched, changes.won)
             changed = np.union1d(changes.won.batch.keys, changes.removed)
-            if watched.region is not None:
-                changed = changed[watched.region.contains(self._grid.centres_m(changed))]
-            return encode_parts(won, np.setdiff1d(changed, won.batch.keys), self._grid)
+            if self.watched.region is not None:
+                changed = changed[self.watched.region.contains(self.engine.grid.centres_m(changed))]
+            return _encode(won, np.setdiff1d(changed, won.batch.keys), self.engine.grid)
 
-        return changes.revision, self._cache.get((watched, since_revision, changes.revision), encode)
+        return changes.revision, (self.cache.get((self.watched, since_revision, changes.revision), encode),)
 
-    def _tile(self, watched: WatchedPart, tile: int) -> tuple[EncodedPart, ...]:
+    def _tiles(self, tiles: np.ndarray) -> Iterator[tuple[EncodedPart, ...]]:
+        for tile in tiles.tolist():
+            yield self._tile(tile)
+
+    def _tile(self, tile: int) -> tuple[EncodedPart, ...]:
         """Return a tile as it is now; a tile completely in the region is shared with other watchers."""
-        if watched.region is not None and _contains(watched.region, tile, self._grid):
+        watched = self.watched
+        if watched.region is not None and _contains(watched.region, tile, self.engine.grid):
             watched = WatchedPart(watched.layer, None, watched.exclude_agent)
         # read before the tile: a change in between makes the kept tile newer than its revision, never older
-        revision = self._engine.maps.tile_revision(watched.layer, tile)
+        revision = self.engine.maps.tile_revision(watched.layer, tile)
 
         def encode() -> tuple[EncodedPart, ...]:
-            won = self._select(watched, self._engine.maps.tile(watched.layer, tile))
-            return encode_parts(won, np.zeros(0, np.int64), self._grid)
+            won = self._select(watched, self.engine.maps.tile(watched.layer, tile))
+            return _encode(won, np.zeros(0, np.int64), self.engine.grid)
 
-        return self._cache.get((watched, tile, revision), encode)
+        return self.cache.get((watched, tile, revision), encode)
 
     def _select(self, watched: WatchedPart, won: WonVoxels) -> WonVoxels:
         if watched.exclude_agent:
             won = won.without(watched.exclude_agent)
         if watched.region is None:
             return won
-        return WonVoxels(crop_to_box(won.batch, watched.region, self._grid), won.keys_by_winner)
+        return WonVoxels(crop_to_box(won.batch, watched.region, self.engine.grid), won.keys_by_winner)
 
-    def _in_region(self, tiles: np.ndarray, region: AxisAlignedBox | None) -> np.ndarray:
+    def _in_region(self, tiles: np.ndarray) -> np.ndarray:
+        grid, region = self.engine.grid, self.watched.region
         if region is None:
             return tiles
-        low_m = self._grid.indices(tiles) * self._grid.size_m
-        high_m = low_m + TILE_VOXELS * self._grid.size_m
+        low_m = grid.indices(tiles) * grid.size_m
+        high_m = low_m + TILE_VOXELS * grid.size_m
         touches = (low_m <= np.array(region.max_m)) & (high_m >= np.array(region.min_m))
         return tiles[touches.all(axis=1)]
+
+
+def _encode(won: WonVoxels, removed: np.ndarray, grid: VoxelGrid) -> tuple[EncodedPart, ...]:
+    """Encode voxels and, as tombstones, the keys of empty ones; no part if there are none."""
+    agents = sorted(won.keys_by_winner)
+    winner_of = {key: index for index, name in enumerate(agents) for key in won.keys_by_winner[name]}
+
+    def provenance(part: VoxelBatch) -> Provenance:
+        if not agents:
+            return Provenance()
+        return Provenance(agent_ids=agents, winner=[winner_of.get(key, 0) for key in part.keys.tolist()])
+
+    return encode_parts(merge_batches(won.batch, tombstones(removed)), grid, _SENDER, provenance)
 
 
 def _contains(region: AxisAlignedBox, tile: int, grid: VoxelGrid) -> bool:
     low_m = grid.indices(np.array([tile], np.int64)) * grid.size_m
     return bool(region.contains(np.concatenate([low_m, low_m + TILE_VOXELS * grid.size_m]).astype(np.float32)).all())
-
-
-def _block(part: EncodedPart, revision: int, snapshot: bool) -> MapBlock:
-    return MapBlock(revision=revision, snapshot=snapshot, subset=part[0], provenance=part[1])

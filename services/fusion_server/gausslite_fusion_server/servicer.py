@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -15,7 +15,6 @@ from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import (
     InvalidInputError,
     QuotaError,
-    RevisionGoneError,
 )
 from gausslite.domain.names import require_identifier
 from gausslite.domain.objects import ObjectReport
@@ -25,7 +24,6 @@ from gausslite.fusion.map_renderer import MapRenderer
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
-from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.caller import Caller
 from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
@@ -38,9 +36,10 @@ from gausslite.wire.convert import (
 from gausslite.wire.convert_objects import object_to_message, report_from_message
 from gausslite.wire.convert_task import graph_from_message
 from gausslite.wire.digest_messages import digests_to_messages
+from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
 from gausslite.wire.rejection_log import RejectionLog
 from gausslite.wire.server import Service
-from gausslite_fusion_server.change_blocks import ChangeBlocks, WatchedPart
+from gausslite_fusion_server.change_blocks import FusedMapReader, WatchedPart
 from gausslite_fusion_server.contributions import (
     agent_of_session,
     enqueue_subset,
@@ -57,7 +56,6 @@ from gausslite_fusion_server.messages import (
     layer_from_message,
     view_to_message,
 )
-from gausslite_fusion_server.read_deadline import read_deadline
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
 
 _log = logging.getLogger(__name__)
@@ -80,7 +78,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._decoder = ThreadPoolExecutor(1, "decode")
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
-        self._change_blocks = ChangeBlocks(engine)
+        self._encoded_parts = EncodedPartCache()
         # one thread: an estimate of frames or a rendering must not delay the acknowledgements
         self._background = ThreadPoolExecutor(1, "background")
         self._aligning = False
@@ -205,19 +203,17 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         if request.exclude_agent_id:
             require_identifier("exclude_agent_id", request.exclude_agent_id)
         watched = WatchedPart(layer_from_message(request.layer), region, request.exclude_agent_id)
-        blocks = self._change_blocks.blocks(watched, request.since_revision)
-        block = await self._work(_next_block, blocks)
-        while True:
-            while block is not None:
-                revision = block.revision
-                with read_deadline():
-                    yield pb.WatchFusedMapResponse(block=block)
-                block = await self._work(_next_block, blocks)
-            changed = self._map_changes.subscribe()
-            while self._engine.maps.revision(watched.layer) == revision and self._gate.is_open:
-                await changed.wait()
-                changed = self._map_changes.subscribe()
-            blocks, block = await self._work(self._changes_or_snapshot, watched, revision)
+        reader = FusedMapReader(self._engine, watched, self._encoded_parts)
+
+        async def read(_since_revision: int) -> FusedMapReader:
+            return reader
+
+        def revision() -> int:
+            self._gate.require_open()
+            return self._engine.maps.revision(watched.layer)
+
+        async for block in follow(read, revision, request.since_revision, self._map_changes, self._work):
+            yield pb.WatchFusedMapResponse(block=block)
 
     async def RefineFusedMap(
         self, request: pb.RefineFusedMapRequest, context: Any
@@ -321,16 +317,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         _log.warning("agent %s: may join again", request.agent_id)
         return pb.UnbanAgentResponse()
 
-    def _changes_or_snapshot(self, watched: WatchedPart, revision: int) -> tuple[Iterator[MapBlock], MapBlock | None]:
-        """Return the blocks of the changes after the first one, and the first one."""
-        blocks = self._change_blocks.blocks(watched, revision)
-        try:
-            return blocks, next(blocks)
-        except RevisionGoneError:
-            # the watcher missed more removals than are recorded, so it gets a snapshot
-            blocks = self._change_blocks.blocks(watched, 0)
-            return blocks, next(blocks)
-
     def _export(self, request: pb.ExportFusedMapRequest) -> ExportedFile:
         batch = self._select_map(request)
         return ExportedFile(ply_bytes(batch.gaussians, self._engine.mission_config.given_world_frame))
@@ -377,7 +363,3 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
 def _evicted(request: pb.EvictAgentRequest) -> str:
     return "banned" if request.ban else "evicted"
-
-
-def _next_block(blocks: Iterator[MapBlock]) -> MapBlock | None:
-    return next(blocks, None)

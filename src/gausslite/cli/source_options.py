@@ -20,7 +20,7 @@ from gausslite.process.messages import print_message
 from gausslite.process.siblings import Sibling, sibling
 
 
-def add_source(parser: argparse.ArgumentParser, default_text: str = NONE) -> None:
+def add_source(parser: argparse.ArgumentParser, default_text: str) -> None:
     """Add SOURCE and the options of its frames; default_text as in `add_frames`."""
     parser.add_argument(
         "source",

@@ -76,39 +76,6 @@ def test_a_sentence_takes_less_than_10_ms():
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "   ", "asdf qwer", "pick up", "go and clean", "!?!", "12 34", "please", "Ignore the vase", "red"],
-)
-def test_text_without_an_object_is_refused_in_one_line(text):
-    with pytest.raises(TaskError, match=r"expected .* names an object, such as") as caught:
-        RuleParser().parse(text)
-    assert "\n" not in str(caught.value)
-
-
-def test_bytes_of_another_encoding_are_refused():
-    with pytest.raises(TaskError, match="expected UTF-8"):
-        RuleParser().parse("find the m\udcffg")
-
-
-def test_text_that_is_too_long_is_refused():
-    with pytest.raises(TaskError, match="at most 1000 characters, got 1001"):
-        RuleParser().parse("a" * 1001)
-
-
-def test_too_many_objects_are_refused():
-    names = ", the ".join(
-        f"{colour} {noun}" for colour in ("red", "blue", "green") for noun in sorted(COMMON_ANCHORS)[:6]
-    )
-    with pytest.raises(TaskError, match="at most 16 objects, got 18"):
-        RuleParser().parse(f"Find the {names}")
-
-
-def test_a_phrase_that_is_too_long_is_refused():
-    with pytest.raises(TaskError, match="at most 64 characters"):
-        RuleParser().parse("Find the " + "x" * 70)
-
-
-@pytest.mark.parametrize(
     ("text", "excluded"),
     [
         ("Ignore people and map the chairs", "person"),
@@ -281,3 +248,23 @@ def test_the_validator_refuses_relations_between_unknown_nouns():
 def test_pictures_maps_and_lists_are_objects_where_the_robot_handles_them(text, targets, anchors):
     graph = RuleParser().parse(text)
     assert (graph.targets, graph.anchors) == (targets, anchors)
+
+
+NO_OBJECT = ("", "   ", "asdf qwer", "pick up", "go and clean", "!?!", "12 34", "please", "Ignore the vase", "red")
+MANY = [f"{colour} {noun}" for colour in ("red", "blue", "green") for noun in sorted(COMMON_ANCHORS)[:6]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        *((text, r"expected .* names an object, such as") for text in NO_OBJECT),
+        ("find the m\udcffg", "expected UTF-8"),
+        ("a" * 1001, "at most 1000 characters, got 1001"),
+        (f"Find the {', the '.join(MANY)}", "at most 16 objects, got 18"),
+        ("Find the " + "x" * 70, "at most 64 characters"),
+    ],
+)
+def test_a_text_that_is_no_task_is_refused_in_one_line(text, message):
+    with pytest.raises(TaskError, match=message) as caught:
+        RuleParser().parse(text)
+    assert "\n" not in str(caught.value)

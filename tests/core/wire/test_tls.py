@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from certificates import SCRIPT, identity, make_certificates
+from certificates import identity, make_certificates
 from fusion_running import GRID, fusion_server
 from sample_gaussians import plain_gaussians
 from serving import serving
@@ -186,16 +186,6 @@ def test_a_key_is_in_no_representation(certs: Path, caplog: pytest.LogCaptureFix
     secret = (certs / "server/key.pem").read_text().splitlines()[1]
     assert secret not in caplog.text
     assert "BEGIN PRIVATE KEY" not in caplog.text
-
-
-@pytest.mark.parametrize("arguments", [[], ["folder"], ["folder", "../x"], ["folder", "a b"], ["folder", "a:king"]])
-def test_the_script_names_the_expected_arguments(arguments: list[str], tmp_path: Path) -> None:
-    done = subprocess.run(
-        ["bash", str(SCRIPT), *(argument.replace("folder", str(tmp_path)) for argument in arguments)],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr.startswith("make_certificates: expected")
 
 
 def test_certificate_without_its_key_is_refused_by_name() -> None:

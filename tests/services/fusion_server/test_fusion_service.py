@@ -14,7 +14,6 @@ from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
     NameInUseError,
-    QuotaError,
     RevisionGoneError,
     SessionUnknownError,
     UnavailableError,
@@ -82,20 +81,6 @@ def test_an_invalid_subset_does_not_end_the_stream() -> None:
         assert (ant.subsets_accepted, ant.subsets_rejected, ant.gaussians, ant.voxels) == (2, 5, 3, 2)
         assert (ant.kappa_sum, ant.last_update_seq) == (3, 7)
         assert ant.last_seen_ns > 0
-
-
-def test_a_quota_counts_stored_and_not_sent_gaussians() -> None:
-    with fusion_server(settings=FusionSettings(grid=GRID, quotas=Quotas(agents=1, voxels_per_agent=2))) as t:
-        session = t.client.join("ant", GRID).session_id
-        statuses = [
-            t.contribute_subsets(session, make_subset("ant", revision, cells))[0].status
-            for revision, cells in [(1, {0: [1], 1: [1]}), (2, {0: [2], 1: []}), (3, {2: [1]}), (2, {0: [9], 2: [9]})]
-        ]
-        assert statuses == [ACCEPTED, ACCEPTED, REJECTED, REJECTED]
-        assert t.contribute_subsets(session, make_subset("ant", 1, {0: [1], 1: [1]}))[0].status == STALE
-        with pytest.raises(QuotaError, match="at most 1 in this mission"):
-            t.client.join("bee", GRID)
-        assert t.client.join("ant", GRID).session_id != session
 
 
 def test_a_robot_whose_agent_id_another_one_uses_is_refused() -> None:
