@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from jaxtyping import install_import_hook
+from support.postgres_running import PostgresServer, postgres_server
 
 # accept an int for a float, as the type checker does
 install_import_hook(
@@ -26,3 +28,10 @@ def shared_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real sequences and models here: {folder} is absent")
     return folder
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[PostgresServer]:
+    """Return a running PostgreSQL server; skip the test where it is not installed."""
+    with postgres_server() as server:
+        yield server

@@ -45,7 +45,7 @@ class ParserScore:
 def load_sentences(path: Path = SENTENCES) -> list[TaskGraph]:
     """Return the expected graphs, with their sentence as text, of a JSON file. Raises InvalidInputError, OSError.
 
-    The file is a list of graphs in the form of `gausslite parse --json`, with the sentence as "text" (docs/guides/task.md).
+    The file is a list of graphs in the form of `gausslite parse --json`, with the sentence as "text".
     """
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))

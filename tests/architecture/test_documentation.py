@@ -113,8 +113,8 @@ def test_flags_named_in_pages_exist(help_texts: str) -> None:
     # of pip, docker and our own scripts
     others = {"--check", "--editable", "--no-index", "--build", "--python"}
     others |= {"--masks", "--homes", "--gains", "--pose-noise"}
-    # of cibuildwheel, mkdocs, pytest-xdist, cmake and ray
-    others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel", "--head"}
+    # of cibuildwheel, mkdocs, pytest-xdist and cmake
+    others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel"}
     unknown = []
     for page in pages():
         text = page.read_text()

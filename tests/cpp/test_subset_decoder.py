@@ -1,4 +1,4 @@
-"""The C++ decoder, written from docs/reference/wire.md, gives the Python decoder's values and refuses damaged messages."""
+"""The C++ decoder, written from docs/reference/wire.md, gives the Python decoder's values and refuses damage."""
 
 from __future__ import annotations
 

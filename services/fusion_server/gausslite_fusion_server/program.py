@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import secrets
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.fusion.engine import FusionEngine
@@ -26,11 +22,13 @@ from gausslite_fusion_server.maintenance import run_command
 from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
-from gausslite_fusion_server.settings import MAINTENANCE_COMMANDS, PROGRAM, ServerSettings, parse_arguments
-from gausslite_fusion_server.store_follower import ServerLeadership, follow_store
-
-if TYPE_CHECKING:
-    from gausslite.cluster.ray_store import RayStore
+from gausslite_fusion_server.settings import (
+    MAINTENANCE_COMMANDS,
+    POSTGRES_SCHEME,
+    PROGRAM,
+    ServerSettings,
+    parse_arguments,
+)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -52,51 +50,35 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return run_service(PROGRAM, serve)
 
 
-def _open_store(settings: ServerSettings) -> tuple[FusionStore, ServerLeadership | None]:
-    """Return the store and, of a store that servers share, who leads. Raises InvalidInputError, StorageError."""
-    if settings.store is None:
-        return MemoryStore(), None
-    if settings.shards is None:
-        return SqliteStore(settings.store, settings.store_max_bytes), None
-    ray_store = _open_ray_store(settings.store, settings.shards, settings)
-    return ray_store, ray_store
-
-
-def _open_engine(settings: ServerSettings, store: FusionStore, leadership: ServerLeadership | None) -> FusionEngine:
-    if leadership is None:
-        return FusionEngine(store, settings.fusion, decode_keyframe=decode_frame)
-    leadership.renew()
-    return FusionEngine(store, settings.fusion, _revision_of_one_server(), decode_frame, leadership.leads)
-
-
-def _revision_of_one_server() -> int:
-    """Return a first revision so that the revisions of servers that share a store differ.
-
-    A watcher that changes the server then gets a snapshot, and not changes since another server's revision. A server
-    would need 4096 revisions in each microsecond to reach those of one that started later.
-    """
-    return (time.time_ns() // 1000 << 12) + secrets.randbelow(1 << 12)
-
-
-def _open_ray_store(folder: Path, shards: int, settings: ServerSettings) -> RayStore:
+def _open_database(url: str) -> FusionStore:
     try:
-        # Ray is large, and an extra
-        from gausslite.cluster.ray_store import RaySettings, RayStore
-    except ModuleNotFoundError as error:
+        # psycopg is an extra
+        from gausslite.fusion.postgres_store import PostgresStore
+    except ImportError as error:
         raise InvalidInputError(
-            "--shards: expected the package 'ray'; install it with: pip install 'gausslite[ray]'"
+            f"--store {POSTGRES_SCHEME}...: expected the package 'psycopg'; install it with: "
+            "pip install 'gausslite[postgres]'"
         ) from error
-    return RayStore(RaySettings(folder, shards, settings.ray_address, settings.store_max_bytes))
+    return PostgresStore(url)
+
+
+def _open_store(settings: ServerSettings) -> FusionStore:
+    """Return the store. Raises InvalidInputError, StorageError."""
+    if settings.database is not None:
+        return _open_database(settings.database)
+    if settings.store is None:
+        return MemoryStore()
+    return SqliteStore(settings.store, settings.store_max_bytes)
 
 
 async def _serve(settings: ServerSettings) -> None:
-    store, leadership = _open_store(settings)
+    store = _open_store(settings)
     with contextlib.closing(store):
-        engine = _open_engine(settings, store, leadership)
+        engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame)
         refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
         servicer = FusionServicer(engine, refinement)
         try:
-            await _serve_mission(settings, engine, servicer, leadership)
+            await _serve_mission(settings, engine, servicer)
         finally:
             servicer.close()
             # a full disk is in the log already
@@ -104,15 +86,10 @@ async def _serve(settings: ServerSettings) -> None:
                 engine.save_counters()
 
 
-async def _serve_mission(
-    settings: ServerSettings, engine: FusionEngine, servicer: FusionServicer, leadership: ServerLeadership | None
-) -> None:
+async def _serve_mission(settings: ServerSettings, engine: FusionEngine, servicer: FusionServicer) -> None:
     async def work_until_stopped() -> None:
         try:
-            if leadership is None:
-                await asyncio.Event().wait()
-            else:
-                await follow_store(engine, leadership, servicer.publish_changes)
+            await asyncio.Event().wait()
         finally:
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
             servicer.drain()

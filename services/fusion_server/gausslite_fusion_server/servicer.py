@@ -102,8 +102,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._gate.close()
         self._map_changes.notify()
 
-    def publish_changes(self) -> None:
-        """Send watchers what other servers have changed, and look which frames are due. Use it on the event loop."""
+    def _publish_changes(self) -> None:
+        """Wake the watchers, and look which frames are due. Use it on the event loop."""
         self._map_changes.notify()
         self._align_in_background()
 
@@ -170,7 +170,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             outcome = await outcome_of(self._engine, queued)
             if outcome.status == pb.SUBSET_STATUS_REJECTED:
                 self._rejections.record(caller.key, outcome.reason, outcome.message)
-            self.publish_changes()
+            self._publish_changes()
             acknowledged = max(acknowledged, request.sequence)
             yield pb.ContributeSubsetsResponse(acknowledged=acknowledged, outcomes=[outcome])
 

@@ -13,6 +13,7 @@ from gausslite.config.layers import parse_options
 from gausslite.config.mapping_options import add_rasterizer, add_voxel_size
 from gausslite.config.numbers import Number
 from gausslite.config.tls_options import add_tls, read_server_tls
+from gausslite.config.toml_text import without_password
 from gausslite.config.view_option import add_view
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
@@ -28,8 +29,7 @@ from gausslite.wire.tls import Tls
 PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"
 STORE_SUFFIX = ".sqlite"
-RAY_LOCAL = "local"
-MAX_SHARDS = 1024
+POSTGRES_SCHEME = "postgresql://"
 _CORRECT, _TRUST = "correct", "trust"
 _MAX_STORE_MB = 1 << 24
 _MAINTENANCE = (
@@ -43,17 +43,16 @@ MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
-    """Address, storage (None: in memory) and limits of the server, and the mission that it serves.
+    """Address, storage (a file, the URL of a PostgreSQL database, or memory) and limits of the server, and the mission.
 
-    shards: the storage is a folder, for shards on Ray; None for a file. view: port of the page that shows the server,
-    None for no page. health: own address for health checks, None for none.
+    view: port of the page that shows the server, None for no page. health: own address for health checks, None for
+    none.
     """
 
     listen: str = FUSION_ADDRESS
     store: Path | None = None
+    database: str | None = field(default=None, repr=False)
     store_max_bytes: int | None = None
-    shards: int | None = None
-    ray_address: str = RAY_LOCAL
     fusion: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = "auto"
@@ -79,13 +78,10 @@ class MaintenanceSettings:
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Return the settings of the options. Raises InvalidInputError for values that are out of range."""
     options = parse_options(build_parser(), arguments, warn=print_message)
-    if options.shards is not None and options.store == MEMORY:
-        raise InvalidInputError("--shards: expected a folder as --store, got none")
     _require_store(options)
+    is_database = options.store.startswith(POSTGRES_SCHEME)
     if options.health is not None:
         host_and_port("--health", options.health)
-    if options.shards is None and options.ray_address != RAY_LOCAL:
-        raise InvalidInputError("--ray-address: expected --shards beside it")
     quotas = Quotas(
         options.quota_agents,
         options.quota_voxels,
@@ -95,10 +91,9 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     )
     return ServerSettings(
         options.listen,
-        None if options.store == MEMORY else Path(options.store),
+        None if options.store == MEMORY or is_database else Path(options.store),
+        options.store if is_database else None,
         None if options.store_max_mb is None else options.store_max_mb << 20,
-        options.shards,
-        options.ray_address,
         FusionSettings(
             VoxelGrid(options.voxel_size),
             options.mission,
@@ -119,17 +114,22 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
 
 def _require_store(options: argparse.Namespace) -> None:
     """Raise InvalidInputError for a --store of another kind than the other options need, or for a misspelt one."""
-    if options.store == MEMORY or options.shards is not None:
+    if options.store == MEMORY:
+        return
+    if options.store.startswith(POSTGRES_SCHEME):
+        if options.store_max_mb is not None:
+            raise InvalidInputError("--store-max-mb: expected a file as --store, got a database")
         return
     path = Path(options.store)
     if path.is_dir():
         missions = f"; start one server for each mission in the folder: --store FILE{STORE_SUFFIX}"
         has_missions = any(path.glob(f"*{STORE_SUFFIX}"))
-        raise InvalidInputError(
-            f"--store {path}: expected a file; a folder needs --shards{missions if has_missions else ''}"
-        )
+        raise InvalidInputError(f"--store {path}: expected a file, got a folder{missions if has_missions else ''}")
     if path.suffix != STORE_SUFFIX and not path.exists():
-        raise InvalidInputError(f"--store {path}: expected {MEMORY} or the name of a file that ends in {STORE_SUFFIX}")
+        raise InvalidInputError(
+            f"--store {without_password(options.store)}: expected {MEMORY} or the name of a file that ends in "
+            f"{STORE_SUFFIX}, or {POSTGRES_SCHEME}USER@HOST/DATABASE"
+        )
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -144,16 +144,8 @@ def build_parser() -> argparse.ArgumentParser:
     defaults, quotas = ServerSettings(), Quotas()
     add = parser.add_argument
     add("--listen", default=defaults.listen, metavar="ADDRESS", help="HOST:PORT or unix:PATH (default: %(default)s)")
-    storage = "storage of the voxel updates; with --shards a folder that all machines share (default: memory)"
-    add("--store", default=MEMORY, metavar="memory|PATH.sqlite|FOLDER", help=storage)
-    shards = "divide the space among this many processes on Ray, each with a standby (default: one file)"
-    add("--shards", type=Number("shards", int, 1, MAX_SHARDS), metavar="N", help=shards)
-    add(
-        "--ray-address",
-        default=RAY_LOCAL,
-        metavar="local|auto|HOST:PORT",
-        help="Ray cluster of --shards; local starts one on this machine (default: %(default)s)",
-    )
+    storage = "storage of the voxel updates (default: memory)"
+    add("--store", default=MEMORY, metavar="memory|PATH.sqlite|postgresql://USER@HOST/DATABASE", help=storage)
     max_mb = Number("store-max-mb", int, 1, _MAX_STORE_MB)
     add("--store-max-mb", type=max_mb, metavar="MB", help="largest size of the SQLite file (default: no limit)")
     add_voxel_size(parser)

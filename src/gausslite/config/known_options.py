@@ -7,7 +7,7 @@ from typing import Final
 
 KNOWN_OPTIONS: Final = frozenset(
     {
-        *("agents", "corpus", "held", "hostile", "kills", "messages", "seconds", "server", "servers", "watchers"),
+        *("agents", "corpus", "held", "hostile", "kills", "messages", "seconds", "server", "watchers"),
         *("absent", "accept-similar", "after", "agent-id", "backend", "before", "blur", "camera-correction", "caps"),
         "changes",
         *("deadline-slack", "details", "detector", "disable", "drain-timeout", "equal", "exit-when-done"),
@@ -56,7 +56,6 @@ KNOWN_OPTIONS: Final = frozenset(
             "quota-voxels",
             "rasterizer",
             "rate",
-            "ray-address",
             "real",
             "recorded-size",
             "refine-iterations",
@@ -72,7 +71,6 @@ KNOWN_OPTIONS: Final = frozenset(
             "save-state",
             "seed",
             "seeds",
-            "shards",
         ),
         *("save-scores", "segmenter", "sentences", "shares", "simd", "size", "sizes", "skip-stages", "source", "spool"),
         *("state", "store", "store-max-mb", "strict", "task", "task-a", "task-at", "task-b", "test-every"),

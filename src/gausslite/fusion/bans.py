@@ -32,13 +32,6 @@ class BanList:
         self._store.save_record(agent_id, RECORD, _BANNED)
         self._agents.add(agent_id)
 
-    def follow(self, agent_id: str, data: bytes) -> None:
-        """Apply a record that another server has saved."""
-        if data == _BANNED:
-            self._agents.add(agent_id)
-        else:
-            self._agents.discard(agent_id)
-
     def remove(self, agent_id: str) -> None:
         """Allow a banned agent again. Raises InvalidInputError if it is not banned, StorageError."""
         if agent_id not in self._agents:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future
 from threading import RLock
 from typing import NamedTuple
@@ -20,8 +20,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.change_follower import ChangeFollower
-from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
+from gausslite.fusion.fused_map import FusedMapLayers
 from gausslite.fusion.keyframes import (
     AgentKeyframe,
     EncodedKeyframe,
@@ -36,17 +35,12 @@ from gausslite.fusion.mission_status import mission_status
 from gausslite.fusion.refined_map import save_refinement
 from gausslite.fusion.storage_probe import StorageProbe
 from gausslite.fusion.store import FusionStore, require_storable
-from gausslite.fusion.store_changes import ContentReplaced
 from gausslite.fusion.store_values import PutOutcome, SessionRecord
 from gausslite.fusion.team_objects import find_objects
 from gausslite.fusion.traffic import MissionStatus, TrafficCounters
 from gausslite.fusion.update_committer import UpdateCommitter
 from gausslite.fusion.update_queue import PendingUpdate
 from gausslite.fusion.usage import require_within_quotas
-
-
-def _always() -> bool:
-    return True
 
 
 class JoinResult(NamedTuple):
@@ -64,11 +58,9 @@ class JoinResult(NamedTuple):
 class FusionEngine:
     """Owns the store, the sessions, the keyframes and the refined map of one mission. Thread-safe.
 
-    Updates, sessions, keyframes, objects, counters and the refined map persist with the store. Several servers may
-    share a store; `follow` applies what the others have written.
+    Updates, sessions, keyframes, objects, counters and the refined map persist with the store.
     first_revision must exceed the revisions from before a restart; by default it is the time in microseconds.
-    decode_keyframe reads keyframes as they were received; only a refinement needs it. leads: whether this server, of
-    those that share the store, estimates the agents' frames.
+    decode_keyframe reads keyframes as they were received; only a refinement needs it.
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
@@ -78,7 +70,6 @@ class FusionEngine:
         settings: FusionSettings,
         first_revision: int | None = None,
         decode_keyframe: FrameDecoder = no_decoder,
-        leads: Callable[[], bool] = _always,
     ) -> None:
         self._lock = RLock()
         self._store = store
@@ -86,8 +77,7 @@ class FusionEngine:
         self._storage = StorageProbe(store)
         if first_revision is None:
             first_revision = time.time_ns() // 1000
-        self._decode_keyframe, self._leads = decode_keyframe, leads
-        self._mission, self._follower = self._open_mission(first_revision)
+        self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe)
         self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_update)
 
     @property
@@ -147,11 +137,8 @@ class FusionEngine:
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
         with self._committer.committing, self._lock:
-            self._apply_new_changes()
             self._mission.members.admit(agent_id, requested, token)
             session = self._mission.members.open_session(agent_id, token)
-            # from now on, no server stores anything of an earlier session
-            self._apply_new_changes()
             if fresh_map:
                 self._mission.agents.begin_new_map(agent_id)
                 self._mission.members.save_token(agent_id, token)
@@ -203,28 +190,12 @@ class FusionEngine:
         It takes up to seconds, mostly without the lock. Call it from one thread at a time. Raises StorageError.
         """
         changed = False
-        for agent_id in self._mission.aligner.due() if self._leads() else ():
+        for agent_id in self._mission.aligner.due():
             keys = self._mission.aligner.estimate(agent_id)
             with self._lock:
                 self._mission.maps.record(agent_id, keys)
                 changed |= self._mission.agents.drop_contradicted(agent_id) or len(keys) > 0
         return changed
-
-    def follow(self) -> bool:
-        """Apply what other servers have written to the store; returns whether there was anything.
-
-        It may wait for other machines, without a lock. Raises StorageError.
-        """
-        if not self._store.fetch_changes() and not self._follower.has_deferred:
-            return False
-        with self._committer.committing, self._lock:
-            self._apply_changes()
-        return True
-
-    def save_leases(self) -> None:
-        """Tell the other servers of the store which agents are alive. Raises StorageError."""
-        with self._lock:
-            self._mission.members.save_leases()
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
         """Set the motion from the agent's frame to the fused map's that the agent declares. Raises StorageError."""
@@ -286,7 +257,6 @@ class FusionEngine:
         only that. Raises InvalidInputError for an unknown agent that is not banned, StorageError.
         """
         with self._committer.committing, self._lock:
-            self._apply_new_changes()
             voxels = self._store.totals(agent_id).voxels
             self._mission.members.require_evictable(agent_id, ban)
             self._mission.members.end_agent(agent_id)
@@ -297,8 +267,7 @@ class FusionEngine:
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
-        with self._committer.committing, self._lock:
-            self._apply_new_changes()
+        with self._lock:
             self._mission.members.unban(agent_id)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
@@ -354,22 +323,6 @@ class FusionEngine:
         with self._lock:
             self._store.close()
 
-    def _apply_new_changes(self) -> None:
-        if self._store.fetch_changes():
-            self._apply_changes()
-
-    def _apply_changes(self) -> None:
-        changes = self._store.take_changes()
-        if ContentReplaced() in changes:
-            newest = max(self.maps.revision(layer) for layer in MapLayer)
-            self._mission, self._follower = self._open_mission(newest + 1)
-        else:
-            self._follower.apply(changes)
-
-    def _open_mission(self, first_revision: int) -> tuple[MissionData, ChangeFollower]:
-        mission = MissionData.open(self._store, self._settings, self._lock, first_revision, self._decode_keyframe)
-        return mission, ChangeFollower(mission, self._leads)
-
     def _check_update(self, update: PendingUpdate) -> RoiSubset:
         """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
         self._mission.members.session(update.session_id)
@@ -382,8 +335,7 @@ class FusionEngine:
 
     def _record_update(self, subset: RoiSubset, outcome: PutOutcome) -> None:
         """Update the fused map after a commit."""
-        if self._leads():
-            self._mission.aligner.record(subset.agent_id, outcome.accepted)
+        self._mission.aligner.record(subset.agent_id, outcome.accepted)
         if len(outcome.accepted):
             self._mission.maps.record(
                 subset.agent_id, self._mission.votes.changed_keys(subset.agent_id, outcome.accepted)

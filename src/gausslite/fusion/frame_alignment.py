@@ -151,10 +151,6 @@ class FrameAlignments:
         self._store.save_record(agent_id, RECORD, _encode(alignment))
         self._by_agent[agent_id] = alignment
 
-    def follow(self, agent_id: str, data: bytes) -> None:
-        """Apply an alignment that another server has stored. Raises CodecError."""
-        self._by_agent[agent_id] = _decode(data)
-
     def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
         """Set the motion that the agent declares; estimates from before are dropped if it changed."""
         current = self.get(agent_id)

@@ -37,10 +37,6 @@ class FreeSpaceRecords:
         self._store.save_record(agent_id, RECORD, encode_free_space(after, self.grid))
         self._by_agent[agent_id] = after
 
-    def follow(self, agent_id: str, data: bytes) -> None:
-        """Apply what another server has stored of an agent. Raises CodecError."""
-        self._by_agent[agent_id] = decode_free_space(data, _STORED_BYTES)[0]
-
     def free_voxels(self, agent_id: str) -> int:
         """Return the number of voxels that the agent has observed as free."""
         return self._by_agent.get(agent_id, FreeSpace.empty()).free_voxels

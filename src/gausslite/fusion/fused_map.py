@@ -20,7 +20,7 @@ from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.change_log import ChangeLog
-from gausslite.fusion.refined_map import RefinedMap, StoredRefinement, decode_refinement
+from gausslite.fusion.refined_map import RefinedMap, StoredRefinement
 from gausslite.fusion.tile_index import TileIndex
 from gausslite.fusion.vote import VoteResult, fuse, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
@@ -150,14 +150,6 @@ class FusedMapLayers:
             self._refined = refined
             vote = rank_voxels(self._votes.scores())
         return StoredRefinement.of(refined, vote, np.array(sorted(changed), np.int64))
-
-    def follow_refinement(self, data: bytes) -> None:
-        """Show a refinement that another server has stored. Raises CodecError."""
-        stored = decode_refinement(data)
-        with self._lock:
-            before = self._refined_tiles.all_keys()
-            shown = set(self._restore_refined(stored, rank_voxels(self._votes.scores())).tolist())
-            self._record_refined(sorted(shown), sorted(before - shown))
 
     def refined_map(self) -> VoxelBatch:
         """Return the refined map; voxels that changed after the refinement started show the newer vote.

@@ -109,19 +109,6 @@ class KeyframePool:
             raise InvalidInputError(f"index: expected a keyframe of {agent_id}, such as {indices[-1]}, got {index}")
         return self._store.keyframe(agent_id, indices[-1] if index is None else index)
 
-    def follow_saved(self, agent_id: str, index: int, size_bytes: int) -> None:
-        """Note a keyframe that another server has stored."""
-        self._sizes_bytes.setdefault(agent_id, {})[index] = size_bytes
-
-    def follow_removed(self, agent_id: str, indices: Iterable[int]) -> None:
-        """Note that another server has deleted these keyframes."""
-        for index in indices:
-            self._sizes_bytes.get(agent_id, {}).pop(index, None)
-
-    def reload(self) -> None:
-        """Read the indices and sizes again. Raises StorageError."""
-        self._sizes_bytes = self._store.keyframe_sizes()
-
     def remove_agent(self, agent_id: str) -> None:
         """Delete an agent's keyframes."""
         self._store.remove_keyframes(agent_id, sorted(self._sizes_bytes.pop(agent_id, ())))

@@ -98,34 +98,6 @@ class Membership:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
         self._bans.remove(agent_id)
 
-    def save_leases(self) -> None:
-        """Tell the other servers of the store which agents are alive. Raises StorageError."""
-        self._sessions.save_leases()
-
-    def follow_mission_config(self, mission_config: MissionConfig) -> None:
-        """Apply the configuration that agents have agreed on at another server."""
-        self._mission_config = mission_config
-
-    def follow_session(self, session: SessionRecord) -> None:
-        """Apply a join at another server."""
-        self._sessions.follow_session(session)
-
-    def follow_end(self, session_id: str) -> None:
-        """Apply the end of a session at another server."""
-        self._sessions.follow_end(session_id)
-
-    def follow_token(self, agent_id: str, data: bytes) -> None:
-        """Apply the record of a join at another server."""
-        self._sessions.follow_token(agent_id, data)
-
-    def follow_leases(self, _owner: str, data: bytes) -> None:
-        """Apply the record of leases renewed at another server."""
-        self._sessions.follow_leases(data)
-
-    def follow_ban(self, agent_id: str, data: bytes) -> None:
-        """Apply a ban, or its end, at another server."""
-        self._bans.follow(agent_id, data)
-
     def _is_agreed(self, agent_id: str) -> bool:
         """Return whether another live agent, or any data, fixes the mission's configuration."""
         return bool(frozenset(self._store.agents()) or self._sessions.live_agents - {agent_id})

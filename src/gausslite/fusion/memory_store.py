@@ -18,7 +18,6 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
 from gausslite.fusion.store import require_storable
-from gausslite.fusion.store_changes import StoreChange
 from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
 
 
@@ -163,14 +162,6 @@ class MemoryStore:
         """Return the record of this name of every agent that has one."""
         with self._lock:
             return dict(self._records.get(name, {}))
-
-    def fetch_changes(self) -> bool:
-        """Return False: one server uses this store."""
-        return False
-
-    def take_changes(self) -> list[StoreChange]:
-        """Return nothing."""
-        return []
 
     def close(self) -> None:
         """Do nothing; there are no files to close."""

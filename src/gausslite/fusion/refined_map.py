@@ -84,10 +84,10 @@ def save_refinement(store: FusionStore, stored: StoredRefinement) -> None:
 def load_refinement(store: FusionStore) -> StoredRefinement | None:
     """Return the store's refinement, None without one. Raises CodecError, StorageError."""
     data = store.records(RECORD).get(_OWNER)
-    return None if data is None else decode_refinement(data)
+    return None if data is None else _decode_refinement(data)
 
 
-def decode_refinement(data: bytes) -> StoredRefinement:
+def _decode_refinement(data: bytes) -> StoredRefinement:
     """Return a stored refinement. Raises CodecError."""
     try:
         columns = load(data)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import secrets
 import time
 from collections import deque
@@ -16,9 +15,6 @@ from gausslite.fusion.store_values import SessionRecord
 
 _MAX_REPLACED_SESSIONS = 1000
 TOKEN_RECORD = "join-token"  # noqa: S105 - the name of a record
-LEASES_RECORD = "leases"
-# no agent can have an empty id
-_MISSION = ""
 _NAME_TAKEN = "another robot uses this name; give each its own agent id"
 
 
@@ -26,8 +22,7 @@ class SessionRegistry:
     """Opens, finds and ends sessions; they persist with the store. Not thread-safe; FusionEngine holds a lock.
 
     A lease lasts `lease_s` after the session's last use; clock_s: the time in seconds. Only a join with the token of
-    the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256. The methods
-    `follow_...` apply what other servers of the same store have written.
+    the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256.
     """
 
     def __init__(self, store: FusionStore, lease_s: float, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -38,9 +33,6 @@ class SessionRegistry:
         self._token_hashes = store.records(TOKEN_RECORD)
         # replaced sessions, and whether the same token replaced them
         self._replaced: deque[tuple[str, bool]] = deque(maxlen=_MAX_REPLACED_SESSIONS)
-        self._renewed: set[str] = set()
-        # agents whose next session has another token
-        self._other_holders: set[str] = set()
 
     @property
     def agents(self) -> frozenset[str]:
@@ -65,41 +57,17 @@ class SessionRegistry:
         session = SessionRecord(secrets.token_hex(16), agent_id)
         self.save_token(agent_id, token)
         self._store.save_session(session)
-        self._replace(session, is_holder)
+        for replaced in self._sessions_of(agent_id):
+            del self._sessions[replaced]
+            self._replaced.append((replaced, is_holder))
+        self._sessions[session.session_id] = session
+        self._renew(agent_id)
         return session
 
     def save_token(self, agent_id: str, token: str) -> None:
         """Store the token of an agent's session, also after its other records were deleted. Raises StorageError."""
         self._store.save_record(agent_id, TOKEN_RECORD, _hash(token))
         self._token_hashes[agent_id] = _hash(token)
-
-    def follow_token(self, agent_id: str, token_hash: bytes) -> None:
-        """Note the token of a join; its session follows."""
-        if token_hash != self._token_hashes.get(agent_id):
-            self._other_holders.add(agent_id)
-        self._token_hashes[agent_id] = token_hash
-
-    def follow_session(self, session: SessionRecord) -> None:
-        """Replace the agent's session by one that it opened at another server."""
-        self._replace(session, is_holder=session.agent_id not in self._other_holders)
-        self._other_holders.discard(session.agent_id)
-
-    def follow_end(self, session_id: str) -> None:
-        """End a session that has ended at another server."""
-        session = self._sessions.pop(session_id, None)
-        if session is not None:
-            self._lease_ends_s.pop(session.agent_id, None)
-
-    def save_leases(self) -> None:
-        """Tell the other servers which leases were renewed here since the last call. Raises StorageError."""
-        renewed, self._renewed = self._renewed, set()
-        if renewed:
-            self._store.save_record(_MISSION, LEASES_RECORD, json.dumps(sorted(renewed)).encode())
-
-    def follow_leases(self, renewed: bytes) -> None:
-        """Renew the leases of agents that are at another server."""
-        for agent_id in self.agents.intersection(json.loads(renewed)):
-            self._lease_ends_s[agent_id] = self._clock_s() + self._lease_s
 
     def get(self, session_id: str) -> SessionRecord:
         """Return the session of this id and renew its lease.
@@ -140,17 +108,8 @@ class SessionRegistry:
     def _sessions_of(self, agent_id: str) -> list[str]:
         return [key for key, session in self._sessions.items() if session.agent_id == agent_id]
 
-    def _replace(self, session: SessionRecord, is_holder: bool) -> None:
-        """Make it the agent's only session. is_holder: it has the token of the one before it."""
-        for replaced in self._sessions_of(session.agent_id):
-            del self._sessions[replaced]
-            self._replaced.append((replaced, is_holder))
-        self._sessions[session.session_id] = session
-        self._renew(session.agent_id)
-
     def _renew(self, agent_id: str) -> None:
         self._lease_ends_s[agent_id] = self._clock_s() + self._lease_s
-        self._renewed.add(agent_id)
 
     def _remaining_s(self, agent_id: str) -> float:
         return self._lease_ends_s.get(agent_id, -float("inf")) - self._clock_s()

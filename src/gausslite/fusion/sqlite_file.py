@@ -1,4 +1,4 @@
-"""Open the SQLite file of a store: schema, the lock of one server, checksums of rows, and errors in plain words."""
+"""Open the SQLite file of a store: schema, the lock of one server, and errors in plain words."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ import fcntl
 import os
 import secrets
 import sqlite3
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-import google_crc32c
 
 from gausslite.domain.errors import StorageError
 
@@ -41,7 +38,6 @@ CREATE TABLE mission_config (
     only INTEGER PRIMARY KEY CHECK (only = 1),
     mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m REAL NOT NULL);
 """
-_UPDATE_HEADER = struct.Struct("<qqqq")
 
 
 class StoreLock:
@@ -120,17 +116,6 @@ def remove_store(path: Path) -> None:
     """Delete a store that no process uses, with its log and its lock."""
     for suffix in ("", "-wal", "-shm", "-lock"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
-
-
-def update_checksum(agent_id: str, voxel: int, scores: tuple[int, int, int], gaussians: bytes) -> int:
-    """Return the CRC32C of an update; scores: its update_seq, Σkappa and count."""
-    head = agent_id.encode() + _UPDATE_HEADER.pack(voxel, *scores)
-    return int(google_crc32c.extend(google_crc32c.value(head), gaussians))
-
-
-def data_checksum(owner: str, name: str | int, data: bytes) -> int:
-    """Return the CRC32C of a keyframe or record."""
-    return int(google_crc32c.extend(google_crc32c.value(f"{owner}\0{name}".encode()), data))
 
 
 def connect(path: Path) -> sqlite3.Connection:

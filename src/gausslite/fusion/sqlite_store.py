@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,10 +11,10 @@ from threading import RLock
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import from_stored, is_stored, to_stored
+from gausslite.codec.stored_voxels import to_stored
 from gausslite.domain.errors import StorageError
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
@@ -28,13 +27,11 @@ from gausslite.fusion.sqlite_file import (
     RESTORE_ADVICE,
     StoreLock,
     connect,
-    data_checksum,
     open_or_create,
     storage_errors,
-    update_checksum,
 )
 from gausslite.fusion.store import require_storable
-from gausslite.fusion.store_changes import StoreChange
+from gausslite.fusion.store_rows import UpdateRow, batch_of_rows, data_checksum, index_rows, is_intact, update_rows
 from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
 
 _LOADED_ROWS = 10_000
@@ -44,12 +41,9 @@ INSERT INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (agent_id, vo
     checksum = excluded.checksum, gaussians = excluded.gaussians
 """
 SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, gaussians FROM voxel_updates"
-"""Rows as `is_intact` reads them."""
-_SELECT_POSITION = "SELECT value FROM properties WHERE name = 'log_position'"
-_SET_POSITION = "INSERT OR REPLACE INTO properties VALUES ('log_position', ?)"
+"""UpdateRows."""
 _SELECT_AGENT = f"{SELECT_UPDATES} WHERE agent_id = ? ORDER BY voxel"
 _SELECT_VOXELS = f"{SELECT_UPDATES} WHERE agent_id = ? AND voxel IN (SELECT value FROM json_each(?)) ORDER BY voxel"  # noqa: S608
-_UpdateRow = tuple[str, int, int, int, int, int, bytes]
 
 
 class SqliteStore:
@@ -76,7 +70,6 @@ class SqliteStore:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
             self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
-            self._log_position = sum(int(row[0]) for row in self._read(_SELECT_POSITION))
             self._grid = _grid_of(self.mission_config())
             self._opened = opened.pop_all()
 
@@ -84,11 +77,6 @@ class SqliteStore:
     def incarnation_id(self) -> str:
         """The id made with the file, by a restore or by a repair."""
         return self._incarnation_id
-
-    @property
-    def log_position(self) -> int:
-        """The number of transactions since the file was made; a backup has that of its source."""
-        return self._log_position
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
@@ -104,7 +92,7 @@ class SqliteStore:
             if any(mask.any() for mask in masks):
                 with self._transaction() as db:
                     for subset, own, mask in zip(subsets, encoded, masks, strict=True):
-                        db.executemany(_UPSERT, _rows(subset, own, mask))
+                        db.executemany(_UPSERT, update_rows(subset, own, mask))
             with self._index_lock:
                 for subset, mask in zip(subsets, masks, strict=True):
                     self._index.put(subset.agent_id, subset.batch.keys[mask], scores_of(subset, mask))
@@ -148,16 +136,14 @@ class SqliteStore:
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        rows: list[_UpdateRow] = (
+        rows: list[UpdateRow] = (
             self._read(_SELECT_AGENT, (agent_id,))
             if keys is None
             else self._read(_SELECT_VOXELS, (agent_id, _as_json(keys)))
         )
         for row in rows:
             self._require_intact(row)
-        keys, counts = np.array([row[1] for row in rows], np.int64), np.array([row[4] for row in rows], np.uint32)
-        sums = np.array([row[3] for row in rows], np.uint64)
-        return VoxelBatch(keys, sums, counts, from_stored(keys, counts, [row[6] for row in rows]))
+        return batch_of_rows(rows)
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
@@ -245,14 +231,6 @@ class SqliteStore:
                 raise self._damaged(f"record {name!r} of agent {agent_id!r}")
         return {agent_id: data for agent_id, data, _ in rows}
 
-    def fetch_changes(self) -> bool:
-        """Return False: one server uses this store."""
-        return False
-
-    def take_changes(self) -> list[StoreChange]:
-        """Return nothing."""
-        return []
-
     def close(self) -> None:
         """Write the log into the file and close it."""
         with self._write_lock, self._read_lock:
@@ -268,12 +246,9 @@ class SqliteStore:
             while rows := cursor.fetchmany(_LOADED_ROWS):
                 for row in rows:
                     self._require_intact(row)
-                for agent_id, own in itertools.groupby(rows, key=lambda row: row[0]):
-                    _, voxels, seqs, sums, counts, _, _ = zip(*own, strict=True)
-                    columns = np.array(seqs, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32)
-                    self._index.put(agent_id, np.array(voxels, np.int64), StoredScores(*columns))
+                index_rows(self._index, rows)
 
-    def _require_intact(self, row: _UpdateRow) -> None:
+    def _require_intact(self, row: UpdateRow) -> None:
         if not is_intact(row):
             raise self._damaged(f"voxel {row[1]} of agent {row[0]!r}")
 
@@ -290,30 +265,11 @@ class SqliteStore:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 yield self._writer
-                self._writer.execute(_SET_POSITION, (str(self._log_position + 1),))
                 self._writer.execute("COMMIT")
-                self._log_position += 1
             except BaseException:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
                 raise
-
-
-def is_intact(row: _UpdateRow) -> bool:
-    """Return whether a row of updates has its checksum and as many Gaussians as it counts."""
-    agent_id, voxel, update_seq, kappa_sum, count, checksum, gaussians = row
-    return (
-        is_stored(gaussians, count)
-        and update_checksum(agent_id, voxel, (update_seq, kappa_sum, count), gaussians) == checksum
-    )
-
-
-def _rows(subset: RoiSubset, encoded: list[bytes], selected: Bool[ndarray, " v"]) -> Iterator[_UpdateRow]:
-    batch = subset.batch
-    for i in np.flatnonzero(selected).tolist():
-        key = int(batch.keys[i])
-        scores = subset.update_seq, int(batch.kappa_sums[i]), int(batch.counts[i])
-        yield (subset.agent_id, key, *scores, update_checksum(subset.agent_id, key, scores, encoded[i]), encoded[i])
 
 
 def _grid_of(mission_config: MissionConfig | None) -> VoxelGrid | None:

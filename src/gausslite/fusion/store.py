@@ -19,7 +19,6 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.tile_digests import TileDigests
 from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
 from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store_changes import StoreChange
 from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
 
 
@@ -32,9 +31,6 @@ class FusionStore(Protocol):
 
     When a method of a durable store has returned, its effect survives a crash. All methods raise StorageError if the
     storage refuses; the store stays usable for other calls.
-
-    Several servers may share a store. What the others write counts in `agents`, `totals`, `digests`, `stored` and
-    `scores` from `take_changes` on; all other methods read the content as it is.
     """
 
     @property
@@ -124,17 +120,6 @@ class FusionStore(Protocol):
 
     def records(self, name: str) -> dict[str, bytes]:
         """Return the record of this name of every agent that has one."""
-        ...
-
-    def fetch_changes(self) -> bool:
-        """Fetch what other servers have written since the last call; returns whether there is anything to take.
-
-        It may wait for other machines, and changes nothing. A store that one server uses returns False.
-        """
-        ...
-
-    def take_changes(self) -> list[StoreChange]:
-        """Count what was fetched in the totals, and return it in the order in which each part of the store has it."""
         ...
 
     def close(self) -> None:

@@ -13,12 +13,12 @@ from gausslite.domain.errors import StorageError
 from gausslite.fusion.sqlite_file import (
     RESTORE_ADVICE,
     StoreLock,
-    data_checksum,
     open_existing,
     renew_incarnation,
     storage_errors,
 )
-from gausslite.fusion.sqlite_store import SELECT_UPDATES, is_intact
+from gausslite.fusion.sqlite_store import SELECT_UPDATES
+from gausslite.fusion.store_rows import data_checksum, is_intact
 
 
 @dataclass(frozen=True, slots=True)

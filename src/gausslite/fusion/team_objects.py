@@ -37,10 +37,6 @@ class TeamObjects:
         self._store.save_record(agent_id, RECORD, encode_object_report(report))
         self._reports[agent_id] = report
 
-    def follow(self, agent_id: str, data: bytes) -> None:
-        """Apply a report that another server has stored. Raises CodecError."""
-        self._reports[agent_id] = decode_object_report(data)
-
     def targets(self, agent_id: str) -> tuple[str, ...]:
         """Return the noun phrases of an agent's targets, by the `target` of its Gaussians; empty without a report."""
         report = self._reports.get(agent_id)

@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 
 from gausslite.domain.errors import CodecError, StorageError
 from gausslite.fusion.frame_alignment import FrameAlignment
@@ -40,10 +40,6 @@ class TrafficCounters:
             self.subsets_rejected + newer.subsets_rejected,
         )
 
-    def at_least(self, other: TrafficCounters) -> TrafficCounters:
-        """Return the larger value of each counter."""
-        return TrafficCounters(*(max(getattr(self, each.name), getattr(other, each.name)) for each in fields(self)))
-
 
 class TrafficLog:
     """The counters of each agent, saved in the store every 10 s. Not thread-safe; FusionEngine holds a lock."""
@@ -73,11 +69,6 @@ class TrafficLog:
         if not self._is_saved:
             self._store.save_record(_OWNER, RECORD, _encode(self._by_agent))
             self._is_saved = True
-
-    def follow(self, _owner: str, data: bytes) -> None:
-        """Take over counters that another server has saved, where they are higher. Raises CodecError."""
-        for agent_id, counters in _decode(data).items():
-            self._by_agent[agent_id] = self.of(agent_id).at_least(counters)
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""

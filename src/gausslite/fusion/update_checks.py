@@ -38,10 +38,6 @@ class UpdateChecks:
             self._store.save_record(agent_id, RECORD, _JOINED.pack(now_s))
             self._first_joined_s[agent_id] = now_s
 
-    def follow(self, agent_id: str, data: bytes) -> None:
-        """Apply a first join at another server."""
-        self._first_joined_s[agent_id] = _JOINED.unpack(data)[0]
-
     def check(self, subset: RoiSubset) -> RoiSubset:
         """Return the message with Σkappa computed from its Gaussians, whatever it declares.
 

@@ -9,14 +9,11 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from gausslite.cli.progress import progress_bar
-from gausslite.config.numbers import Number
 from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.server.agent_load import LoadResult
 from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
 from gausslite_bench.server.server_process import DEFAULT_COMMAND
-
-_MAX_SERVERS = 64
 
 
 def configure_server(parser: argparse.ArgumentParser) -> None:
@@ -28,8 +25,6 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
     add("--store", choices=["sqlite", "memory"], default="sqlite", help="store of the server (default: %(default)s)")
     add("--watchers", type=int, default=20, metavar="N", help="watchers that stop reading (default: %(default)s)")
     add("--server", default=DEFAULT_COMMAND, metavar="COMMAND", help="starts the server, to compare versions")
-    servers = "servers that share the store, for a --server command with --shards and --ray-address (default: 1)"
-    add("--servers", type=Number("servers", int, 1, _MAX_SERVERS), default=1, metavar="N", help=servers)
     add_switch(parser, "--hostile", "also measure 8 agents beside one that resends a message of 200000 tombstones")
     add_switch(parser, "--json", "print JSON for scripts")
     parser.set_defaults(run=run_server)
@@ -47,7 +42,6 @@ def run_server(options: argparse.Namespace) -> int:
         store=options.store,
         watchers=options.watchers,
         hostile=options.hostile,
-        servers=options.servers,
     )
     with progress_bar(len(settings.held), "server", "server") as progress:
         results = []
@@ -79,7 +73,7 @@ def _lines(result: StoredSizeResult) -> Iterator[str]:
     yield f"{result.held} Gaussians held (filled in {result.fill_s:.1f} s)"
     yield f"  largest team with p99 < {P99_LIMIT_MS:g} ms: {result.largest_team} agents"
     for load in result.loads:
-        yield f"{_load_line(load)}, servers {load.server_cpu_ms:.1f} ms of CPU per message"
+        yield f"{_load_line(load)}, server {load.server_cpu_ms:.1f} ms of CPU per message"
     if result.hostile is not None:
         yield f"{_load_line(result.hostile)}, beside a hostile agent"
     yield (

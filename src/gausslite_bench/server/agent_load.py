@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import time
 from collections.abc import Sequence
-from contextlib import AsyncExitStack, ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,13 +37,10 @@ class LoadResult:
 
 
 class AgentLoad:
-    """Joins agents and sends their messages. Sequence numbers continue from one load to the next.
+    """Joins agents and sends their messages. Sequence numbers continue from one load to the next."""
 
-    The agents of a load are spread evenly over the addresses, which are those of servers on one store.
-    """
-
-    def __init__(self, addresses: Sequence[str]) -> None:
-        self._addresses = tuple(addresses)
+    def __init__(self, address: str) -> None:
+        self._address = address
         self._next_seq = 1
 
     def fill(self, gaussians: int, gaussians_per_voxel: int) -> None:
@@ -53,7 +48,7 @@ class AgentLoad:
         voxels = gaussians // gaussians_per_voxel // _FILL_AGENTS
         if not voxels:
             return
-        with FusionClient(self._addresses[0], deadline_s=600.0) as client:
+        with FusionClient(self._address, deadline_s=600.0) as client:
             for number in range(_FILL_AGENTS):
                 agent_id = f"fill-{number}"
                 session_id = client.join(agent_id, GRID).session_id
@@ -64,16 +59,9 @@ class AgentLoad:
         """Send deltas from these agents; hostile: one more agent resends a message of 200 000 tombstones."""
         count = max(int(seconds * RATE_HZ), 1)
         names = [f"load-{number}" for number in range(agents)]
-        with ExitStack() as opened:
-            clients = [
-                opened.enter_context(FusionClient(address, deadline_s=60.0, token=_TOKEN))
-                for address in self._addresses
-            ]
-            sessions = [
-                client.join(name, GRID).session_id
-                for client, name in zip(itertools.cycle(clients), names, strict=False)
-            ]
-            hostile_session = clients[0].join("hostile", GRID).session_id if hostile else ""
+        with FusionClient(self._address, deadline_s=60.0, token=_TOKEN) as client:
+            sessions = [client.join(name, GRID).session_id for name in names]
+            hostile_session = client.join("hostile", GRID).session_id if hostile else ""
         messages = [delta_messages(name, number, count, self._next_seq) for number, name in enumerate(names)]
         self._next_seq += count
         times_s, missing = asyncio.run(self._send(sessions, messages, hostile_session))
@@ -81,7 +69,7 @@ class AgentLoad:
         return LoadResult(agents, agents * count, float(p50), float(p99), missing)
 
     async def _send_all(self, session_id: str, messages: Sequence[bytes]) -> None:
-        async with UpdateStreams(self._addresses[0]) as streams:
+        async with UpdateStreams(self._address) as streams:
             stream = streams.open(session_id)
             for data in messages:
                 await stream.send(data)
@@ -91,11 +79,10 @@ class AgentLoad:
         self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]], hostile_session: str
     ) -> tuple[list[float], int]:
         times_s: list[float] = []
-        async with AsyncExitStack() as opened:
-            streams = [await opened.enter_async_context(UpdateStreams(address)) for address in self._addresses]
+        async with UpdateStreams(self._address) as streams:
             data = tombstone_message("hostile", HOSTILE_TOMBSTONES, self._next_seq) if hostile_session else b""
             hostile = [
-                asyncio.ensure_future(streams[0].open(session).resend_forever(data))
+                asyncio.ensure_future(streams.open(session).resend_forever(data))
                 for session in (hostile_session,)
                 if session
             ]
@@ -103,7 +90,7 @@ class AgentLoad:
             tasks = [
                 asyncio.ensure_future(
                     _send_agent(
-                        streams[number % len(streams)].open(session),
+                        streams.open(session),
                         own,
                         begin_s + number / len(sessions) / RATE_HZ,
                         times_s,

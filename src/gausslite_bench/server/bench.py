@@ -6,7 +6,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -25,10 +25,7 @@ _WATCH_PAUSE_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class ServerBenchSettings:
-    """What to measure; command: starts the server. watchers: number that stop reading after the first block.
-
-    servers: number of servers on the store, which must be one that they can share.
-    """
+    """What to measure; command: starts the server. watchers: number that stop reading after the first block."""
 
     held: Sequence[int]
     agents: Sequence[int]
@@ -37,7 +34,6 @@ class ServerBenchSettings:
     store: str
     watchers: int
     hostile: bool
-    servers: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,19 +63,16 @@ class StoredSizeResult:
 
 def measure(settings: ServerBenchSettings, held: int, on_progress: Callable[[str], None]) -> StoredSizeResult:
     """Fill a new server and measure it. `on_progress` receives a description of each step."""
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
-        servers = []
-        for number in range(settings.servers):
-            servers.append(ServerProcess(settings.command, Path(folder), settings.store, f"fusion-{number}"))
-            opened.callback(servers[-1].close)
-        return _measure(settings, held, servers, on_progress)
+    with tempfile.TemporaryDirectory() as folder:
+        server = ServerProcess(settings.command, Path(folder), settings.store)
+        with closing(server):
+            return _measure(settings, held, server, on_progress)
 
 
 def _measure(
-    settings: ServerBenchSettings, held: int, servers: Sequence[ServerProcess], on_progress: Callable[[str], None]
+    settings: ServerBenchSettings, held: int, server: ServerProcess, on_progress: Callable[[str], None]
 ) -> StoredSizeResult:
-    server = servers[0]
-    load = AgentLoad([each.address for each in servers])
+    load = AgentLoad(server.address)
     on_progress(f"{held} Gaussians: fill")
     begin_s = time.monotonic()
     load.fill(held, GAUSSIANS_PER_VOXEL)
@@ -87,11 +80,9 @@ def _measure(
     loads: list[LoadResult] = []
     for agents in settings.agents:
         on_progress(f"{held} Gaussians: {agents} agents")
-        cpu_s = sum(each.cpu_s() for each in servers)
+        cpu_s = server.cpu_s()
         result = load.run(agents, settings.seconds)
-        loads.append(
-            replace(result, server_cpu_ms=1000 * (sum(each.cpu_s() for each in servers) - cpu_s) / result.messages)
-        )
+        loads.append(replace(result, server_cpu_ms=1000 * (server.cpu_s() - cpu_s) / result.messages))
     hostile = None
     if settings.hostile:
         on_progress(f"{held} Gaussians: hostile agent")

@@ -25,15 +25,12 @@ _QUOTAS = (
 
 
 class ServerProcess:
-    """Owns the process of a server on a store, and appends what it logs to a file.
+    """Owns the process of a server on a store, and appends what it logs to a file."""
 
-    name: of its socket and log, for several servers on one store.
-    """
-
-    def __init__(self, command: str, folder: Path, store: str, name: str = "fusion") -> None:
+    def __init__(self, command: str, folder: Path, store: str) -> None:
         self._command, self._store = command, "memory" if store == "memory" else str(folder / "store.sqlite")
-        self.address = f"unix:{folder}/{name}.sock"
-        self.log = folder / f"{name}.log"
+        self.address = f"unix:{folder}/fusion.sock"
+        self.log = folder / "fusion.log"
         self.start()
 
     @property

@@ -120,6 +120,17 @@ def test_a_printed_configuration_hides_the_password_of_a_url(capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(
+    "url", ["postgresql://fusion:se/cr@et@db/team", "postgresql://fusion@db/team?sslmode=require&password=se/cr@et"]
+)
+def test_a_printed_configuration_hides_the_password_of_a_database(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = printed(fusion_server.build_parser(), capsys, "--store", url)
+    assert "se/cr" not in text
+    assert "et@db" not in text
+    assert "fusion" in text
+    assert "db/team" in text
+
+
+@pytest.mark.parametrize(
     ("flags", "named"),
     [(["--rate", "-1"], "--rate: expected"), (["--seed", "-1"], "--seed: expected 0"), (["--threads", "0"], "threads")],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import signal
 import sqlite3
 import subprocess
@@ -14,10 +13,8 @@ from threading import Thread
 
 import numpy as np
 import pytest
-from support.local_replicas import LocalHosts
 from support.sample_batches import make_batch
 
-from gausslite.cluster.sharded_store import ShardedStore
 from gausslite.codec.records import to_records
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
@@ -55,36 +52,34 @@ def make_subset(agent_id: str, update_seq: int, counts: dict[int, int], kappa: i
     return RoiSubset(agent_id, "session", update_seq, update_seq, batch)
 
 
-def open_store(kind: str, folder: Path) -> FusionStore:
+OpenStore = Callable[[], FusionStore]
+
+
+def opener(kind: str, request: pytest.FixtureRequest) -> OpenStore:
+    """Return a function that opens the test's store of this kind, again after it was closed."""
     match kind:
         case "memory":
-            return MemoryStore()
+            return MemoryStore
         case "sqlite":
-            return SqliteStore(folder / "store.sqlite")
-        case "sharded":
-            return ShardedStore([SqliteStore(folder / f"shard-{number}.sqlite") for number in range(3)])
-        case "replicated":
-            return LocalHosts(folder).open_store(2)
-        case "ray":
-            from gausslite.cluster.ray_store import RaySettings, RayStore
+            path = request.getfixturevalue("tmp_path") / "store.sqlite"
+            return lambda: SqliteStore(path)
+        case _:
+            url = request.getfixturevalue("postgres").new_database()
+            from gausslite.fusion.postgres_store import PostgresStore
 
-            return RayStore(RaySettings(folder))
-    raise ValueError(kind)
+            return lambda: PostgresStore(url)
 
 
-RAY = pytest.param(
-    "ray",
-    marks=pytest.mark.skipif(
-        "GAUSSLITE_TEST_RAY" not in os.environ, reason="set GAUSSLITE_TEST_RAY=1: every test starts a Ray of its own"
-    ),
-)
-
-
-@pytest.fixture(params=["memory", "sqlite", "sharded", "replicated", RAY])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[FusionStore]:
-    store = open_store(request.param, tmp_path)
+@pytest.fixture(params=["memory", "sqlite", "postgres"])
+def store(request: pytest.FixtureRequest) -> Iterator[FusionStore]:
+    store = opener(request.param, request)()
     yield store
     store.close()
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def open_durable(request: pytest.FixtureRequest) -> OpenStore:
+    return opener(request.param, request)
 
 
 def test_stored_updates_are_read_back(store: FusionStore) -> None:
@@ -216,17 +211,37 @@ def test_threads_can_put_concurrently(store: FusionStore) -> None:
     assert store.scores().update_seqs.tolist() == [19] * 6
 
 
-def test_a_reopened_sqlite_store_has_the_same_content(tmp_path: Path) -> None:
-    path = tmp_path / "store.sqlite"
-    store = SqliteStore(path)
+def test_keyframes_and_records_are_stored_and_leave_with_their_agent(store: FusionStore) -> None:
+    for index in (3, 5, 5, 8):
+        store.save_keyframe("ant", index, bytes(index))
+    store.save_keyframe("bee", 5, b"")
+    store.save_record("ant", "objects", b"early")
+    store.save_record("ant", "objects", b"late")
+    store.save_record("bee", "objects", b"")
+    assert store.keyframe_sizes() == {"ant": {3: 3, 5: 5, 8: 8}, "bee": {5: 0}}
+    assert (store.keyframe("ant", 5), store.keyframe("ant", 6)) == (bytes(5), b"")
+    assert store.records("objects") == {"ant": b"late", "bee": b""}
+    store.remove_keyframes("ant", [3, 8, 9])
+    assert store.keyframe_sizes() == {"ant": {5: 5}, "bee": {5: 0}}
+    store.remove_agent("ant")
+    assert (store.keyframe_sizes(), store.records("objects")) == ({"bee": {5: 0}}, {"bee": b""})
+
+
+def test_a_reopened_store_has_the_same_content(open_durable: OpenStore) -> None:
+    store = open_durable()
     store.put(make_subset("ant", 3, {11: 2}))
     store.save_session(SessionRecord("one", "ant"))
     store.set_mission_config(MissionConfig("m", "w", 0.1))
+    store.save_keyframe("ant", 4, b"image")
+    incarnation_id = store.incarnation_id
     store.close()
-    again = SqliteStore(path)
+    again = open_durable()
     assert again.batch("ant").counts.tolist() == [2]
+    assert again.totals("ant") == AgentTotals(1, 1, 2, 2, 3)
     assert again.sessions() == (SessionRecord("one", "ant"),)
     assert again.mission_config() == MissionConfig("m", "w", 0.1)
+    assert again.keyframe("ant", 4) == b"image"
+    assert again.incarnation_id == incarnation_id
     again.close()
 
 
@@ -319,11 +334,13 @@ def test_an_unwritable_folder_is_one_clear_error(tmp_path: Path) -> None:
         SqliteStore(tmp_path)
 
 
-def test_a_second_server_on_the_same_file_is_refused(tmp_path: Path) -> None:
-    first = SqliteStore(tmp_path / "store.sqlite")
-    with pytest.raises(StorageError, match="in use by another server"):
-        SqliteStore(tmp_path / "store.sqlite")
+def test_a_second_server_on_the_same_store_is_refused(open_durable: OpenStore) -> None:
+    first = open_durable()
+    with pytest.raises(StorageError, match="in use by another server") as caught:
+        open_durable()
+    assert "\n" not in str(caught.value)
     first.close()
+    open_durable().close()
 
 
 def test_a_full_disk_refuses_the_message_and_keeps_earlier_ones(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import subprocess
+import sys
 import urllib.request
 from pathlib import Path
 
@@ -18,14 +19,21 @@ from gausslite.wire.clients import Export, FusionClient
 from gausslite_fusion_server.program import run
 
 
-def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(tmp_path: Path) -> None:
-    store = tmp_path / "team.sqlite"
-    with server_process("--store", str(store)) as (_, client):
+@pytest.fixture(params=["sqlite", "postgres"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "sqlite":
+        return str(tmp_path / "team.sqlite")
+    return str(request.getfixturevalue("postgres").new_database())
+
+
+def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(store: str) -> None:
+    with server_process("--store", store) as (_, client):
         session = client.join("ant", GRID).session_id
         message = request(session, make_subset("ant", 1, {0: [4], 1: [2, 2]}))
         [answer] = client.contribute([message], 20.0)
         assert answer.acknowledged == 1
-    with server_process("--store", str(store)) as (_, client):
+        assert "in use by another server" in ends_with_one_line("--store", store)
+    with server_process("--store", store) as (_, client):
         [answer] = client.contribute([message], 20.0)
         assert answer.outcomes[0].status == pb.SUBSET_STATUS_STALE
         assert sorted(gaussians_from_ply(client.export(Export())).kappa.tolist()) == [2, 2, 4]
@@ -42,6 +50,17 @@ def test_sigterm_ends_open_streams_and_the_process_with_code_0(tmp_path: Path) -
         assert process.wait(20) == 0
     assert "Traceback" not in log.read_text()
     assert log.read_text().rstrip().endswith("ended")
+
+
+def test_a_database_without_the_extra_is_one_line_with_the_command_that_installs_it() -> None:
+    program = (
+        "import sys; sys.modules['psycopg'] = None; from gausslite_fusion_server.program import run; sys.exit(run())"
+    )
+    command = [sys.executable, "-c", program, "--store", "postgresql://ant@db/team"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    [line] = done.stderr.splitlines()
+    assert line.endswith("pip install 'gausslite[postgres]'")
 
 
 class Hasty(FusionClient):
@@ -71,6 +90,10 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(
     nonsense = tmp_path / "missions" / "notes.sqlite"
     nonsense.parent.mkdir()
     nonsense.write_text("remember the milk, " * 300)
+    secret = "postgresql://ant:kept-secret@127.0.0.1:1/team"
+    assert "--store-max-mb: expected a file" in ends_with_one_line(capsys, "--store", secret, "--store-max-mb", "9")
+    for url in (secret, secret.replace("ant", "ant@"), secret.replace("postgresql", "postgres")):
+        assert "kept-secret" not in ends_with_one_line(capsys, "--store", url)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -78,7 +101,7 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(
             (("--store", str(tmp_path / "no" / "folder" / "x.sqlite")), "cannot be opened"),
             (("--store", str(nonsense)), "undamaged GaussLite store"),
             (("--store", "memroy"), "--store memroy: expected memory or"),
-            (("--store", str(tmp_path)), "a folder needs --shards"),
+            (("--store", str(tmp_path)), "expected a file, got a folder"),
             (("--store", str(nonsense.parent)), "start one server for each mission in the folder"),
             (("--health", "nonsense"), "--health"),
             (("--voxel-size", "0"), "--voxel-size: expected 0.001 to 1000"),

@@ -1,1 +1,0 @@
-"""The store of a fusion server on several machines: voxel regions as shards, each with a standby."""

