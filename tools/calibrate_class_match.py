@@ -1,4 +1,4 @@
-"""Measure the limits of `perception/text_embeddings.py`: which LVIS nouns find a right class, and which a sibling.
+"""Measure the limits of `perception/text_features.py`: which LVIS nouns find a right class, and which a sibling.
 
 Usage: python tools/calibrate_class_match.py FILE.onnx    (a YOLO-seg file with the CLIP tables next to it)
 
@@ -12,9 +12,9 @@ import json
 import sys
 from pathlib import Path
 
-from gausslite.domain.object_names import SYNONYMS, head_of, normalised_noun
+from gausslite.domain.object_names import head_of, normalised_noun, synonyms
 from gausslite.perception.models.model_file import open_model
-from gausslite.perception.text_embeddings import TextEmbeddings
+from gausslite.perception.text_features import TextEmbeddings
 from gausslite.perception.yolo import load_yolo
 
 _DEFINITION_WORDS = 7
@@ -56,7 +56,7 @@ def main(path: Path) -> None:
 def right_classes(names: list[str], definition: str, classes: set[str]) -> tuple[set[str], set[str]]:
     """Return the classes that are synonyms of a noun, and those of which it is a kind."""
     words = definition.replace(",", " ").split()[:_DEFINITION_WORDS]
-    heads = {head_of(name) for name in names} | {SYNONYMS.get(name, "") for name in names}
+    heads = {head_of(name) for name in names} | {synonyms().get(name, "") for name in names}
     return classes & set(names), classes & (heads | set(words))
 
 

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 import gausslite as gl
-from gausslite.perception.colours import BASIC_TERMS, ColourMatch, match_colour, no_colours
-from gausslite.perception.object_masks import mask_colours
+from gausslite.perception.colours import ColourMatch, basic_terms, match_colour, no_colours
+from gausslite.perception.settings import ColourSettings, SurfaceSettings
+from gausslite.perception.surface import mask_colours
 
 _LABELS = Path(__file__).with_name("home_colours.txt")
 _MIN_PIXELS = 80
@@ -53,19 +54,19 @@ def object_colours(home: int, frames: int, size: str, gains: tuple[float, ...]) 
         for name, region in source.regions().items():
             mask = region.mask(frame)
             if np.count_nonzero(mask) >= _MIN_PIXELS:
-                sums[name] = sums.get(name, no_colours()) + mask_colours(mask, frame)
+                sums[name] = sums.get(name, no_colours()) + mask_colours(mask, frame, SurfaceSettings())
     yield from sums.items()
 
 
 def score(homes: list[int], frames: int, size: str, gains: tuple[float, ...]) -> dict[str, WordScore]:
     """Return the score of each basic colour term."""
-    labels, scores = read_labels(), {term: WordScore() for term in BASIC_TERMS}
+    labels, scores = read_labels(), {term: WordScore() for term in basic_terms()}
     for home in homes:
         for name, colours in object_colours(home, frames, size, gains):
-            right, possible = labels.get((home, name), (set(), set(BASIC_TERMS)))
-            for term in set(BASIC_TERMS) - possible:
+            right, possible = labels.get((home, name), (set(), set(basic_terms())))
+            for term in set(basic_terms()) - possible:
                 outcome = scores[term].right if term in right else scores[term].wrong
-                outcome[match_colour(term, colours)] += 1
+                outcome[match_colour(term, colours, ColourSettings())] += 1
     return scores
 
 

@@ -16,7 +16,7 @@ from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import MissionSettings, require_rate
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask

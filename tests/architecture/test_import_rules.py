@@ -139,7 +139,7 @@ def test_importing_the_packages_loads_nothing_heavy() -> None:
         "gausslite.domain.frame",
         "gausslite.mission.task_mapper",
         "gausslite.mission.runner",
-        "gausslite.perception.relevance_estimator",
+        "gausslite.perception.relevance",
         "gausslite.fusion.vote",
         "gausslite.wire.clients",
         "gausslite_sim",

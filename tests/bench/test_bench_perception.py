@@ -18,7 +18,7 @@ from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph
-from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.detector import RegionDetector
 from gausslite_bench.perception.absent_nouns import choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
 from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery

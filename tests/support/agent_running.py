@@ -14,15 +14,11 @@ from fusion_running import GRID
 from serving import serving
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounReport
-from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.settings import MissionSettings
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
-from gausslite.perception.relevance_estimator import RelevanceEstimate, RelevanceEstimator
+from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate, RelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
 from gausslite.wire.change_notifier import ChangeNotifier
@@ -41,7 +37,7 @@ TASK = "Pick up the mug on the table"
 
 
 @dataclass
-class Gate:
+class Gate(RelevanceEstimator):
     """A relevance estimator that blocks the worker at a frame, and fails on request."""
 
     inner: RelevanceEstimator
@@ -63,25 +59,6 @@ class Gate:
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
         return self.inner.evaluate_past(frame)
-
-    known_objects = 0
-
-    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
-        return relevance
-
-    @property
-    def objects(self) -> tuple[ObjectLandmark, ...]:
-        return ()
-
-    @property
-    def nouns(self) -> tuple[NounReport, ...]:
-        return ()
-
-    def state(self) -> State:
-        return {}
-
-    def restore(self, state: State) -> None:
-        del state
 
 
 def ball_estimator(_graph: TaskGraph) -> RelevanceEstimator:

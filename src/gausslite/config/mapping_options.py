@@ -26,8 +26,8 @@ from gausslite.mission.settings import (
     PerceptionSettings,
     PoseMode,
 )
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.tiles import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
+from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.choose import BACKENDS
 from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
 

@@ -9,7 +9,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.motion_model import MotionModel
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.mission.settings import PoseMode
-from gausslite.perception.tiles import DEFAULT_TILES_PER_SIDE
+from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE
 from gausslite.task.backends import RESPONSE_FORMATS, Backend
 
 _DETECTOR, _RATE, _FUSION = "--detector FILE.onnx", "--rate HZ", "--fusion ADDRESS"

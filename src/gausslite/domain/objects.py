@@ -82,7 +82,7 @@ class ObjectReport:
     def __post_init__(self) -> None:
         if len(self.objects) > MAX_OBJECTS_PER_AGENT:
             raise InvalidInputError(f"objects: expected at most {MAX_OBJECTS_PER_AGENT}, got {len(self.objects)}")
-        if len({each.object_id for each in self.objects}) != len(self.objects):
+        if len({landmark.object_id for landmark in self.objects}) != len(self.objects):
             raise InvalidInputError("objects: expected different ids, got a repeated one")
 
     def target_index(self, noun: str) -> int:
@@ -121,5 +121,6 @@ def object_of_gaussian(
     if target == NO_TARGET_INDEX:
         return None
     point = tuple(mean_m)
-    matching = [each for each in objects if any((o.agent_id, o.target) == (agent_id, target) for o in each.observers)]
-    return min(matching, key=lambda each: each.landmark.distance_m(point), default=None)
+    seen_as = (agent_id, target)
+    matching = [found for found in objects if seen_as in ((seen.agent_id, seen.target) for seen in found.observers)]
+    return min(matching, key=lambda found: found.landmark.distance_m(point), default=None)

@@ -16,15 +16,19 @@ from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.evidence import EvidenceSettings
-from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
-from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.tiles import Tiling
+from gausslite.perception.detector import Tiling
+from gausslite.perception.relevance import (
+    AsyncRelevanceEstimator,
+    NoTaskEstimator,
+    RegionRelevanceEstimator,
+    RelevanceEstimator,
+    TaskRelevanceEstimator,
+)
+from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
-    from gausslite.perception.detect import Detector
+    from gausslite.perception.detector import Detector
     from gausslite.perception.models.model_registry import ModelRegistry
 
 
@@ -117,6 +121,6 @@ class EstimatorFactory:
 
     def _ground_truth_detector(self) -> Detector:
         self.require_detector()
-        from gausslite.perception.ground_truth import RegionDetector
+        from gausslite.perception.detector import RegionDetector
 
         return RegionDetector(self._scene().regions)

@@ -21,7 +21,7 @@ from gausslite.mapping.policies import TASK, UNIFORM, disable, follows_task, pol
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
-from gausslite.perception.tiles import DEFAULT_TILES_PER_SIDE
+from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE
 from gausslite.render.cpu_kernels import MAX_THREADS
 
 DEFAULT_MAX_GAUSSIANS = 150_000

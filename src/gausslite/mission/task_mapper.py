@@ -27,7 +27,7 @@ from gausslite.mapping.task_change import Reevaluation
 from gausslite.mapping.team_voxels import InsertedVoxels
 from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
-from gausslite.perception.relevance_estimator import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
+from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
 

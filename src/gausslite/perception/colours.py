@@ -7,99 +7,48 @@ terms (Berlin and Kay, 1969) that name it, and those that could name it: in warm
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
+from gausslite.domain.object_names import words
 from gausslite.domain.srgb import linear_light
+from gausslite.domain.task import TaskGraph, noun_of
+from gausslite.perception.settings import ColourSettings
 
-BASIC_TERMS: Final = ("black", "grey", "white", "red", "orange", "yellow", "green", "blue", "purple", "pink", "brown")
-
-# other words, by the terms that they may mean
-_TERMS_OF_WORD: Final[dict[str, tuple[str, ...]]] = {
-    **{term: (term,) for term in BASIC_TERMS},
-    "beige": ("white", "yellow", "brown"),
-    "cream": ("white", "yellow"),
-    "ivory": ("white", "yellow"),
-    "tan": ("brown", "yellow", "orange"),
-    "khaki": ("brown", "yellow", "green"),
-    "amber": ("orange", "yellow", "brown"),
-    "bronze": ("brown", "orange", "yellow"),
-    "gold": ("yellow", "orange", "brown"),
-    "golden": ("yellow", "orange", "brown"),
-    "silver": ("grey", "white"),
-    "turquoise": ("green", "blue"),
-    "teal": ("green", "blue"),
-    "cyan": ("blue", "green"),
-    "navy": ("blue", "black"),
-    "indigo": ("blue", "purple"),
-    "violet": ("purple",),
-    "lilac": ("purple", "pink"),
-    "magenta": ("pink", "purple"),
-    "maroon": ("red", "brown"),
-    "crimson": ("red",),
-    "scarlet": ("red", "orange"),
-}
-_SHADES: Final = ("light", "dark", "bright", "pale", "deep")
-# gains of red, green and blue: as the camera shows them, and with its white balance wrong in both directions
-_BALANCES: Final = ((1.0, 1.0, 1.0), (1.12, 1.0, 0.89), (0.89, 1.0, 1.12))
-_MIN_OWN_SHARE: Final = 0.3
-_MIN_POSSIBLE_SHARE: Final = 0.12
+_ANY: Final = (-np.inf, np.inf)
 
 
 class _Range(NamedTuple):
-    """A range of hue in degrees from -20 to 340, of saturation and of lightness; the upper limits are excluded.
+    """A range of hue in degrees, of saturation and of lightness, and the terms that name or could name it."""
 
-    own: the term that names it, empty where no one does. possible: all terms that could name it.
-    """
-
-    hue_deg: tuple[float, float]
-    saturation: tuple[float, float]
-    lightness: tuple[float, float]
-    own: str
-    possible: str
+    limits: tuple[tuple[float, float], ...]
+    named: frozenset[str]
+    possible: frozenset[str]
 
 
-_ANY: Final = (-1e9, 1e9)
-_WARM: Final = (40.0, 112.0)
-# the first range that a pixel falls into counts
-_RANGES: Final = (
-    _Range(_ANY, _ANY, (0.0, 0.14), "black", "black"),
-    _Range(_ANY, (0.0, 0.09), (0.0, 0.30), "black", "black"),
-    _Range(_ANY, _ANY, (0.0, 0.22), "", "black brown green blue red purple"),
-    _Range(_ANY, (0.0, 0.07), (0.0, 0.42), "", "black grey"),
-    _Range(_ANY, (0.0, 0.055), (0.42, 0.68), "grey", "grey white"),
-    _Range(_ANY, (0.0, 0.055), (0.68, 0.80), "", "grey white"),
-    _Range(_ANY, (0.0, 0.055), (0.80, 2.0), "white", "white grey"),
-    # nearly neutral: the light's colour, or a faint colour of the object
-    _Range(_WARM, (0.0, 0.09), (0.0, 0.45), "", "brown grey black"),
-    _Range(_WARM, (0.0, 0.09), (0.45, 2.0), "", "white grey brown yellow"),
-    _Range((112.0, 205.0), (0.0, 0.08), _ANY, "", "green blue grey"),
-    _Range((205.0, 300.0), (0.0, 0.08), _ANY, "", "blue grey white"),
-    _Range(_ANY, (0.0, 0.08), _ANY, "", "pink purple grey white brown"),
-    _Range(_WARM, (0.09, 0.14), (0.60, 2.0), "", "brown yellow white"),
-    _Range(_WARM, (0.09, 0.14), _ANY, "brown", "brown"),
-    _Range((-20.0, 38.0), (0.0, 0.22), (0.68, 2.0), "pink", "pink red orange"),
-    _Range((8.0, 34.0), _ANY, (0.0, 0.45), "red", "red brown"),
-    _Range((8.0, 34.0), _ANY, _ANY, "red", "red pink"),
-    _Range((34.0, 48.0), _ANY, (0.0, 0.50), "", "red brown orange"),
-    _Range((34.0, 48.0), _ANY, _ANY, "", "red orange pink"),
-    _Range((48.0, 76.0), (0.16, 9.0), (0.58, 2.0), "orange", "orange yellow brown"),
-    _Range((76.0, 112.0), (0.13, 9.0), (0.60, 2.0), "yellow", "yellow orange brown"),
-    _Range((48.0, 70.0), (0.17, 9.0), _ANY, "brown", "brown orange red"),
-    _Range((70.0, 112.0), (0.15, 9.0), _ANY, "", "brown yellow orange green"),
-    _Range((48.0, 112.0), _ANY, _ANY, "brown", "brown"),
-    _Range((112.0, 125.0), _ANY, _ANY, "green", "green yellow brown"),
-    _Range((125.0, 178.0), _ANY, _ANY, "green", "green"),
-    _Range((178.0, 205.0), _ANY, _ANY, "", "green blue"),
-    _Range((205.0, 285.0), _ANY, _ANY, "blue", "blue"),
-    _Range((285.0, 303.0), _ANY, _ANY, "", "blue purple"),
-    _Range((303.0, 332.0), _ANY, _ANY, "purple", "purple pink"),
-    _Range(_ANY, _ANY, _ANY, "pink", "pink purple red"),
-)
+@functools.cache
+def _ranges() -> tuple[_Range, ...]:
+    """Return the ranges of colours; the first one that a pixel falls into counts."""
+    return tuple(
+        _Range(
+            tuple(tuple(row.get(axis, _ANY)) for axis in ("hue_deg", "saturation", "lightness")),
+            frozenset([row["named"]] if "named" in row else []),
+            frozenset(row["possible"]),
+        )
+        for row in words()["colours"]["ranges"]
+    )
+
+
+def basic_terms() -> tuple[str, ...]:
+    """Return the basic colour terms."""
+    return tuple(words()["colours"]["terms"])
+
 
 # linear sRGB to the cones' responses, and their cube roots to Oklab
 _CONES_OF_RGB: Final = np.array(
@@ -128,20 +77,20 @@ class ColourMatch(Enum):
 
 def colour_counts(rgb: UInt8[ndarray, "n 3"]) -> Float64[ndarray, "balances ranges"]:
     """Return the share of the pixels in each range of colours, for each white balance; zeros without pixels."""
-    return np.stack([_range_shares(rgb.astype(np.float64) * gains) for gains in _BALANCES])
+    return np.stack([_range_shares(rgb.astype(np.float64) * gains) for gains in words()["colours"]["white_balances"]])
 
 
 def no_colours() -> Float64[ndarray, "balances ranges"]:
     """Return the counts of an object without pixels."""
-    return np.zeros((len(_BALANCES), len(_RANGES)))
+    return np.zeros((len(words()["colours"]["white_balances"]), len(_ranges())))
 
 
 def is_evaluated(colour: str) -> bool:
     """Return True if the words of a task's colour are known, such as "red", "light blue" or "black and white"."""
-    return all(_base_word(each) in _TERMS_OF_WORD for each in colour.split(" and "))
+    return all(_terms_of(word) for word in colour.split(" and "))
 
 
-def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"]) -> ColourMatch:
+def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"], settings: ColourSettings) -> ColourMatch:
     """Return whether an object with these sums of `colour_counts` has the colour.
 
     YES: ranges that the word names have 0.3 of the pixels, as the camera shows them. NO: ranges that it could name have
@@ -151,41 +100,42 @@ def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"]) -> Co
     total = float(counts[0].sum())
     if total == 0.0 or not is_evaluated(colour):
         return ColourMatch.DOUBTFUL
-    matches = [_match_word(_base_word(each), counts / total) for each in colour.split(" and ")]
+    matches = [_match_terms(_terms_of(word), counts / total, settings) for word in colour.split(" and ")]
     if ColourMatch.NO in matches:
         return ColourMatch.NO
-    return ColourMatch.YES if all(each is ColourMatch.YES for each in matches) else ColourMatch.DOUBTFUL
+    return ColourMatch.YES if all(match is ColourMatch.YES for match in matches) else ColourMatch.DOUBTFUL
 
 
-def _match_word(word: str, shares: Float64[ndarray, "balances ranges"]) -> ColourMatch:
-    terms = set(_TERMS_OF_WORD[word])
-    if float(shares[0, _is_named(terms, possibly=False)].sum()) >= _MIN_OWN_SHARE:
+def _match_terms(
+    terms: frozenset[str], shares: Float64[ndarray, "balances ranges"], settings: ColourSettings
+) -> ColourMatch:
+    is_named = np.array([not terms.isdisjoint(colours.named) for colours in _ranges()])
+    if float(shares[0, is_named].sum()) >= settings.min_named_share:
         return ColourMatch.YES
-    possible = float(shares[:, _is_named(terms, possibly=True)].sum(axis=1).max())
-    return ColourMatch.NO if possible < _MIN_POSSIBLE_SHARE else ColourMatch.DOUBTFUL
+    is_possible = np.array([not terms.isdisjoint(colours.possible) for colours in _ranges()])
+    possible = float(shares[:, is_possible].sum(axis=1).max())
+    return ColourMatch.NO if possible < settings.min_possible_share else ColourMatch.DOUBTFUL
+
+
+def _terms_of(word: str) -> frozenset[str]:
+    """Return the basic terms that a word may mean, without its shade: "light blue" → blue; none for unknown words."""
+    colours = words()["colours"]
+    base = " ".join(part for part in word.split() if part not in colours["shades"])
+    return frozenset([base] if base in colours["terms"] else colours["words"].get(base, ()))
 
 
 def _range_shares(rgb: Float64[ndarray, "n 3"]) -> Float64[ndarray, " ranges"]:
     lightness, hue_deg, saturation = _oklab(rgb)
     values = (hue_deg, saturation, lightness)
     is_free = np.ones(len(rgb), np.bool_)
-    shares = np.zeros(len(_RANGES))
-    for index, each in enumerate(_RANGES):
+    shares = np.zeros(len(_ranges()))
+    for index, colours in enumerate(_ranges()):
         is_inside = is_free.copy()
-        for value, (low, high) in zip(values, each[:3], strict=True):
+        for value, (low, high) in zip(values, colours.limits, strict=True):
             is_inside &= (value >= low) & (value < high)
         shares[index] = np.count_nonzero(is_inside)
         is_free &= ~is_inside
     return shares / max(len(rgb), 1)
-
-
-def _is_named(terms: set[str], possibly: bool) -> Bool[ndarray, " ranges"]:
-    return np.array([not terms.isdisjoint((each.possible if possibly else each.own).split()) for each in _RANGES])
-
-
-def _base_word(colour: str) -> str:
-    """Return the word without its shade: "light blue" → "blue"."""
-    return " ".join(word for word in colour.split() if word not in _SHADES)
 
 
 def _oklab(
@@ -196,3 +146,68 @@ def _oklab(
     lightness, a, b = (np.cbrt(linear @ _CONES_OF_RGB.T) @ _OKLAB_OF_CONES.T).T
     hue_deg = (np.degrees(np.arctan2(b, a)) + 20.0) % 360.0 - 20.0
     return lightness, hue_deg, np.hypot(a, b) / np.maximum(lightness, 1e-6)
+
+
+class ColourFilter:
+    """The colours of a task's names. An object whose colour clearly differs is not meant; a doubtful one is."""
+
+    def __init__(self, graph: TaskGraph, settings: ColourSettings) -> None:
+        self._settings = settings
+        self._colours = {
+            attributes.name: attributes.colour for attributes in graph.attributes if attributes.colour is not None
+        }
+        named = {noun_of(target) for target in graph.targets}
+        excluded = [name for name in graph.excluded if name in self._colours]
+        self._excluded = tuple((noun_of(name), self._colours[name]) for name in excluded if noun_of(name) in named)
+        self._excluded_everywhere = tuple(name for name in excluded if noun_of(name) not in named)
+        self._names = tuple(name for name in self._colours if name not in graph.excluded)
+
+    def match(self, name: str, counts: Float64[ndarray, "balances ranges"]) -> ColourMatch:
+        """Return whether an object with these counts has the colour of a name; YES for a name without a colour."""
+        colour = self._colours.get(name)
+        return ColourMatch.YES if colour is None else match_colour(colour, counts, self._settings)
+
+    def allows(self, name: str, counts: Float64[ndarray, "balances ranges"]) -> bool:
+        """Return False if the colour of an object clearly differs from that of a name."""
+        return self.match(name, counts) is not ColourMatch.NO
+
+    def is_excluded(self, noun: str, counts: Float64[ndarray, "balances ranges"]) -> bool:
+        """Return True if an object of a target's noun clearly has the colour of an excluded object of this noun."""
+        return any(
+            noun == excluded and match_colour(colour, counts, self._settings) is ColourMatch.YES
+            for excluded, colour in self._excluded
+        )
+
+    def label(self, name: str) -> str:
+        """Return the noun of a name with its colour."""
+        return " ".join(filter(None, (self._colours.get(name), noun_of(name))))
+
+    def notes(self, seen: Sequence[tuple[str, Float64[ndarray, "balances ranges"]]]) -> tuple[str, ...]:
+        """Return one line for each colour that could not decide about all of these objects, or that left some out.
+
+        seen: noun and counts of each object.
+        """
+        lines = [self._describe(name, seen) for name in self._names]
+        for noun, colour in self._excluded:
+            matches = [match_colour(colour, counts, self._settings) for other, counts in seen if other == noun]
+            doubtful = matches.count(ColourMatch.DOUBTFUL)
+            if doubtful:
+                lines.append(f"excluded {colour} {noun!r}: {doubtful} of {len(matches)} objects may be one, and count")
+        lines += [
+            f"excluded {self.label(name)!r}: its colour is not evaluated, every {noun_of(name)!r} is left out"
+            for name in self._excluded_everywhere
+        ]
+        return tuple(line for line in lines if line)
+
+    def _describe(self, name: str, seen: Sequence[tuple[str, Float64[ndarray, "balances ranges"]]]) -> str:
+        colour, noun = self._colours[name], noun_of(name)
+        if not is_evaluated(colour):
+            return f"{colour} {noun!r}: this colour is not evaluated, every {noun!r} counts"
+        matches = [self.match(name, counts) for other, counts in seen if other == noun]
+        other, doubtful = matches.count(ColourMatch.NO), matches.count(ColourMatch.DOUBTFUL)
+        parts = []
+        if other:
+            parts.append(f"{other} of {len(matches)} objects of another colour do not count")
+        if doubtful:
+            parts.append(f"{doubtful} of {len(matches)} objects of doubtful colour count")
+        return f"{colour} {noun!r}: {', '.join(parts)}" if parts else ""

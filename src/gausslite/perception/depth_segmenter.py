@@ -14,7 +14,6 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 
 _NO_DEPTH: Final = -9.0
-_CENTRE_INSET: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +22,13 @@ class DepthSegmenterSettings:
 
     depth_step: relative difference of depth. colour_step: difference in Lab units; the default stops only at strong
     edges, because depth outlines objects better. side_px: the longer side of the scaled box.
+    centre_inset_share: distance of the centre region from each side of the box.
     """
 
     depth_step: float = 0.02
     colour_step: float = 20.0
     side_px: int = 96
+    centre_inset_share: float = 0.25
 
     def __post_init__(self) -> None:
         for name in ("depth_step", "colour_step"):
@@ -76,7 +77,8 @@ class DepthSegmenter:
         step = (self._settings.depth_step, self._settings.colour_step, self._settings.colour_step)
         height, width = depth_m.shape
         centre = np.zeros((height, width), np.bool_)
-        inset_y, inset_x = int(height * _CENTRE_INSET), int(width * _CENTRE_INSET)
+        inset = self._settings.centre_inset_share
+        inset_y, inset_x = int(height * inset), int(width * inset)
         centre[inset_y : height - inset_y, inset_x : width - inset_x] = True
         unvisited = centre & (depth_m > 0)
         best, best_count = None, 0

@@ -4,29 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
+from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark, ObjectRole
 from gausslite.domain.relevance import Rival
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.perception.colours import no_colours
-from gausslite.perception.fitted_plane import INNER_PERCENTILES, FittedPlane
-from gausslite.perception.surface_votes import SurfaceVotes
-
-_CELL_GRID: Final = VoxelGrid(0.05)
-_MIN_MATCH_DISTANCE_M: Final = 0.15
-_MAX_SIZE_RATIO: Final = 2.0
-_MIN_SHARED: Final = 0.3
-_MIN_COUNT_SHARE: Final = 0.15
-_MIN_RELIABLE_SHARE: Final = 0.25
-_MAX_CELLS: Final = 4000
-_MIN_FLAT_WIDTH_M: Final = 0.4
-_MAX_FLAT_SLOPE: Final = 0.1
-_MAX_OBJECTS: Final = 500
-MAX_SUPPORTS: Final = 50
+from gausslite.perception.settings import ObjectMapSettings
+from gausslite.perception.surface import SurfaceVotes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,8 +26,7 @@ class Observation:
     would dominate the outermost points. camera_m is the camera's centre, None without a camera. time_ns is the frame's
     capture time. rival: a different thing detected in the same place. votes: which voxels the mask
     shows inside and outside the object. colours: `colour_counts` of the mask's pixels.
-    supports_m: the levels of planes seen under it, along up in the world. is_weak: of a weak detection.
-    plane: fits the mask's points; None for a whole object.
+    levels_m: of planes seen under it, along up in the world. is_weak: of a weak detection.
     """
 
     phrase: str
@@ -48,12 +36,12 @@ class Observation:
     camera_m: Float64[ndarray, "3"] | None = None
     score: float = 1.0
     time_ns: int = 0
+    settings: ObjectMapSettings = field(default_factory=ObjectMapSettings)
     rival: Rival | None = None
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
-    supports_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
+    levels_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     is_weak: bool = False
-    plane: FittedPlane | None = None
 
     @classmethod
     def from_points(
@@ -63,32 +51,33 @@ class Observation:
         camera_m: Float64[ndarray, "3"] | None = None,
         score: float = 1.0,
         time_ns: int = 0,
+        settings: ObjectMapSettings | None = None,
     ) -> Observation:
         """Return the observation of a mask's points: their median is the centroid, outliers are dropped."""
-        centroid = np.median(points_m, axis=0)
-        distances = np.linalg.norm(points_m - centroid, axis=1)
-        radius_m = 2.0 * float(np.median(distances))
-        inliers = points_m[distances <= 2.0 * max(radius_m, _MIN_MATCH_DISTANCE_M)]
-        cells = np.unique(_CELL_GRID.keys(inliers.astype(np.float32)))
-        return cls(phrase, centroid, radius_m, cells, camera_m, score, time_ns, plane=FittedPlane.of(inliers))
+        settings = settings or ObjectMapSettings()
+        centroid_m = np.median(points_m, axis=0)
+        radius_m = 2.0 * float(np.median(np.linalg.norm(points_m - centroid_m, axis=1)))
+        inliers_m = points_m[_is_inlier(points_m, centroid_m, radius_m, settings)]
+        cells = np.unique(VoxelGrid(settings.cell_m).keys(inliers_m.astype(np.float32)))
+        return cls(phrase, centroid_m, radius_m, cells, camera_m, score, time_ns, settings)
+
+    def without_outliers(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
+        """Return those of the mask's points that are near the centroid for the object's size."""
+        near: Float64[ndarray, "m 3"] = points_m[_is_inlier(points_m, self.centroid_m, self.radius_m, self.settings)]
+        return near
 
     @property
     def distance_m(self) -> float:
         """Distance from the camera to the centroid; infinite without a camera."""
         return np.inf if self.camera_m is None else float(np.linalg.norm(self.centroid_m - self.camera_m))
 
-    def is_flat(self, up: Float64[ndarray, "3"]) -> bool:
-        """Return True if the cells cover a wide area at nearly one height, as those of a rug. up: in the world."""
-        centres_m = _CELL_GRID.centres_m(self.cells).astype(np.float64)
-        heights_m = centres_m @ up
-        across_m = np.ptp(np.percentile(centres_m - heights_m[:, None] * up, INNER_PERCENTILES, axis=0), axis=0)
-        width_m = float(np.linalg.norm(across_m))
-        height_m = float(np.ptp(np.percentile(heights_m, INNER_PERCENTILES)))
-        return width_m >= _MIN_FLAT_WIDTH_M and height_m <= _MAX_FLAT_SLOPE * width_m
 
-    def is_panel(self, up: Float64[ndarray, "3"]) -> bool:
-        """Return True if the points are thin and upright, as those of a screen. up: in the world."""
-        return self.plane is not None and self.plane.is_panel(up)
+def _is_inlier(
+    points_m: Float64[ndarray, "n 3"], centroid_m: Float64[ndarray, "3"], radius_m: float, settings: ObjectMapSettings
+) -> Bool[ndarray, " n"]:
+    distances_m = np.linalg.norm(points_m - centroid_m, axis=1)
+    is_inlier: Bool[ndarray, " n"] = distances_m <= 2.0 * max(radius_m, settings.min_match_distance_m)
+    return is_inlier
 
 
 @dataclass(slots=True, eq=False)
@@ -101,7 +90,7 @@ class Landmark:
     score_sum: sum of its scores; rival_scores: sums of the scores of different things in its place. votes: of its
     masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
     weak_count: frames with a weak detection only, whose score is in score_sum.
-    colours: sums over its observations. supports_m: the latest levels of planes seen under it.
+    colours: sums over its observations. levels_m: the latest levels of planes seen under it.
     """
 
     phrase: str
@@ -121,16 +110,19 @@ class Landmark:
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     missed_in_a_row: int = 0
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
-    supports_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
+    levels_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     weak_count: int = 0
+    settings: ObjectMapSettings = field(default_factory=ObjectMapSettings)
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
         """Return a landmark of one observation."""
-        counts = np.ones(len(observation.cells), np.int64)
-        extent = (observation.phrase, observation.centroid_m, observation.radius_m, observation.cells, counts)
         return cls(
-            *extent,
+            phrase=observation.phrase,
+            centroid_m=observation.centroid_m,
+            radius_m=observation.radius_m,
+            cells=observation.cells,
+            counts=np.ones(len(observation.cells), np.int64),
             seen_count=1,
             missed_count=0,
             best_score=observation.score,
@@ -141,33 +133,42 @@ class Landmark:
             rival_scores={} if observation.rival is None else {observation.rival.name: observation.rival.score},
             votes=observation.votes,
             colours=observation.colours,
-            supports_m=observation.supports_m,
+            levels_m=observation.levels_m,
+            settings=observation.settings,
         )
 
     def is_colocated_with(self, other: Observation) -> bool:
         """Return True if the centroids are close for the size of the smaller object."""
-        max_distance_m = max(_MIN_MATCH_DISTANCE_M, 0.75 * min(self.radius_m, other.radius_m))
+        smaller_m = min(self.radius_m, other.radius_m)
+        max_distance_m = max(self.settings.min_match_distance_m, self.settings.match_radius_share * smaller_m)
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < max_distance_m
 
     def may_equal(self, other: Observation) -> bool:
-        """Return True if an observation of another phrase may show this object: the same place, and a similar size.
-
-        A bowl in the middle of a table has the table's centroid, but not its size.
-        """
-        is_similar = max(self.radius_m, other.radius_m) <= _MAX_SIZE_RATIO * min(self.radius_m, other.radius_m)
-        return is_similar and self.is_colocated_with(other)
-
-    def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
-        """Return the whole object as an observation by a camera, to evaluate relations."""
-        place = self.phrase, self.centroid_m, self.radius_m, self.cells, camera_m
-        return Observation(*place, votes=self.votes, colours=self.colours, supports_m=self.supports_m)
+        """Return True if an observation of another phrase may show this object: the same place, and a similar size."""
+        smaller_m, larger_m = sorted((self.radius_m, other.radius_m))
+        return larger_m <= self.settings.max_size_ratio * smaller_m and self.is_colocated_with(other)
 
     def matches(self, other: Observation) -> bool:
         """Return True if an observation of the same phrase shows this object, in whole or in part."""
         shared = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
-        return self.is_colocated_with(other) or shared >= _MIN_SHARED * max(1, min(len(self.cells), len(other.cells)))
+        smaller = max(1, min(len(self.cells), len(other.cells)))
+        return self.is_colocated_with(other) or shared >= self.settings.min_shared_share * smaller
 
-    def support(self, weak: Observation) -> None:
+    def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
+        """Return the whole object as an observation by a camera, to evaluate relations."""
+        return Observation(
+            phrase=self.phrase,
+            centroid_m=self.centroid_m,
+            radius_m=self.radius_m,
+            cells=self.cells,
+            camera_m=camera_m,
+            settings=self.settings,
+            votes=self.votes,
+            colours=self.colours,
+            levels_m=self.levels_m,
+        )
+
+    def add_weak(self, weak: Observation) -> None:
         """Count a weak detection of this object, without its inexact mask."""
         self.weak_count += 1
         self.missed_in_a_row = 0
@@ -175,10 +176,6 @@ class Landmark:
         self.last_seen_ns = max(self.last_seen_ns, weak.time_ns)
         if weak.rival is not None:
             self._add_rivals({weak.rival.name: weak.rival.score})
-
-    def _add_rivals(self, scores: dict[str, float]) -> None:
-        for name, score in scores.items():
-            self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score
 
     def add(self, other: Landmark) -> None:
         """Merge another landmark into this one, and recompute the centroid."""
@@ -192,52 +189,65 @@ class Landmark:
         self.score_sum += other.score_sum
         self.votes = self.votes.add(other.votes)
         self.colours = self.colours + other.colours
-        self.supports_m = np.concatenate([self.supports_m, other.supports_m])[-MAX_SUPPORTS:]
+        self.levels_m = np.concatenate([self.levels_m, other.levels_m])[-self.settings.max_levels :]
         self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
         self._add_rivals(other.rival_scores)
+        self._add_cells(other)
+
+    def _add_rivals(self, scores: dict[str, float]) -> None:
+        for name, score in scores.items():
+            self.rival_scores[name] = self.rival_scores.get(name, 0.0) + score
+
+    def _add_cells(self, other: Landmark) -> None:
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
         total = np.bincount(where, weights=np.concatenate([self.counts, other.counts])).astype(np.int64)
-        if len(merged) > _MAX_CELLS:
-            most_observed = np.sort(np.argsort(-total, kind="stable")[:_MAX_CELLS])
+        if len(merged) > self.settings.max_cells:
+            most_observed = np.sort(np.argsort(-total, kind="stable")[: self.settings.max_cells])
             merged, total = merged[most_observed], total[most_observed]
         self.cells, self.counts = merged, total
-        centres = self.footprint_m().astype(np.float64)
-        self.centroid_m = centres.mean(axis=0)
-        self.radius_m = 2.0 * float(np.median(np.linalg.norm(centres - self.centroid_m, axis=1)))
+        centres_m = self.footprint_m().astype(np.float64)
+        self.centroid_m = centres_m.mean(axis=0)
+        self.radius_m = 2.0 * float(np.median(np.linalg.norm(centres_m - self.centroid_m, axis=1)))
 
     def box_m(self) -> AxisAlignedBox:
         """Return the axis-aligned box of the footprint's cells."""
-        centres, half_m = self.footprint_m().astype(np.float64), 0.5 * _CELL_GRID.size_m
-        low, high = centres.min(axis=0) - half_m, centres.max(axis=0) + half_m
+        centres_m, half_m = self.footprint_m().astype(np.float64), 0.5 * self.settings.cell_m
+        low, high = centres_m.min(axis=0) - half_m, centres_m.max(axis=0) + half_m
         return AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
     def footprint_m(self) -> Float32[ndarray, "k 3"]:
         """Return the centres of the cells that are observed often, or of all cells if those are few."""
-        reliable = self.cells[self.counts > max(1.0, _MIN_COUNT_SHARE * float(np.percentile(self.counts, 90)))]
-        has_enough = len(reliable) >= _MIN_RELIABLE_SHARE * len(self.cells)
-        return _CELL_GRID.centres_m(reliable if has_enough else self.cells)
+        often = self.settings.min_count_share * float(np.percentile(self.counts, 90))
+        reliable = self.cells[self.counts > max(1.0, often)]
+        has_enough = len(reliable) >= self.settings.min_footprint_share * len(self.cells)
+        return VoxelGrid(self.settings.cell_m).centres_m(reliable if has_enough else self.cells)
 
 
 class ObjectMap:
-    """The landmarks of a task; at most _MAX_OBJECTS, the least observed is dropped first."""
+    """The landmarks of a task; of too many, the least observed is dropped first."""
 
-    def __init__(self, objects: Sequence[Landmark] = ()) -> None:
-        """Start with these landmarks, oldest first."""
-        self._objects = list(objects)
-        self._next_number = 1 + max((each.number for each in objects), default=0)
+    def __init__(self, settings: ObjectMapSettings | None = None) -> None:
+        self._settings = settings or ObjectMapSettings()
+        self._objects: list[Landmark] = []
+        self._next_number = 1
 
     @property
     def objects(self) -> tuple[Landmark, ...]:
         """All landmarks, oldest first."""
         return tuple(self._objects)
 
+    def restore(self, objects: Sequence[Landmark]) -> None:
+        """Replace the landmarks by these, oldest first."""
+        self._objects = list(objects)
+        self._next_number = 1 + max((landmark.number for landmark in objects), default=0)
+
     def with_phrase(self, phrase: str) -> list[Landmark]:
         """Return the landmarks of a phrase."""
-        return [each for each in self._objects if each.phrase == phrase]
+        return [landmark for landmark in self._objects if landmark.phrase == phrase]
 
     def match(self, observation: Observation) -> Landmark | None:
         """Return the landmark that an observation shows; None if there is none."""
-        return next((each for each in self.with_phrase(observation.phrase) if each.matches(observation)), None)
+        return next(iter(self._matches(observation)), None)
 
     def observe(
         self, observations: Sequence[Observation], is_visible: Callable[[Landmark], bool] | None = None
@@ -249,18 +259,20 @@ class ObjectMap:
         observed = [self._add(observation) for observation in observations if not observation.is_weak]
         for observation in observations:
             if observation.is_weak:
-                self._support(observation, observed)
+                self._add_weak(observation, observed)
         if is_visible is not None:
-            for each in self._objects:
-                if not any(each is other for other in observed) and is_visible(each):
-                    each.missed_count += 1
-                    each.missed_in_a_row += 1
-        while len(self._objects) > _MAX_OBJECTS:
-            self._objects.remove(min(self._objects, key=lambda each: each.seen_count))
+            for landmark in self._objects:
+                if not any(landmark is other for other in observed) and is_visible(landmark):
+                    landmark.missed_count += 1
+                    landmark.missed_in_a_row += 1
+        while len(self._objects) > self._settings.max_objects:
+            self._objects.remove(min(self._objects, key=lambda landmark: landmark.seen_count))
+
+    def _matches(self, observation: Observation) -> list[Landmark]:
+        return [landmark for landmark in self.with_phrase(observation.phrase) if landmark.matches(observation)]
 
     def _add(self, observation: Observation) -> Landmark:
-        new = Landmark.from_observation(observation)
-        matches = [each for each in self.with_phrase(observation.phrase) if each.matches(observation)]
+        new, matches = Landmark.from_observation(observation), self._matches(observation)
         if not matches:
             new.number, self._next_number = self._next_number, self._next_number + 1
             self._objects.append(new)
@@ -271,14 +283,38 @@ class ObjectMap:
             self._objects.remove(other)
         return matches[0]
 
-    def _support(self, weak: Observation, observed: list[Landmark]) -> None:
+    def _add_weak(self, weak: Observation, observed: list[Landmark]) -> None:
         """Count a weak observation for the nearest landmark that it shows, unless this frame already shows one.
 
         Its mask may cover several objects, so it merges none.
         """
-        matches = [each for each in self.with_phrase(weak.phrase) if each.matches(weak)]
-        if not matches or any(each is other for each in matches for other in observed):
+        matches = self._matches(weak)
+        if not matches or any(landmark is other for landmark in matches for other in observed):
             return
-        nearest = min(matches, key=lambda each: float(np.linalg.norm(each.centroid_m - weak.centroid_m)))
-        nearest.support(weak)
+        nearest = min(matches, key=lambda landmark: float(np.linalg.norm(landmark.centroid_m - weak.centroid_m)))
+        nearest.add_weak(weak)
         observed.append(nearest)
+
+
+def describe_landmarks(landmarks: Sequence[Landmark], graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
+    """Return the landmarks as values for a report, in their order; of too many, the most confident ones."""
+    described = [describe_landmark(landmark, graph) for landmark in landmarks]
+    chosen = sorted(described, key=lambda landmark: -landmark.confidence)[:MAX_OBJECTS_PER_AGENT]
+    ids = {landmark.object_id for landmark in chosen}
+    return tuple(landmark for landmark in described if landmark.object_id in ids)
+
+
+def describe_landmark(landmark: Landmark, graph: TaskGraph) -> ObjectLandmark:
+    """Return a landmark as a value; its confidence is the best score times the share of frames that detected it."""
+    x, y, z = (float(value) for value in landmark.centroid_m)
+    seen_share = landmark.seen_count / (landmark.seen_count + landmark.missed_count)
+    return ObjectLandmark(
+        object_id=f"{landmark.phrase}-{landmark.number}",
+        noun=landmark.phrase,
+        role=ObjectRole.TARGET if landmark.phrase in map(noun_of, graph.targets) else ObjectRole.ANCHOR,
+        centroid_m=(x, y, z),
+        extent_m=landmark.box_m(),
+        confidence=min(max(landmark.best_score, 0.0), 1.0) * seen_share,
+        first_seen_ns=landmark.first_seen_ns,
+        last_seen_ns=landmark.last_seen_ns,
+    )

@@ -1,13 +1,9 @@
-"""Decide the relevance of each frame: which pixels show the task's targets.
-
-Detections are localised in 3D and filtered by the task's relations. The masks of all frames follow from the measured
-surfaces of the objects.
-"""
+"""Decide the relevance of each frame: which pixels show the task's targets."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,69 +11,56 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch, NounReport
 from gausslite.domain.object_names import is_generic
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.pose import UpAxis, require_rigid, rotation_angle_deg, translation_m, unit_up_axis
+from gausslite.domain.pose import require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
-from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
+from gausslite.domain.state import (
+    State,
+    add_prefix,
+    encode_text,
+    get_array,
+    get_counts,
+    get_floats,
+    get_text,
+    int_array,
+    select_prefix,
+)
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.perception.checkpoint import decode_floor, decode_landmark, encode_landmark
-from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
+from gausslite.perception.colours import ColourFilter, no_colours
+from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
 from gausslite.perception.lifting import lift_detections
-from gausslite.perception.object_map import Landmark
-from gausslite.perception.object_masks import refined_mask, surface_mask
-from gausslite.perception.object_report import describe_landmarks
-from gausslite.perception.relations import SpatialSettings
-from gausslite.perception.spatial import SpatialFilter
-
-# a detection with a smaller share of its pixels outside excluded objects shows one of them
-_MIN_SHARE_LEFT = 0.3
-# a frame whose relevance has this share of an object's surface shows the object
-_MIN_SHOWN_SHARE = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class RelevanceTrackerSettings:
-    """Limits of the camera's motion and of the frames between two detections (a comment in Sec. III-B.2).
-
-    up_axis: up in the world frame, by default that of a level first camera.
-    """
-
-    up_axis: UpAxis = (0.0, -1.0, 0.0)
-    max_translation_m: float = 1.0
-    max_rotation_deg: float = 15.0
-    max_frames: int = 5
-    spatial: SpatialSettings = field(default_factory=SpatialSettings)
-    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
-
-    def __post_init__(self) -> None:
-        for name in ("max_translation_m", "max_rotation_deg"):
-            if not getattr(self, name) > 0:
-                raise InvalidInputError(f"tracker {name}: expected a positive number, got {getattr(self, name)}")
-        unit_up_axis(self.up_axis)
-        if self.max_frames < 1:
-            raise InvalidInputError(f"tracker max_frames: expected at least 1, got {self.max_frames}")
+from gausslite.perception.object_map import Landmark, ObjectMap, describe_landmarks
+from gausslite.perception.relations import NamedObjects, RelationFilter
+from gausslite.perception.settings import HeightSettings, RelevanceTrackerSettings
+from gausslite.perception.supporting_surface import FloorLevel, SupportingSurfaces
+from gausslite.perception.surface import SurfaceVotes, refined_mask, surface_mask
+from gausslite.perception.targets import TargetSelector
 
 
 class RelevanceTracker:
     """State of the tracked targets: latest keyframe, landmarks with their surfaces. Use from one thread at a time.
 
-    The caller runs the detector.
+    The caller runs the detector. Detections are localised in 3D and filtered by the task's relations. The masks of all
+    frames follow from the measured surfaces of the objects.
     """
 
     def __init__(
-        self,
-        graph: TaskGraph,
-        settings: RelevanceTrackerSettings,
-        nouns_by_height: frozenset[str] = frozenset(),
+        self, graph: TaskGraph, settings: RelevanceTrackerSettings, nouns_by_height: frozenset[str] = frozenset()
     ) -> None:
         """nouns_by_height: surfaces that the detector cannot find, whose height above the floor is known."""
         self._graph = graph
         self._settings = settings
-        self._filter = SpatialFilter(graph, settings.up_axis, settings.spatial, settings.evidence, nouns_by_height)
+        self._evidence = Evidence(settings.evidence)
+        self._object_map = ObjectMap(settings.object_map)
+        up = np.array(unit_up_axis(settings.up_axis))
+        self._surfaces = SupportingSurfaces(graph, nouns_by_height, up, settings.heights)
+        objects = NamedObjects(self._object_map, self._evidence, ColourFilter(graph, settings.colours))
+        relations = RelationFilter(graph, up, settings.relations, objects, self._surfaces)
+        self._targets = TargetSelector(graph, objects, relations, self._surfaces)
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
         self._needs_observation = False
@@ -85,41 +68,35 @@ class RelevanceTracker:
 
     @property
     def known_objects(self) -> int:
-        """The number of targets that were detected often enough so far."""
+        """The number of targets that were known so far."""
         return len(self._known_targets)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What colours decided, different things, low scores, and anchors that no frame has shown yet."""
-        rivals = (
-            f"what looks like {each.phrase!r} is rather {rival!r}: not activated; --accept-similar accepts it"
-            for each, rival in self._filter.rivals
-        )
-        viewpoint = self._T_world_keyframe
-        low_scores = (
-            f"{target!r}: {count} scored far below the best, so not activated; --accept-similar accepts all"
-            for target, count in ({} if viewpoint is None else self._filter.low_score_counts(viewpoint)).items()
-        )
-        unseen = (f"anchor {name!r} not seen yet: its targets are kept" for name in self._filter.unseen_anchors)
-        return (*self._filter.colour_notes, *self._filter.height_notes, *dict.fromkeys(rivals), *low_scores, *unseen)
+        """What colours and heights decided, different things, low scores, and anchors that no frame has shown yet."""
+        return self._targets.notes(self._T_world_keyframe)
 
     @property
     def landmarks(self) -> tuple[Landmark, ...]:
         """All objects detected so far for the task's nouns, in world coordinates."""
-        return self._filter.landmarks
+        return self._object_map.objects
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task, in the order of their first detection."""
-        return describe_landmarks(self._filter.confirmed_landmarks, self._graph)
+        return describe_landmarks(self._evidence.confirmed(self.landmarks), self._graph)
 
     def report(self, match: NounMatch) -> NounReport:
         """Return what has been detected of a noun so far."""
-        landmarks = [each for each in self.landmarks if each.phrase == match.noun]
-        confirmed = sum(each.phrase == match.noun for each in self._filter.confirmed_landmarks)
-        rival = next((name for each, name in self._filter.rivals if each.phrase == match.noun), None)
-        best_score = max((each.best_score for each in landmarks), default=0.0)
-        return NounReport(match, sum(each.seen_count for each in landmarks), best_score, confirmed, rival)
+        landmarks = self._object_map.with_phrase(match.noun)
+        rivals = (self._evidence.rival(landmark) for landmark in landmarks)
+        return NounReport(
+            match,
+            detections=sum(landmark.seen_count for landmark in landmarks),
+            best_score=max((landmark.best_score for landmark in landmarks), default=0.0),
+            objects=len(self._evidence.confirmed(landmarks)),
+            rival=next((rival for rival in rivals if rival is not None), None),
+        )
 
     def state(self) -> State:
         """Return the landmarks and the keyframe's pose as named arrays."""
@@ -129,7 +106,7 @@ class RelevanceTracker:
             "keyframe_age": int_array(self._frames_since, self._needs_observation),
             "known_targets": int_array(*self._known_targets),
         }
-        floor = self._filter.floor
+        floor = self._surfaces.floor
         levels = [] if floor.first_camera_m is None else [floor.first_camera_m]
         state |= {"floor_counts": floor.counts, "first_camera_m": np.array(levels, np.float64)}
         state["count"] = int_array(len(self.landmarks))
@@ -146,8 +123,8 @@ class RelevanceTracker:
         for pose in poses:
             require_rigid("state T_world_keyframe", pose)
         saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
-        floor = decode_floor(state)
-        self._filter.restore([decode_landmark(each) for each in saved_landmarks], floor)
+        self._surfaces.floor = decode_floor(state, self._settings.heights)
+        self._object_map.restore([decode_landmark(saved, self._settings) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
         self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
         self._needs_observation = needs_observation > 0
@@ -188,13 +165,13 @@ class RelevanceTracker:
         new = self._known_targets[relevance.known_objects :]
         masks = [
             (name, surface_mask(landmark.votes, frame))
-            for landmark, name in self._filter.targets(self._viewpoint(frame))
+            for landmark, name in self._targets.select(self._viewpoint(frame))
             if landmark.number in new
         ]
         missed = [
             (name, mask)
             for name, mask in masks
-            if np.count_nonzero(mask & relevance.roi) < _MIN_SHOWN_SHARE * np.count_nonzero(mask)
+            if np.count_nonzero(mask & relevance.roi) < self._settings.min_shown_share * np.count_nonzero(mask)
         ]
         added = merge_masks(missed, self._graph.targets, frame)
         is_new = added.roi & ~relevance.roi
@@ -210,8 +187,8 @@ class RelevanceTracker:
     def _relevance(self, frame: Frame, detected: Sequence[tuple[Landmark, Bool[ndarray, "h w"]]]) -> RelevanceMap:
         """Return the masks of all targets. A detected mask adds pixels that no other frame shows outside its object."""
         masks = []
-        for landmark, name in self._filter.targets(self._viewpoint(frame)):
-            if landmark.number not in self._known_targets and self._settings.evidence.is_known(landmark):
+        for landmark, name in self._targets.select(self._viewpoint(frame)):
+            if landmark.number not in self._known_targets and self._evidence.state(landmark) is LandmarkState.KNOWN:
                 self._known_targets.append(landmark.number)
             own = [mask for owner, mask in detected if owner is landmark]
             if own:
@@ -227,48 +204,51 @@ class RelevanceTracker:
         """Add the detections to the object map; return the masks of its landmarks in this frame."""
         kept = self._drop_excluded(self._drop_generic_anchors(detections))
         localised = [
-            (detection, self._filter.with_support(observation, detection, frame))
-            for detection, observation in lift_detections(kept, depth_m, frame)
-            if self._filter.is_possible(observation)
+            (detection, self._surfaces.with_level(observation, detection.mask, frame))
+            for detection, observation in lift_detections(kept, depth_m, frame, self._settings)
         ]
-        self._filter.observe_floor(frame)
-        self._filter.observe([observation for _, observation in localised], VisibilityCheck(frame, frame.depth_m))
+        self._surfaces.observe(frame)
+        visibility = VisibilityCheck(frame, frame.depth_m, self._settings.evidence)
+        self._object_map.observe([observation for _, observation in localised], visibility.is_visible)
+        shown = [
+            (landmark, detection.mask, observation)
+            for detection, observation in localised
+            if (landmark := self._object_map.match(observation)) is not None
+        ]
         self._needs_observation = any(
-            self._filter.needs_observation(observation) and self._filter.target_of(observation) is not None
-            for _, observation in localised
+            self._evidence.needs_observation(landmark) and self._targets.target_of(observation) is not None
+            for landmark, _, observation in shown
         )
-        owners = [(self._filter.landmark_of(observation), detection.mask) for detection, observation in localised]
-        return [(landmark, mask) for landmark, mask in owners if landmark is not None]
+        return [(landmark, mask) for landmark, mask, _ in shown]
 
     def _drop_generic_anchors(self, detections: Sequence[Detection]) -> list[Detection]:
         """Drop detections of a generic noun that are an anchor: "the object on the desk" is not the desk."""
         nouns = {noun_of(anchor) for anchor in self._graph.anchors}
-        anchors = [each.mask for each in detections if each.phrase in nouns and not each.is_weak]
+        anchors = [detection.mask for detection in detections if detection.phrase in nouns and not detection.is_weak]
         return [
-            each
-            for each in detections
-            if not (is_generic(each.phrase) and any(each.mask is anchor for anchor in anchors))
+            detection
+            for detection in detections
+            if not (is_generic(detection.phrase) and any(detection.mask is anchor for anchor in anchors))
         ]
 
     def _drop_excluded(self, detections: Sequence[Detection]) -> list[Detection]:
         """Remove the pixels of excluded objects from all others; drop detections that mostly show an excluded one."""
         nouns = self._graph.excluded_nouns
-        excluded = [each.mask for each in detections if each.phrase in nouns and not each.is_weak]
+        excluded = [detection.mask for detection in detections if detection.phrase in nouns and not detection.is_weak]
         if not excluded:
             return list(detections)
-        left_out = np.logical_or.reduce(excluded)
-        others = [replace(each, mask=each.mask & ~left_out) for each in detections if each.phrase not in nouns]
-        full = [each.mask for each in detections if each.phrase not in nouns]
-        return [
-            each
-            for each, mask in zip(others, full, strict=True)
-            if np.count_nonzero(each.mask) >= _MIN_SHARE_LEFT * np.count_nonzero(mask)
-        ]
+        left_out, kept = np.logical_or.reduce(excluded), []
+        for detection in detections:
+            left = detection.mask & ~left_out
+            is_other = np.count_nonzero(left) >= self._settings.min_left_share * np.count_nonzero(detection.mask)
+            if detection.phrase not in nouns and is_other:
+                kept.append(replace(detection, mask=left))
+        return kept
 
 
 def merge_detections(detections: Sequence[Detection], targets: Sequence[str], frame: Frame) -> RelevanceMap:
     """Return the binary w(u, v) of detections whose phrases are targets."""
-    return merge_masks([(each.phrase, each.mask) for each in detections], targets, frame)
+    return merge_masks([(detection.phrase, detection.mask) for detection in detections], targets, frame)
 
 
 def merge_masks(
@@ -276,6 +256,89 @@ def merge_masks(
 ) -> RelevanceMap:
     """Return the binary w(u, v): 1 on every target's mask; in an overlap the pixel belongs to the smaller object."""
     target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
-    for name, mask in sorted(masks, key=lambda each: int(np.count_nonzero(each[1])), reverse=True):
+    for name, mask in sorted(masks, key=lambda named: int(np.count_nonzero(named[1])), reverse=True):
         target[mask] = targets.index(name)
     return RelevanceMap((target != NO_TARGET).astype(np.float32), target)
+
+
+def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
+    """Encode a landmark."""
+    return {
+        "phrase": encode_text(landmark.phrase),
+        "centroid_radius_m": np.array([*landmark.centroid_m, landmark.radius_m]),
+        "cells": landmark.cells,
+        "counts": landmark.counts,
+        "seen_missed": int_array(landmark.seen_count, landmark.missed_count, landmark.missed_in_a_row),
+        "weak_count": int_array(landmark.weak_count),
+        "seen_ns_number": np.array([landmark.first_seen_ns, landmark.last_seen_ns, landmark.number], np.int64),
+        "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
+        "rival_names": encode_text("\n".join(landmark.rival_scores)),
+        "vote_keys": landmark.votes.keys,
+        "votes": np.stack([landmark.votes.inside, landmark.votes.outside]),
+        "vote_voxel_m": np.array([landmark.votes.voxel_m]),
+        "colours": landmark.colours,
+        "supports_m": landmark.levels_m,
+        "score_sums": np.array([landmark.score_sum, *landmark.rival_scores.values()]),
+    }
+
+
+def decode_landmark(state: State, settings: RelevanceTrackerSettings) -> Landmark:
+    """Decode a landmark. Raises MapFileError, InvalidInputError."""
+    x_m, y_m, z_m, radius_m = get_floats(state, "centroid_radius_m", 4)
+    cells = get_array(state, "cells", (None,), np.int64).copy()
+    counts = get_array(state, "counts", cells.shape, np.int64).copy()
+    if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
+        raise MapFileError("state landmark: expected ascending cells with positive counts, got others")
+    seen_count, missed_count, missed_in_a_row = get_counts(state, "seen_missed", 3)
+    (weak_count,) = get_counts(state, "weak_count", 1)
+    best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
+    first_ns, last_ns, number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
+    keys = get_array(state, "vote_keys", (None,), np.int64).copy()
+    inside, outside = get_array(state, "votes", (2, len(keys)), np.int64).copy()
+    if (keys[1:] <= keys[:-1]).any() or (inside < 0).any() or (outside < 0).any():
+        raise MapFileError("state landmark: expected ascending voxels with votes, got others")
+    (voxel_m,) = get_floats(state, "vote_voxel_m", 1)
+    sizes_m = settings.surface.voxel_sizes_m
+    if voxel_m not in sizes_m:
+        raise MapFileError(f"state landmark: expected voxels of {', '.join(map(str, sizes_m))} m, got {voxel_m}")
+    colours = get_array(state, "colours", no_colours().shape, np.float64).copy()
+    if not np.isfinite(colours).all() or (colours < 0).any():
+        raise MapFileError("state landmark: expected colours of zero or more, got others")
+    levels_m = get_array(state, "supports_m", (None,), np.float64).copy()
+    max_levels = settings.object_map.max_levels
+    if len(levels_m) > max_levels or not np.isfinite(levels_m).all():
+        raise MapFileError(f"state landmark: expected at most {max_levels} finite levels, got {len(levels_m)}")
+    names = get_text(state, "rival_names").splitlines()
+    score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
+    return Landmark(
+        phrase=get_text(state, "phrase"),
+        centroid_m=np.array([x_m, y_m, z_m]),
+        radius_m=radius_m,
+        cells=cells,
+        counts=counts,
+        seen_count=seen_count,
+        missed_count=missed_count,
+        best_score=best_score,
+        farthest_m=farthest_m,
+        first_seen_ns=first_ns,
+        last_seen_ns=last_ns,
+        number=number,
+        score_sum=score_sum,
+        rival_scores=dict(zip(names, rival_sums, strict=True)),
+        votes=SurfaceVotes(keys, inside, outside, voxel_m, settings.surface),
+        missed_in_a_row=missed_in_a_row,
+        colours=colours,
+        levels_m=levels_m,
+        weak_count=weak_count,
+        settings=settings.object_map,
+    )
+
+
+def decode_floor(state: State, settings: HeightSettings) -> FloorLevel:
+    """Decode the observed heights. Raises MapFileError."""
+    empty = FloorLevel.before_frames(settings)
+    counts = get_array(state, "floor_counts", empty.counts.shape, np.int64).copy()
+    levels_m = get_array(state, "first_camera_m", (None,), np.float64)
+    if (counts < 0).any() or len(levels_m) > 1 or not np.isfinite(levels_m).all():
+        raise MapFileError("state floor: expected counts of zero or more and at most one finite level, got others")
+    return FloorLevel(float(levels_m[0]) if len(levels_m) else None, counts, settings)

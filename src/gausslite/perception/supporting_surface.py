@@ -7,8 +7,7 @@ The plane under an object has a height above the floor, and each kind of furnitu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -16,49 +15,60 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import MatchBasis, NounMatch
-from gausslite.domain.object_names import head_of
-from gausslite.perception.detect import bounding_box
-from gausslite.perception.object_masks import window_points_m
-
-# furniture of any height: what reaches down to the floor does not stand on it
-_RAISED: Final = frozenset(
-    {"shelf", "bookshelf", "bookcase", "rack", "cabinet", "cupboard", "dresser", "sideboard", "wardrobe", "drawer",
-     "stand", "trolley", "cart", "ledge", "windowsill", "sill", "mantelpiece", "mantel", "piano"}
-)  # fmt: skip
-_MAX_FLOOR_BOTTOM_M: Final = 0.06
-# heights above the floor in metres: usual, and possible
-_HEIGHTS_M: Final[dict[str, tuple[tuple[float, float], tuple[float, float]]]] = {
-    "floor": ((-0.05, 0.06), (-0.15, 0.12)),
-    "ground": ((-0.05, 0.06), (-0.15, 0.12)),
-    "carpet": ((-0.05, 0.08), (-0.15, 0.12)),
-    "rug": ((-0.05, 0.08), (-0.15, 0.12)),
-    "nightstand": ((0.40, 0.70), (0.30, 0.80)),
-    "table": ((0.68, 0.80), (0.28, 1.12)),
-    "desk": ((0.65, 0.80), (0.58, 1.15)),
-    "counter": ((0.83, 1.00), (0.78, 1.15)),
-    "countertop": ((0.83, 1.00), (0.78, 1.15)),
-    "worktop": ((0.83, 1.00), (0.78, 1.15)),
-    "workbench": ((0.80, 1.00), (0.68, 1.12)),
-}
-_BIN_M: Final = 0.025
-_REACH_M: Final = 4.0
-_BINS: Final = round(2 * _REACH_M / _BIN_M)
-# a camera carried by a person or a tall robot; other levels are rather a table than the floor
-_CAMERA_HEIGHTS_M: Final = (1.0, 2.2)
-_MIN_FLOOR_SHARE: Final = 0.02
-_MIN_FLOOR_POINTS: Final = 40
-# points of a frame's width; between two of them, a horizontal surface rises by less than this share of their distance
-_POINTS_ACROSS: Final = 40
-_MAX_SLOPE: Final = 0.25
-_MAX_DEPTH_M: Final = 4.0
-_BOTTOM_PERCENTILE: Final = 5.0
-_PLANE_SLACK_M: Final = 0.04
-_RING_M: Final = 0.20
-_MIN_PLANE_POINTS: Final = 30
-_MIN_PLANE_EXTENT_M: Final = 0.15
+from gausslite.domain.object_names import head_of, words
+from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
+from gausslite.perception.detector import bounding_box
+from gausslite.perception.object_map import Landmark, Observation
+from gausslite.perception.settings import HeightSettings
+from gausslite.perception.surface import window_points_m
 
 
-def support_level_m(mask: Bool[ndarray, "h w"], frame: Frame, up: Float64[ndarray, "3"]) -> float:
+class SupportingSurfaces:
+    """The surfaces of a task that no detection shows, and the floor below them. Heights decide what stands on them."""
+
+    def __init__(
+        self, graph: TaskGraph, nouns_by_height: frozenset[str], up: Float64[ndarray, "3"], settings: HeightSettings
+    ) -> None:
+        """nouns_by_height: of `nouns_known_by_height`."""
+        coloured = {attributes.name for attributes in graph.attributes if attributes.colour is not None}
+        self._anchors = frozenset(
+            relation.anchor
+            for relation in graph.relations
+            if relation.predicate is Predicate.ON
+            and relation.anchor not in coloured
+            and noun_of(relation.anchor) in nouns_by_height
+        )
+        self.up = up
+        self._settings = settings
+        self.floor = FloorLevel.before_frames(settings)
+
+    def is_by_height(self, relation: Relation) -> bool:
+        """Return True if heights decide the relation: on a surface without a colour that no detection shows."""
+        return relation.predicate is Predicate.ON and relation.anchor in self._anchors
+
+    def observe(self, frame: Frame) -> None:
+        """Count a frame's points by their height, if a relation needs the floor."""
+        if self._anchors:
+            self.floor = self.floor.add(frame, self.up)
+
+    def with_level(self, observation: Observation, mask: Bool[ndarray, "h w"], frame: Frame) -> Observation:
+        """Return the observation with the level of the plane under it, if a relation needs it."""
+        if not self._anchors:
+            return observation
+        level_m = level_under_m(mask, frame, self.up, self._settings)
+        return replace(observation, levels_m=np.array([level_m])) if np.isfinite(level_m) else observation
+
+    def stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
+        """Return whether an object stands on the relation's anchor by its height; None if heights do not decide."""
+        if not self.is_by_height(relation):
+            return None
+        bottom_m = seen.votes.lowest_m(self.up, self._settings.lowest_percentile)
+        return stands_on(noun_of(relation.anchor), seen.levels_m, self.floor.level_m, bottom_m, self._settings)
+
+
+def level_under_m(
+    mask: Bool[ndarray, "h w"], frame: Frame, up: Float64[ndarray, "3"], settings: HeightSettings
+) -> float:
     """Return the level, along up in the world, of the plane that the frame shows around an object's bottom.
 
     NaN if none is seen. A plane has 30 points beside the object within 4 cm of its bottom, over 15 cm or more.
@@ -78,12 +88,17 @@ def support_level_m(mask: Bool[ndarray, "h w"], frame: Frame, up: Float64[ndarra
     if not is_object.any():
         return np.nan
     levels_m = points_m @ up
-    bottom_m = float(np.percentile(levels_m[is_object], _BOTTOM_PERCENTILE))
+    bottom_m = float(np.percentile(levels_m[is_object], settings.bottom_percentile))
     flat = points_m - levels_m[:, None] * up
-    middle, reach_m = np.median(flat[is_object], axis=0), np.ptp(flat[is_object], axis=0).max() / 2 + _RING_M
-    is_plane = ~is_object & (np.abs(levels_m - bottom_m) < _PLANE_SLACK_M)
+    middle, reach_m = (
+        np.median(flat[is_object], axis=0),
+        np.ptp(flat[is_object], axis=0).max() / 2 + settings.plane_reach_m,
+    )
+    is_plane = ~is_object & (np.abs(levels_m - bottom_m) < settings.plane_slack_m)
     is_plane &= np.linalg.norm(flat - middle, axis=1) < reach_m
-    if np.count_nonzero(is_plane) < _MIN_PLANE_POINTS or np.ptp(flat[is_plane], axis=0).max() < _MIN_PLANE_EXTENT_M:
+    if np.count_nonzero(is_plane) < settings.min_plane_points:
+        return np.nan
+    if np.ptp(flat[is_plane], axis=0).max() < settings.min_plane_extent_m:
         return np.nan
     return float(np.median(levels_m[is_plane]))
 
@@ -97,46 +112,49 @@ class FloorLevel:
 
     first_camera_m: float | None
     counts: Int64[ndarray, " bins"]
+    settings: HeightSettings
 
     @classmethod
-    def before_frames(cls) -> FloorLevel:
+    def before_frames(cls, settings: HeightSettings) -> FloorLevel:
         """Return no points."""
-        return cls(None, np.zeros(_BINS, np.int64))
+        return cls(None, np.zeros(round(2 * settings.level_reach_m / settings.level_bin_m), np.int64), settings)
 
     def add(self, frame: Frame, up: Float64[ndarray, "3"]) -> FloorLevel:
         """Return the counts with some points of another frame."""
         camera_m = float(frame.T_world_camera[:3, 3] @ up)
         first_m = camera_m if self.first_camera_m is None else self.first_camera_m
-        bins = np.floor((_horizontal_levels_m(frame, up) - first_m + _REACH_M) / _BIN_M).astype(np.int64)
-        inside = bins[(bins >= 0) & (bins < _BINS)]
-        return FloorLevel(first_m, self.counts + np.bincount(inside, minlength=_BINS))
+        from_lowest_m = _horizontal_levels_m(frame, up, self.settings) - first_m + self.settings.level_reach_m
+        bins = np.floor(from_lowest_m / self.settings.level_bin_m).astype(np.int64)
+        inside = bins[(bins >= 0) & (bins < len(self.counts))]
+        return FloorLevel(first_m, self.counts + np.bincount(inside, minlength=len(self.counts)), self.settings)
 
     @property
     def level_m(self) -> float:
         """The lowest level, 1.0 to 2.2 m below the first camera, with a fiftieth of all points; NaN without one."""
         pairs = (self.counts[:-1] + self.counts[1:]).astype(np.float64)
-        below_m = _REACH_M - (np.arange(len(pairs)) + 1) * _BIN_M
-        enough = max(_MIN_FLOOR_POINTS, _MIN_FLOOR_SHARE * float(self.counts.sum()))
-        is_floor = (pairs >= enough) & (below_m >= _CAMERA_HEIGHTS_M[0]) & (below_m <= _CAMERA_HEIGHTS_M[1])
+        below_m = self.settings.level_reach_m - (np.arange(len(pairs)) + 1) * self.settings.level_bin_m
+        enough = max(self.settings.min_floor_points, self.settings.min_floor_share * float(self.counts.sum()))
+        is_floor = (pairs >= enough) & (below_m >= self.settings.min_camera_height_m)
+        is_floor &= below_m <= self.settings.max_camera_height_m
         if self.first_camera_m is None or not is_floor.any():
             return np.nan
         low = int(np.flatnonzero(is_floor)[0])
         return self.first_camera_m - float(below_m[low + int(pairs[low : low + 4].argmax())])
 
 
-def _horizontal_levels_m(frame: Frame, up: Float64[ndarray, "3"]) -> Float64[ndarray, " n"]:
+def _horizontal_levels_m(frame: Frame, up: Float64[ndarray, "3"], settings: HeightSettings) -> Float64[ndarray, " n"]:
     """Return the levels of some points of a frame whose neighbours are at the same level."""
-    step = max(1, frame.camera.width_px // _POINTS_ACROSS)
+    step = max(1, frame.camera.width_px // settings.points_across)
     window = slice(0, frame.camera.height_px), slice(0, frame.camera.width_px)
     points_m, is_known = window_points_m(frame, window, step)
     grid_m = np.full((*is_known.shape, 3), np.nan)
     grid_m[is_known] = points_m
     grid_m = grid_m[::step, ::step]
-    is_near = frame.depth_m[::step, ::step] < _MAX_DEPTH_M
+    is_near = frame.depth_m[::step, ::step] < settings.max_depth_m
     is_flat = is_near[1:, 1:]
     for other in (grid_m[:-1, 1:], grid_m[1:, :-1]):
         offset_m = grid_m[1:, 1:] - other
-        is_flat = is_flat & (np.abs(offset_m @ up) < _MAX_SLOPE * np.linalg.norm(offset_m, axis=-1))
+        is_flat = is_flat & (np.abs(offset_m @ up) < settings.max_slope * np.linalg.norm(offset_m, axis=-1))
     levels_m: Float64[ndarray, " n"] = grid_m[1:, 1:][is_flat] @ up
     return levels_m
 
@@ -146,30 +164,40 @@ def nouns_known_by_height(matches: Sequence[NounMatch]) -> frozenset[str]:
 
     A "counter" may be searched as the class "dining table"; the usual heights of both differ.
     """
-    return frozenset(
-        each.noun
-        for each in matches
-        if (head_of(each.noun) in _HEIGHTS_M and not _is_found(each))
-        or (head_of(each.noun) in _RAISED and not each.is_searched)
-    )
+    by_height = []
+    for match in matches:
+        head = head_of(match.noun)
+        if (head in words()["heights_m"] and not _is_found(match)) or (
+            _is_of_any_height(head) and not match.is_searched
+        ):
+            by_height.append(match.noun)
+    return frozenset(by_height)
 
 
 def stands_on(
-    noun: str, support_levels_m: Float64[ndarray, " n"], floor_m: float, bottom_m: float = np.nan
+    noun: str, levels_m: Float64[ndarray, " n"], floor_m: float, bottom_m: float, settings: HeightSettings
 ) -> bool | None:
     """Return whether an object on planes of these levels stands on such a surface; None if this is not sure.
 
     bottom_m: the object's lowest level. It decides alone for furniture of any height, such as shelves.
     """
-    if head_of(noun) in _RAISED:
-        return False if bottom_m - floor_m <= _MAX_FLOOR_BOTTOM_M else None
-    if len(support_levels_m) == 0 or not np.isfinite(floor_m):
+    if _is_of_any_height(head_of(noun)):
+        return False if bottom_m - floor_m <= settings.max_standing_m else None
+    if len(levels_m) == 0 or not np.isfinite(floor_m):
         return None
-    height_m = float(np.median(support_levels_m)) - floor_m
-    usual, possible = _HEIGHTS_M[head_of(noun)]
-    if usual[0] <= height_m <= usual[1]:
+    height_m = float(np.median(levels_m)) - floor_m
+    limits = words()["heights_m"][head_of(noun)]
+    if _is_within(height_m, limits["usual"]):
         return True
-    return None if possible[0] <= height_m <= possible[1] else False
+    return None if _is_within(height_m, limits["possible"]) else False
+
+
+def _is_of_any_height(head: str) -> bool:
+    return head in words()["surfaces"]["of_any_height"]
+
+
+def _is_within(value: float, limits: Sequence[float]) -> bool:
+    return limits[0] <= value <= limits[1]
 
 
 def _is_found(match: NounMatch) -> bool:
@@ -178,6 +206,7 @@ def _is_found(match: NounMatch) -> bool:
         return False
     if not match.classes or match.basis not in (MatchBasis.SYNONYM, MatchBasis.TEXT_FEATURES, MatchBasis.SIMILAR):
         return True
-    low_m, high_m = _HEIGHTS_M[head_of(match.noun)][0]
-    heights = [_HEIGHTS_M.get(head_of(name)) for name in match.classes]
-    return any(height is None or (height[0][0] < high_m and low_m < height[0][1]) for height in heights)
+    heights_m = words()["heights_m"]
+    low_m, high_m = heights_m[head_of(match.noun)]["usual"]
+    usual = [heights_m[head_of(name)]["usual"] if head_of(name) in heights_m else None for name in match.classes]
+    return any(limits is None or (limits[0] < high_m and low_m < limits[1]) for limits in usual)

@@ -1,4 +1,4 @@
-"""Detect nouns with a YOLO network in an ONNX file: boxes, and masks if it has them, of a fixed set of classes."""
+"""Detect nouns with a YOLO network of fixed classes, and segment boxes with the masks of any class."""
 
 from __future__ import annotations
 
@@ -6,42 +6,88 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.object_names import is_generic, is_seat, same_kind
+from gausslite.domain.object_names import is_generic, same_kind
 from gausslite.domain.relevance import DetectedBox, Detection, Rival
-from gausslite.perception.box_size import BoxSizeLimits
-from gausslite.perception.detect import box_iou
+from gausslite.perception.detector import BoxSizeLimits, box_iou
 from gausslite.perception.models.model_file import OpenModel
-from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
-from gausslite.perception.yolo_decode import Candidates, suppress
-from gausslite.perception.yolo_network import NetworkOutput, YoloNetwork
+from gausslite.perception.text_features import ClassMatchSettings, TextEmbeddings, match_noun
+from gausslite.perception.yolo_network import Candidates, YoloNetwork, suppress
+
+
+@dataclass(frozen=True, slots=True)
+class ClassAgnosticSettings:
+    """Which masks of an image are candidates, and which candidate a box gets.
+
+    min_score: lowest score of a candidate. nms_max_iou: IoU of two boxes above which non-maximum suppression drops the
+    lower score. max_masks: number of candidates. min_box_iou: lowest IoU of the given box with its mask's box.
+    """
+
+    min_score: float = 0.4
+    nms_max_iou: float = 0.9
+    min_box_iou: float = 0.5
+    max_masks: int = 100
+
+    def __post_init__(self) -> None:
+        for name in ("min_score", "nms_max_iou", "min_box_iou"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise InvalidInputError(f"segmenter {name}: expected between 0 and 1, got {getattr(self, name)}")
+        if not 1 <= self.max_masks <= 1000:
+            raise InvalidInputError(f"segmenter max_masks: expected 1 to 1000, got {self.max_masks}")
+
+    @classmethod
+    def for_classes(cls, classes: int) -> ClassAgnosticSettings:
+        """Return settings for a network; with many classes, each score is lower than FastSAM's with its one class."""
+        return cls() if classes == 1 else cls(min_score=0.03, nms_max_iou=0.7)
+
+
+class ClassAgnosticSegmenter:
+    """A Segmenter that gives each box the mask of the instance, of any class, with the largest overlap."""
+
+    def __init__(self, network: YoloNetwork, settings: ClassAgnosticSettings | None = None) -> None:
+        """Without settings, use the defaults for the network's number of classes."""
+        self._network = network
+        self._settings = settings or ClassAgnosticSettings.for_classes(network.classes)
+
+    def segment(self, frame: Frame, boxes_px: Float32[ndarray, "n 4"]) -> list[Bool[ndarray, "h w"] | None]:
+        """Return per box the mask with the largest box IoU; None if no IoU reaches min_box_iou."""
+        if len(boxes_px) == 0:
+            return []
+        output = self._network.run(frame)
+        candidates = output.candidates(self._settings.min_score)
+        candidates = suppress(candidates, self._settings.nms_max_iou, self._settings.max_masks, across_classes=True)
+        if len(candidates.scores) == 0:
+            return [None] * len(boxes_px)
+        overlaps = box_iou(boxes_px, candidates.boxes_px)
+        is_match = overlaps.max(axis=1) >= self._settings.min_box_iou
+        masks = output.masks(candidates.take(overlaps.argmax(axis=1)))
+        return [mask if match and mask.any() else None for mask, match in zip(masks, is_match, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
 class YoloSettings:
     """Thresholds of score, overlap and size of the boxes.
 
-    weak_score: lowest score of weak detections, which only named objects have. accept_similar: also search classes
-    that are only similar to a noun. rival_min_iou: lowest overlap of a box with one of a different class that may show
-    the same object. rival_min_cover: lowest share of a seat's mask that another seat covers.
+    weak_score: lowest score of weak detections, which only named objects have. rival_min_iou: lowest
+    overlap of a box with one of a different class that may show the same object: a monitor is detected as `tv` with
+    0.7 and, in the same box, as `laptop` with 0.3. class_match: which class a noun is searched as.
     """
 
     min_score: float = 0.25
     weak_score: float = 0.1
     nms_max_iou: float = 0.7
     max_boxes: int = 100
-    accept_similar: bool = False
     rival_min_iou: float = 0.6
-    rival_min_cover: float = 0.7
+    class_match: ClassMatchSettings = field(default_factory=ClassMatchSettings)
     box_limits: BoxSizeLimits = field(default_factory=BoxSizeLimits)
 
     def __post_init__(self) -> None:
-        for name in ("min_score", "weak_score", "nms_max_iou", "rival_min_iou", "rival_min_cover"):
+        for name in ("min_score", "weak_score", "nms_max_iou", "rival_min_iou"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidInputError(f"detector {name}: expected between 0 and 1, got {getattr(self, name)}")
         if not 1 <= self.max_boxes <= 1000:
@@ -86,8 +132,7 @@ class YoloDetector:
         output = self._network.run(frame)
         every = output.candidates(self._settings.weak_score)
         candidates = self._distinct(every, query_classes)
-        masks = output.masks(candidates)
-        overlaps = self._overlaps(candidates, every) | self._covered(candidates, masks, every, output)
+        masks, overlaps = output.masks(candidates), self._overlaps(candidates, every)
         return [
             Detection(box.phrase, box.score, box.box_px, masks[row], box.rival, box.is_weak)
             for row, box in self._boxes(candidates, every, overlaps, query_classes, frame)
@@ -116,21 +161,6 @@ class YoloDetector:
         """Return which candidates of all classes have nearly the same box as one of the queries' candidates."""
         overlaps: Bool[ndarray, "n m"] = box_iou(candidates.boxes_px, every.boxes_px) >= self._settings.rival_min_iou
         return overlaps
-
-    def _covered(
-        self, candidates: Candidates, masks: Sequence[Bool[ndarray, "h w"]], every: Candidates, output: NetworkOutput
-    ) -> Bool[ndarray, "n m"]:
-        """Return which seats cover a candidate that is a seat: a sofa's end looks like an armchair."""
-        covered = np.zeros((len(candidates.scores), len(every.scores)), np.bool_)
-        others = self._seats(every)[every.scores[self._seats(every)] >= self._settings.min_score]
-        for column, cover in zip(others.tolist(), output.masks(every.take(others)), strict=True):
-            for row in self._seats(candidates).tolist():
-                shared, size = int(np.count_nonzero(masks[row] & cover)), int(np.count_nonzero(masks[row]))
-                covered[row, column] = shared >= self._settings.rival_min_cover * max(1, size)
-        return covered
-
-    def _seats(self, candidates: Candidates) -> Int64[ndarray, " k"]:
-        return np.flatnonzero([is_seat(self.class_names[index]) for index in candidates.classes.tolist()])
 
     def _boxes(
         self,
@@ -173,10 +203,10 @@ class YoloDetector:
         return None
 
     def _match(self, query: str) -> NounMatch:
-        return match_noun(query, self.class_names, self._embeddings, self._settings.accept_similar)
+        return match_noun(query, self.class_names, self._embeddings, self._settings.class_match)
 
 
 def load_yolo(model: OpenModel, accept_similar: bool = False) -> YoloDetector:
     """Return the detector with the text embeddings of the model's folder. Raises ModelFileError."""
-    settings = YoloSettings(accept_similar=accept_similar)
+    settings = YoloSettings(class_match=ClassMatchSettings(accept_similar=accept_similar))
     return YoloDetector(model, TextEmbeddings.from_model_folder(model.path), settings)

@@ -35,7 +35,7 @@ from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.results import as_text, peak_rss_mib
 from gausslite.mission.settings import SceneInfo
 from gausslite.mission.task_mapper import FrameOutcome
-from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.perception.relevance import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
 from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopBench, LoopTiming, Overhead

@@ -23,8 +23,7 @@ from gausslite.domain.object_names import head_of, same_kind
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.mission.results import as_text, prepare_folder
-from gausslite.perception.detect import Detector
-from gausslite.perception.tiles import Tiling
+from gausslite.perception.detector import Detector, Tiling
 from gausslite.task.rules import RuleParser
 from gausslite_bench.perception.absent_nouns import AbsentSummary, absent_queries, choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
@@ -192,7 +191,7 @@ def read_absent(text: str) -> tuple[str, ...] | int:
 def _absent_queries(options: argparse.Namespace, detector: Detector, regions: Mapping[str, Region]) -> list[TaskQuery]:
     """Return a search for each noun of --absent, or for as many nouns of the detector's vocabulary."""
     if isinstance(options.absent, int):
-        from gausslite.perception.text_embeddings import TextEmbeddings
+        from gausslite.perception.text_features import TextEmbeddings
 
         embeddings = TextEmbeddings.from_model_folder(options.detector)
         vocabulary = () if embeddings is None else tuple(embeddings.noun_index)

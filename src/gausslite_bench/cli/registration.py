@@ -20,7 +20,7 @@ from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
+from gausslite.perception.relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 
 

@@ -18,7 +18,7 @@ from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings
 from gausslite.mission.runner import MissionRunner
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.perception.relevance import RelevanceEstimator
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rasterizer
 

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
-from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.perception.relevance import RelevanceEstimator
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.relevance import Detection
-from gausslite.perception.detect import Detector
+from gausslite.perception.detector import Detector
 
 
 class SharedDetections:

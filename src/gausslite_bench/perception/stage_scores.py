@@ -18,10 +18,10 @@ from gausslite.domain.region import Region
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.views import MIN_ROI_PIXELS
-from gausslite.perception.detect import Detector
-from gausslite.perception.evidence import EvidenceSettings
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings, merge_detections
+from gausslite.perception.detector import Detector
+from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.relevance_tracker import merge_detections
+from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 from gausslite_bench.perception.past_frames import PastFrames
 from gausslite_bench.perception.shared_detections import SharedDetections
 

@@ -12,16 +12,12 @@ from numpy import ndarray
 
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounReport
-from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
-from gausslite.perception.relevance_estimator import RelevanceEstimate
+from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate, RelevanceEstimator
 
 _MAX_FRAMES = 100_000
 
@@ -90,54 +86,17 @@ class ScenePlan(Protocol):
         ...
 
 
-class RecordedRelevanceEstimator:
-    """RelevanceEstimator that returns each training frame's precomputed mask, at no cost for any policy."""
+class RecordedRelevanceEstimator(RelevanceEstimator):
+    """A RelevanceEstimator that returns each training frame's precomputed mask, at no cost for any policy."""
 
     def __init__(self, scene: Scene) -> None:
         # keyed by frame, not by pose: depth holes and moving objects differ between frames of equal pose
         self._masks = dict(zip(scene.training, scene.masks, strict=True))
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Empty."""
-        return ()
-
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return the ground-truth mask."""
         del rendered_depth_m
         return RelevanceEstimate(self._masks[frame])
-
-    def evaluate_past(self, frame: Frame) -> RelevanceMap:
-        """Return the ground-truth mask."""
-        return self._masks[frame]
-
-    @property
-    def known_objects(self) -> int:
-        """Always 0: nothing becomes known during a mission."""
-        return 0
-
-    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
-        """Return the relevance."""
-        del frame
-        return relevance
-
-    @property
-    def objects(self) -> tuple[ObjectLandmark, ...]:
-        """Empty: there is no object map."""
-        return ()
-
-    @property
-    def nouns(self) -> tuple[NounReport, ...]:
-        """Empty: there is no detector."""
-        return ()
-
-    def state(self) -> State:
-        """Return an empty state."""
-        return {}
-
-    def restore(self, state: State) -> None:
-        """Do nothing: there is no state."""
-        del state
 
 
 def make_scene(

@@ -25,8 +25,7 @@ from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.perception.fixed_relevance import NoTaskEstimator
-from gausslite.perception.relevance_estimator import RelevanceEstimator
+from gausslite.perception.relevance import NoTaskEstimator, RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene, ScenePlan
 

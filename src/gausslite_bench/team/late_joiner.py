@@ -19,7 +19,7 @@ from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.team.scenes import TeamPlan

@@ -22,7 +22,7 @@ from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.runner import MissionRunner
 from gausslite.mission.settings import MissionSettings, SceneInfo
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.perception.fixed_relevance import NoTaskEstimator
+from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.wire.spool import Purpose, Spool
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.team.scenes import AgentScene

@@ -14,7 +14,7 @@ from gausslite.domain.region import Region
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
 from gausslite_bench.quality.real_scenes import RealScenePlan
 from gausslite_bench.quality.scenes import PosePolicy

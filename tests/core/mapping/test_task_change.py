@@ -29,10 +29,9 @@ from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.optimize.density import DensitySettings
 from gausslite.optimize.splat_table import SplatTable
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
-from gausslite.perception.ground_truth import RegionDetector
-from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.relevance import AsyncRelevanceEstimator, RegionRelevanceEstimator, TaskRelevanceEstimator
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (64, 48)

@@ -30,9 +30,9 @@ from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.settings import MissionSettings, TaskSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.optimize.density import DensitySettings
-from gausslite.perception.ground_truth import RegionDetector
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.cpu import CpuRasterizer
 
 GRAPH = TaskGraph(

@@ -17,9 +17,9 @@ from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.mapping.task_change import TaskChangeSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.perception.ground_truth import RegionDetector
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.cpu import CpuRasterizer
 
 MUG = BallRegion((0.1, 0.0, 2.0), 0.3)

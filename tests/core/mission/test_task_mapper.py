@@ -8,11 +8,7 @@ import numpy as np
 from mapping_scenes import wall_frame
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounReport
-from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.sent_voxels import SentVoxelTracker
@@ -20,8 +16,12 @@ from gausslite.mapping.settings import MapperSettings, SeedingSettings
 from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.fixed_relevance import NoTaskEstimator, RegionRelevanceEstimator
-from gausslite.perception.relevance_estimator import RelevanceEstimate
+from gausslite.perception.relevance import (
+    NoTaskEstimator,
+    RegionRelevanceEstimator,
+    RelevanceEstimate,
+    RelevanceEstimator,
+)
 from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (32, 24)
@@ -94,11 +94,8 @@ def test_the_same_clock_gives_the_same_map() -> None:
     np.testing.assert_array_equal(maps[0].kappa, maps[1].kappa)
 
 
-class SlowEstimator:
+class SlowEstimator(RelevanceEstimator):
     """An estimator that takes ten seconds per frame, on a clock that nothing else advances."""
-
-    notes = ()
-    known_objects = 0
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -109,26 +106,6 @@ class SlowEstimator:
     def estimate(self, frame: Frame, rendered_depth_m: np.ndarray | None = None) -> RelevanceEstimate:
         self.now_s += 10.0
         return BALL.estimate(frame, rendered_depth_m)
-
-    def evaluate_past(self, frame: Frame) -> RelevanceMap:
-        return self.estimate(frame).relevance
-
-    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
-        return relevance
-
-    @property
-    def objects(self) -> tuple[ObjectLandmark, ...]:
-        return ()
-
-    @property
-    def nouns(self) -> tuple[NounReport, ...]:
-        return ()
-
-    def state(self) -> State:
-        return {}
-
-    def restore(self, state: State) -> None:
-        del state
 
 
 def test_skipped_changes_are_published_with_the_next_frame() -> None:

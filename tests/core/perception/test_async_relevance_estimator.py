@@ -18,9 +18,9 @@ from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.ground_truth import RegionDetector
-from gausslite.perception.relevance_estimator import AsyncRelevanceEstimator, TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.relevance import AsyncRelevanceEstimator, TaskRelevanceEstimator
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (64, 48)

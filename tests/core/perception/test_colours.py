@@ -12,9 +12,10 @@ from tool_modules import load_tool
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, TaskGraph
-from gausslite.perception.colours import BASIC_TERMS, ColourMatch, colour_counts, is_evaluated, match_colour, no_colours
+from gausslite.perception.colours import ColourMatch, basic_terms, colour_counts, is_evaluated, match_colour, no_colours
 from gausslite.perception.models.model_registry import ModelRegistry
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.settings import ColourSettings
 
 # colours that every table of colour names gives these names
 FOCAL = {
@@ -32,13 +33,17 @@ FOCAL = {
 }
 
 
+def match_word(word: str, counts: np.ndarray) -> ColourMatch:
+    return match_colour(word, counts, ColourSettings())
+
+
 def counts_of(*rgb: tuple[int, int, int]) -> np.ndarray:
     return colour_counts(np.repeat(np.array(rgb, np.uint8), 100, axis=0))
 
 
-@pytest.mark.parametrize("word", BASIC_TERMS)
+@pytest.mark.parametrize("word", basic_terms())
 def test_each_basic_colour_is_surely_itself_and_no_opposite(word):
-    matches = {term: match_colour(term, counts_of(FOCAL[word])) for term in BASIC_TERMS}
+    matches = {term: match_word(term, counts_of(FOCAL[word])) for term in basic_terms()}
     assert matches[word] is ColourMatch.YES
     assert [term for term, match in matches.items() if match is ColourMatch.YES] == [word]
     assert list(matches.values()).count(ColourMatch.NO) >= 6
@@ -49,27 +54,27 @@ def test_each_basic_colour_is_surely_itself_and_no_opposite(word):
 def test_shading_does_not_exclude_a_colour(word, brightness):
     """Half the surface is in a shadow that scales the light; pixels have the gamma of sRGB."""
     shaded = tuple(int(255 * ((channel / 255) ** 2.2 * brightness) ** (1 / 2.2)) for channel in FOCAL[word])
-    assert match_colour(word, counts_of(FOCAL[word], shaded)) is ColourMatch.YES
-    assert match_colour(word, counts_of(shaded)) is not ColourMatch.NO
+    assert match_word(word, counts_of(FOCAL[word], shaded)) is ColourMatch.YES
+    assert match_word(word, counts_of(shaded)) is not ColourMatch.NO
 
 
 @pytest.mark.parametrize("gains", [(1.12, 1.0, 0.9), (0.9, 1.0, 1.12)])
 def test_a_wrong_white_balance_does_not_exclude_a_colour(gains):
     for word, rgb in FOCAL.items():
         seen = tuple(int(min(255, channel * gain)) for channel, gain in zip(rgb, gains, strict=True))
-        assert match_colour(word, counts_of(seen)) is not ColourMatch.NO, word
+        assert match_word(word, counts_of(seen)) is not ColourMatch.NO, word
 
 
 def test_words_with_shades_two_colours_and_unknown_words():
     blue, striped = counts_of(FOCAL["blue"]), counts_of(FOCAL["black"], FOCAL["white"])
-    assert match_colour("light blue", blue) is ColourMatch.YES
-    assert match_colour("navy", blue) is ColourMatch.YES
-    assert match_colour("black and white", striped) is ColourMatch.YES
-    assert match_colour("black and white", counts_of(FOCAL["black"])) is ColourMatch.NO
-    assert match_colour("teal", blue) is ColourMatch.YES
+    assert match_word("light blue", blue) is ColourMatch.YES
+    assert match_word("navy", blue) is ColourMatch.YES
+    assert match_word("black and white", striped) is ColourMatch.YES
+    assert match_word("black and white", counts_of(FOCAL["black"])) is ColourMatch.NO
+    assert match_word("teal", blue) is ColourMatch.YES
     assert (is_evaluated("dark grey"), is_evaluated("transparent")) == (True, False)
-    assert match_colour("transparent", blue) is ColourMatch.DOUBTFUL
-    assert match_colour("blue", no_colours()) is ColourMatch.DOUBTFUL
+    assert match_word("transparent", blue) is ColourMatch.DOUBTFUL
+    assert match_word("blue", no_colours()) is ColourMatch.DOUBTFUL
 
 
 def test_no_right_colour_of_a_simulated_home_is_excluded():

@@ -1,4 +1,4 @@
-"""Evidence for objects: foreground masks, repeated observations, and misses of visible landmarks."""
+"""Evidence for objects: repeated observations, and misses of visible landmarks."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from observed_objects import ObservedObjects
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
@@ -14,16 +15,12 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.perception.evidence import EvidenceSettings, VisibilityCheck
-from gausslite.perception.foreground import foreground_mask
+from gausslite.perception.evidence import LandmarkState, VisibilityCheck
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
-from gausslite.perception.relations import SpatialSettings
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.spatial import SpatialFilter
+from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
-WHOLE = np.ones((120, 160), np.bool_)
 
 
 def frame_at(x_m: float = 0.0, index: int = 0, wall_m: float = 2.0) -> Frame:
@@ -66,31 +63,6 @@ def target_marked(scores: Sequence[float | None], frames: int, max_frames: int =
     return [bool(estimator.estimate(frame_at(index=index)).relevance.roi.any()) for index in range(frames)]
 
 
-def test_background_between_slats_is_removed():
-    depth_m = np.full((120, 160), 1.5, np.float32)
-    depth_m[:, ::4] = 3.0
-    depth_m[0, 1] = 0.0
-    front = foreground_mask(WHOLE, depth_m)
-    assert np.array_equal(front, (depth_m == 1.5) | (depth_m == 0.0))
-
-
-def test_a_few_pixels_in_between_do_not_join_two_layers():
-    depth_m, mask = np.full((120, 160), 2.2, np.float32), np.zeros((120, 160), np.bool_)
-    mask[40:70, 70:80] = True
-    depth_m[40:66, 70:80] = 1.9
-    depth_m[66, 70:80] = np.linspace(1.9, 2.2, 10)
-    assert np.array_equal(foreground_mask(mask, depth_m), mask & (depth_m < 1.97))
-
-
-def test_a_receding_table_is_one_layer():
-    depth_m = np.broadcast_to(np.linspace(0.8, 4.0, 120, dtype=np.float32)[:, None], (120, 160))
-    assert np.array_equal(foreground_mask(WHOLE, depth_m), WHOLE)
-
-
-def test_a_mask_without_depth_is_unchanged():
-    assert np.array_equal(foreground_mask(WHOLE, np.zeros((120, 160), np.float32)), WHOLE)
-
-
 def test_low_scores_need_two_detections_and_high_scores_one():
     assert target_marked([0.4], 3) == [False, True, True]
     assert target_marked([0.9], 3) == [True, True, True]
@@ -107,29 +79,33 @@ def test_a_first_low_score_makes_the_next_frame_a_keyframe():
         assert detector.calls == calls
 
 
-def test_a_reliable_target_survives_a_few_missed_detections():
-    assert target_marked([0.9, None, None, None, 0.4], 5) == [True, True, True, False, True]
-    assert target_marked([0.9, None, None, 0.9, None, None, None], 7) == [True] * 6 + [False]
-
-
-def test_an_unreliable_target_is_marked_while_no_frame_misses_it():
-    assert target_marked([0.4, 0.4, None, 0.4], 4) == [False, True, False, True]
+def test_a_target_survives_one_missed_detection_for_each_that_found_it():
+    assert target_marked([0.9, None, None, 0.4], 4) == [True, True, False, True]
+    assert target_marked([0.9, None, 0.9, None, None], 5) == [True] * 4 + [False]
 
 
 def test_a_weak_detection_supports_an_object_but_does_not_make_one():
     assert target_marked([0.2], 5) == [False] * 5
     assert target_marked([0.4, 0.2, 0.2, 0.2], 4) == [False] * 4
-    assert target_marked([0.4, 0.4, 0.2, None], 4) == [False, True, True, False]
+    assert target_marked([0.4, 0.4, *[None] * 3], 5) == [False] + [True] * 3 + [False]
+    assert target_marked([0.4, 0.4, 0.2, *[None] * 3], 6) == [False] + [True] * 5
 
 
-def test_a_known_target_survives_missed_detections_without_a_high_score():
-    assert target_marked([0.4, 0.4, 0.4, None, 0.2, None, None], 7) == [False] + [True] * 6
-    assert target_marked([0.4, 0.4, 0.4, *[None] * 7], 10) == [False] + [True] * 8 + [False]
+def known_objects(scores: Sequence[float | None]) -> int:
+    estimator = TaskRelevanceEstimator(
+        TaskGraph("id", "find the mug", ("mug",), (), ()),
+        ScriptedDetector(scores),
+        RelevanceTrackerSettings(max_frames=1),
+    )
+    for index in range(len(scores)):
+        estimator.estimate(frame_at(index=index))
+    return estimator.known_objects
 
 
-def test_two_weak_detections_make_an_object_known_like_a_third_detection():
-    assert target_marked([0.4, 0.4, 0.2, None], 4) == [False, True, True, False]
-    assert target_marked([0.4, 0.4, 0.2, 0.2, None, None], 6) == [False] + [True] * 5
+def test_an_object_is_known_after_three_detections_of_which_weak_ones_count_half():
+    assert (known_objects([0.9, 0.9]), known_objects([0.4, 0.4, 0.4])) == (0, 1)
+    assert (known_objects([0.4, 0.4, 0.2]), known_objects([0.4, 0.4, 0.2, 0.2])) == (0, 1)
+    assert known_objects([0.9, *[None] * 3, 0.9, 0.9]) == 1
 
 
 def test_an_object_missed_by_most_frames_is_not_confirmed():
@@ -147,13 +123,13 @@ def test_an_object_missed_by_most_frames_is_not_confirmed():
     ],
 )
 def test_only_visible_landmarks_can_be_missed(frame, expected):
-    assert VisibilityCheck(frame, frame.depth_m).is_visible(landmark_at()) is expected
+    assert VisibilityCheck(frame, frame.depth_m, EvidenceSettings()).is_visible(landmark_at()) is expected
 
 
 def test_landmarks_farther_than_any_observation_are_not_missed():
     far_frame = frame_at(wall_m=9.0)
     far_frame.T_world_camera[2, 3] = -3.0
-    assert not VisibilityCheck(far_frame, far_frame.depth_m).is_visible(landmark_at())
+    assert not VisibilityCheck(far_frame, far_frame.depth_m, EvidenceSettings()).is_visible(landmark_at())
 
 
 def test_the_order_of_observations_does_not_matter():
@@ -166,7 +142,7 @@ def test_the_order_of_observations_does_not_matter():
         object_map = ObjectMap()
         for number in order:
             object_map.observe([observations[number]])
-        object_map.observe([], lambda each: True)
+        object_map.observe([], lambda landmark: True)
         (mug,) = object_map.objects
         assert (mug.seen_count, mug.missed_count, mug.best_score) == (3, 1, 0.7)
         assert mug.farthest_m == pytest.approx(2.0, abs=0.05)
@@ -178,10 +154,10 @@ def cloud(phrase: str, score: float, *low_and_high_m: tuple[float, float]) -> Ob
     return Observation.from_points(phrase, points_m, np.zeros(3), score)
 
 
-def closest_chair() -> SpatialFilter:
+def closest_chair() -> ObservedObjects:
     relation = Relation(Predicate.CLOSEST_TO, "chair", "table")
     graph = TaskGraph("id", "the chair closest to the table", ("chair",), ("table",), (relation,))
-    return SpatialFilter(graph, (0.0, -1.0, 0.0), SpatialSettings())
+    return ObservedObjects(graph)
 
 
 def test_the_closest_chair_is_found_from_a_part_of_the_table():
@@ -191,23 +167,25 @@ def test_the_closest_chair_is_found_from_a_part_of_the_table():
     )
     parts = [cloud("table", 0.9, (-0.4, right_m), (0.0, 0.05), (-0.4, 0.4)) for right_m in (0.9, 1.6)]
     for part in parts:
-        spatial_filter = closest_chair()
-        spatial_filter.observe([part, side_chair, end_chair])
-        assert spatial_filter.target_of(side_chair) is not None
-        assert spatial_filter.target_of(end_chair) is None
+        objects = closest_chair()
+        objects.observe([part, side_chair, end_chair])
+        assert objects.target_of(side_chair) is not None
+        assert objects.target_of(end_chair) is None
 
 
-def test_an_unreliable_candidate_does_not_decide_a_superlative():
+def test_a_candidate_with_a_far_lower_score_does_not_decide_a_superlative():
     table = cloud("table", 0.9, (-0.4, 0.4), (0.0, 0.05), (-0.4, 0.4))
-    unreliable, reliable = (
+    low, high = (
         cloud("chair", score, (x_m, x_m + 0.3), (-0.3, 0.3), (0.0, 0.3)) for score, x_m in ((0.3, 0.5), (0.9, 1.5))
     )
-    spatial_filter = closest_chair()
+    objects = closest_chair()
+    states = []
     for _ in range(3):
-        spatial_filter.observe([table, unreliable, reliable])
-    assert spatial_filter.is_confirmed(unreliable)
-    assert spatial_filter.target_of(reliable) is not None
-    assert spatial_filter.target_of(unreliable) is None
+        objects.observe([table, low, high])
+        states.append(objects.state(low))
+    assert states == [LandmarkState.CANDIDATE, LandmarkState.CONFIRMED, LandmarkState.KNOWN]
+    assert objects.target_of(high) is not None
+    assert objects.target_of(low) is None
 
 
 @pytest.mark.parametrize("settings", [{"min_seen": 0}, {"confident_score": -0.1}, {"min_seen_fraction": 1.1}])

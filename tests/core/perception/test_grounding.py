@@ -16,9 +16,9 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import DetectedBox
-from gausslite.perception.grounding import GroundingDino, GroundingSettings, corners_px, phrase_scores, preprocess
-from gausslite.perception.grounding_text import BertTokenizer, encode_phrase
 from gausslite.perception.models.model_file import open_model
+from gausslite.perception.open_vocabulary import GroundingDino, GroundingSettings, corners_px, phrase_scores, preprocess
+from gausslite.perception.text_features import BertTokenizer, encode_phrase
 
 LEFT, RIGHT = (0.25, 0.5, 0.25, 0.5), (0.75, 0.5, 0.25, 0.5)
 SURE, UNSURE = 2.0, -1.2

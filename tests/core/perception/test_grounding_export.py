@@ -12,11 +12,10 @@ from tool_modules import load_tool
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.perception.box_size import BoxSizeLimits
-from gausslite.perception.grounding import INPUTS, GroundingDino, GroundingSettings, preprocess
-from gausslite.perception.grounding_text import encode_phrase
+from gausslite.perception.detector import BoxSizeLimits
 from gausslite.perception.models.model_file import open_model
-from gausslite.perception.phrase_vectors import open_phrase_vectors
+from gausslite.perception.open_vocabulary import INPUTS, GroundingDino, GroundingSettings, preprocess
+from gausslite.perception.text_features import encode_phrase, open_phrase_vectors
 
 torch = pytest.importorskip("torch", reason="the reference extra brings torch, which this network is made with")
 transformers = pytest.importorskip("transformers", reason="transformers, which has Grounding DINO, is not installed")
@@ -76,7 +75,7 @@ def network_inputs(seed: int, phrase: str):
 
 @pytest.mark.parametrize("phrase", ["red mug", "table", "red table"])
 def test_every_box_and_score_is_torchs(network, path, phrase):
-    lenient = GroundingSettings(0.001, 0.001, nms_max_iou=0.999, box_limits=BoxSizeLimits(1e6, 1e6, 1e6, 1.0, 1.0, 1.0))
+    lenient = GroundingSettings(0.001, 0.001, nms_max_iou=0.999, box_limits=BoxSizeLimits(scale=1e6))
     detector = GroundingDino(open_model(path, 1), TinyTokenizer(), lenient)
     text = encode_phrase(phrase, TinyTokenizer(), TOKENS)
     for seed in SEEDS:

@@ -14,7 +14,7 @@ from gausslite.domain.errors import InvalidInputError, KernelError, ModelFileErr
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
-from gausslite.perception.detect import SegmentedDetector
+from gausslite.perception.detector import SegmentedDetector
 from gausslite.perception.models.model_file import choose_providers, open_model
 from gausslite.perception.models.model_registry import ModelFamily, ModelRegistry, identify_family
 

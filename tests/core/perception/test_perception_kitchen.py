@@ -12,9 +12,9 @@ from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
 from gausslite.domain.noun_match import MatchBasis
 from gausslite.perception.models.model_file import open_model
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.text_embeddings import TextEmbeddings, match_noun
+from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.settings import RelevanceTrackerSettings
+from gausslite.perception.text_features import ClassMatchSettings, TextEmbeddings, match_noun
 from gausslite.perception.yolo import YoloDetector, load_yolo
 from gausslite.task.rules import RuleParser
 
@@ -55,7 +55,7 @@ def test_text_embeddings_match_nouns_to_classes_or_to_none(shared_dir, detector)
     for noun, name in {"pliers": "scissors", "tiger": "zebra", "faucet": "sink"}.items():
         match = match_noun(noun, names, vectors)
         assert (match.classes, match.basis, match.is_searched) == ((name,), MatchBasis.SIMILAR, False)
-        assert match_noun(noun, names, vectors, accept_similar=True).is_searched
+        assert match_noun(noun, names, vectors, ClassMatchSettings(accept_similar=True)).is_searched
     for noun in ("lamp", "fan", "towel", "fire extinguisher", "pillow", "key", "mirror", "trash can"):
         assert not match_noun(noun, names, vectors).is_searched
 

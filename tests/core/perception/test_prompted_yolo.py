@@ -15,9 +15,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import MatchBasis
 from gausslite.perception.models.model_file import open_model
 from gausslite.perception.models.model_registry import ModelFamily, ModelRegistry, identify_family
-from gausslite.perception.phrase_vectors import ClipTextEncoder, NounVectorTable
-from gausslite.perception.prompted_yolo import PromptedYolo
-from gausslite.perception.text_embeddings import NOUN_NAMES_FILE, NOUN_VECTORS_FILE
+from gausslite.perception.open_vocabulary import PromptedYolo
+from gausslite.perception.text_features import NOUN_NAMES_FILE, NOUN_VECTORS_FILE, ClipTextEncoder, NounVectorTable
 
 pytest.importorskip("tokenizers", reason="the text encoder needs the extra grounding")
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from observed_objects import ObservedObjects
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
@@ -14,18 +15,14 @@ from gausslite.domain.noun_match import MatchBasis
 from gausslite.domain.region import BallRegion
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
-from gausslite.perception.ground_truth import RegionDetector
+from gausslite.perception.detector import RegionDetector
 from gausslite.perception.lifting import best_depth_m
 from gausslite.perception.object_map import Observation
-from gausslite.perception.relations import SpatialSettings
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.spatial import SpatialFilter
-from gausslite.perception.text_embeddings import match_noun
+from gausslite.perception.relevance import RegionRelevanceEstimator, TaskRelevanceEstimator
+from gausslite.perception.settings import RelevanceTrackerSettings
+from gausslite.perception.text_features import match_noun
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
-UP = (0.0, -1.0, 0.0)
 
 
 def frame_at(x_m: float = 0.0, index: int = 0, turn_deg: float = 0.0) -> Frame:
@@ -41,7 +38,7 @@ def frame_at(x_m: float = 0.0, index: int = 0, turn_deg: float = 0.0) -> Frame:
 
 
 def graph_of(*relations: Relation, targets: tuple[str, ...] = ("mug",)) -> TaskGraph:
-    anchors = tuple(dict.fromkeys(each.anchor for each in relations))
+    anchors = tuple(dict.fromkeys(relation.anchor for relation in relations))
     return TaskGraph("id", "a task", targets, anchors, relations)
 
 
@@ -128,11 +125,11 @@ def test_a_target_with_an_unseen_anchor_is_kept_with_a_note():
 
 
 def test_an_anchor_out_of_view_still_counts():
-    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "sink")), UP, SpatialSettings())
-    spatial_filter.observe([observation("sink", 0, 0, 0)])
-    spatial_filter.observe([])
-    assert spatial_filter.target_of(observation("mug", 0.9, 0, 0)) is not None
-    assert spatial_filter.target_of(observation("mug", 1.2, 0, 0)) is None
+    objects = ObservedObjects(graph_of(Relation(Predicate.NEAR, "mug", "sink")))
+    objects.observe([observation("sink", 0, 0, 0)])
+    objects.observe([])
+    assert objects.target_of(observation("mug", 0.9, 0, 0)) is not None
+    assert objects.target_of(observation("mug", 1.2, 0, 0)) is None
 
 
 @pytest.mark.parametrize(
@@ -140,51 +137,47 @@ def test_an_anchor_out_of_view_still_counts():
     [((0, -0.3, 0), True), ((0.4, -0.3, 0), True), ((0, 0.3, 0), False), ((0.8, -0.3, 0), False)],
 )
 def test_on_means_above_within_a_horizontal_distance(centre_m, expected):
-    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
-    spatial_filter.observe([observation("table", 0, 0, 0)])
-    assert (spatial_filter.target_of(observation("mug", *centre_m)) is not None) is expected
+    objects = ObservedObjects(graph_of(Relation(Predicate.ON, "mug", "table")))
+    objects.observe([observation("table", 0, 0, 0)])
+    assert (objects.target_of(observation("mug", *centre_m)) is not None) is expected
 
 
 def test_on_a_long_table_means_over_its_footprint():
-    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.ON, "mug", "table")), UP, SpatialSettings())
+    objects = ObservedObjects(graph_of(Relation(Predicate.ON, "mug", "table")))
     x, z = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.4, 0.4, 40))
-    spatial_filter.observe(
-        [Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))]
-    )
-    assert spatial_filter.target_of(observation("mug", 0.9, -0.1, 0.3, radius_m=0.04)) is not None
-    assert spatial_filter.target_of(observation("mug", 1.4, -0.1, 0.3, radius_m=0.04)) is None
+    objects.observe([Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))])
+    assert objects.target_of(observation("mug", 0.9, -0.1, 0.3, radius_m=0.04)) is not None
+    assert objects.target_of(observation("mug", 1.4, -0.1, 0.3, radius_m=0.04)) is None
 
 
 def test_closest_to_selects_one_of_all_seen_candidates():
-    spatial_filter = SpatialFilter(
-        graph_of(Relation(Predicate.CLOSEST_TO, "chair", "table"), targets=("chair",)), UP, SpatialSettings()
-    )
+    objects = ObservedObjects(graph_of(Relation(Predicate.CLOSEST_TO, "chair", "table"), targets=("chair",)))
     near, far = observation("chair", 0.8, 0, 0), observation("chair", 2.0, 0, 0)
-    spatial_filter.observe([observation("table", 0, 0, 0), far])
-    assert spatial_filter.target_of(far) is not None
-    spatial_filter.observe([near, far])
-    spatial_filter.observe([near])
-    assert spatial_filter.target_of(near) is not None
-    assert spatial_filter.target_of(far) is None
+    objects.observe([observation("table", 0, 0, 0), far])
+    assert objects.target_of(far) is not None
+    objects.observe([near, far])
+    objects.observe([near])
+    assert objects.target_of(near) is not None
+    assert objects.target_of(far) is None
 
 
 def test_one_satisfied_relation_is_enough():
     near_sink, near_stove = (Relation(Predicate.NEAR, "mug", anchor) for anchor in ("sink", "stove"))
-    spatial_filter = SpatialFilter(graph_of(near_sink, near_stove), UP, SpatialSettings())
-    spatial_filter.observe([observation("sink", 0, 0, 0), observation("stove", 5, 0, 0)])
-    assert spatial_filter.target_of(observation("mug", 5.5, 0, 0)) is not None
-    assert spatial_filter.target_of(observation("mug", 2.5, 0, 0)) is None
+    objects = ObservedObjects(graph_of(near_sink, near_stove))
+    objects.observe([observation("sink", 0, 0, 0), observation("stove", 5, 0, 0)])
+    assert objects.target_of(observation("mug", 5.5, 0, 0)) is not None
+    assert objects.target_of(observation("mug", 2.5, 0, 0)) is None
 
 
 def test_partial_views_merge_to_the_true_centroid():
-    spatial_filter = SpatialFilter(graph_of(Relation(Predicate.NEAR, "mug", "table")), UP, SpatialSettings())
+    objects = ObservedObjects(graph_of(Relation(Predicate.NEAR, "mug", "table")))
     for _ in range(3):
         for left in (-1.0, -0.6, -0.2):
             x, z = np.meshgrid(np.arange(left, left + 1.2, 0.02), np.arange(-0.4, 0.4, 0.02))
-            spatial_filter.observe(
+            objects.observe(
                 [Observation.from_points("table", np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1))]
             )
-    (table,) = spatial_filter.landmarks
+    (table,) = objects.landmarks
     assert table.seen_count == 9
     assert np.abs(table.centroid_m - (0, 0, 0)).max() < 0.06
 

@@ -1,4 +1,4 @@
-"""YOLO-seg end to end with known results, and rejection of invalid files."""
+"""YOLO networks end to end with known results: classes with masks, class-agnostic masks, and invalid files."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
-from gausslite.perception.box_size import BoxSizeLimits
-from gausslite.perception.evidence import EvidenceSettings
+from gausslite.perception.detector import BoxSizeLimits
 from gausslite.perception.models.model_file import open_model
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
-from gausslite.perception.yolo import YoloDetector, YoloSettings, load_yolo
+from gausslite.perception.relevance import TaskRelevanceEstimator
+from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
+from gausslite.perception.yolo import (
+    ClassAgnosticSegmenter,
+    ClassAgnosticSettings,
+    YoloDetector,
+    YoloSettings,
+    load_yolo,
+)
+from gausslite.perception.yolo_network import YoloNetwork
 
 NAMES = ("cup", "chair", "dining table")
 
@@ -114,7 +120,7 @@ def test_boxes_too_large_for_their_class_are_dropped_whatever_else_is_asked_for(
     for queries in (["cup"], ["cup", "chair", "table"]):
         assert len(detector_from(path).detect(near, queries)) == 1
         assert detector_from(path).detect(far, queries) == []
-    lenient = YoloDetector(open_model(path), None, YoloSettings(box_limits=BoxSizeLimits(small_m=2.0)))
+    lenient = YoloDetector(open_model(path), None, YoloSettings(box_limits=BoxSizeLimits(scale=2.0)))
     assert len(lenient.detect(far, ["cup"])) == 1
 
 
@@ -140,14 +146,6 @@ def test_a_different_class_in_the_same_box_is_the_rival(tmp_path):
     assert (found.rival.name, found.rival.score) == ("tv", pytest.approx(0.8))
     (object_1, object_2) = detector.detect(frame_with_red_square(), ["object"])
     assert (object_1.rival, object_2.rival) == (None, None)
-
-
-@pytest.mark.parametrize(("names", "rival"), [(("couch", "chair"), "couch"), (("dining table", "cup"), None)])
-def test_a_part_of_a_larger_seat_is_rather_the_larger_seat(tmp_path, names, rival):
-    whole, left_half = (24.0, 32.0, 16.0, 16.0, 0, 0.8), (20.0, 32.0, 8.0, 16.0, 1, 0.4)
-    detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", names, [whole, left_half]))
-    (found,) = detector.detect(frame_with_red_square(), [names[1]])
-    assert (found.rival and found.rival.name) == rival
 
 
 def test_what_is_rather_another_class_is_reported_and_not_activated(tmp_path):
@@ -234,10 +232,10 @@ def test_a_model_without_class_names_is_refused(tmp_path):
 def test_settings_are_checked():
     with pytest.raises(InvalidInputError, match="detector min_score: expected between 0 and 1"):
         YoloSettings(min_score=1.5)
-    with pytest.raises(InvalidInputError, match="box limit small_m: expected a positive length"):
-        BoxSizeLimits(small_m=0.0)
-    with pytest.raises(InvalidInputError, match="box limit small_share: expected 0 to 1"):
-        BoxSizeLimits(small_share=1.5)
+    with pytest.raises(InvalidInputError, match="box limit scale: expected a positive number"):
+        BoxSizeLimits(scale=0.0)
+    with pytest.raises(InvalidInputError, match="box limit min_known_share: expected 0 to 1"):
+        BoxSizeLimits(min_known_share=1.5)
 
 
 def _refused(path: Path, expected: str) -> None:
@@ -245,3 +243,58 @@ def _refused(path: Path, expected: str) -> None:
         detector_from(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+SURE = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
+# the same square in the image's pixels, which are half the network's, moved down by 16 rows of padding
+BOX = (32.0, 16.0, 64.0, 48.0)
+
+
+def segmenter(tmp_path, *boxes, names=("object",)):
+    return ClassAgnosticSegmenter(
+        YoloNetwork(open_model(write_tiny_yolo(tmp_path / "tiny.onnx", names, boxes, named=False)))
+    )
+
+
+def masks(tmp_path, *boxes, given=(BOX,), names=("object",)):
+    return segmenter(tmp_path, *boxes, names=names).segment(frame_with_red_square(), np.asarray(given, np.float32))
+
+
+def test_a_file_without_metadata_segments_the_object_in_the_box(tmp_path):
+    (mask,) = masks(tmp_path, SURE)
+    assert mask is not None
+    assert mask[16:48, 32:64].mean() > 0.97
+    assert mask.sum() == mask[16:48, 32:64].sum()
+
+
+def test_each_box_gets_the_mask_with_the_largest_overlap(tmp_path):
+    larger = (26.0, 32.0, 20.0, 16.0, 0, 0.95)
+    whole, half = masks(tmp_path, SURE, larger, given=(BOX, (32, 16, 80, 48)))
+    assert whole is not None
+    assert half is not None
+    assert whole[16:48, 32:64].mean() > 0.97
+    assert half.sum() >= whole.sum()
+
+
+def test_boxes_without_a_confident_matching_instance_get_no_mask(tmp_path):
+    beside = (48.0, 16.0, 80.0, 48.0)
+    assert masks(tmp_path, SURE, given=(beside,)) == [None]
+    assert masks(tmp_path, (*SURE[:5], 0.39)) == [None]
+    assert masks(tmp_path) == [None]
+
+
+def test_no_boxes_give_no_masks(tmp_path):
+    assert segmenter(tmp_path, SURE).segment(frame_with_red_square(), np.zeros((0, 4), np.float32)) == []
+
+
+def test_a_network_of_many_classes_has_a_lower_threshold(tmp_path):
+    (mask,) = masks(tmp_path, (*SURE[:5], 0.04), names=("cup", "chair"))
+    assert mask is not None
+
+
+def test_settings_of_the_segmenter_are_checked():
+    for name in ("min_score", "nms_max_iou", "min_box_iou"):
+        with pytest.raises(InvalidInputError, match=name):
+            ClassAgnosticSettings(**{name: 1.0})
+    with pytest.raises(InvalidInputError, match="max_masks"):
+        ClassAgnosticSettings(max_masks=0)

@@ -30,7 +30,7 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.settings import SourceSettings
 from gausslite.mission.timeline import read_timeline
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
 from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub

@@ -29,9 +29,8 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.trajectory import Twist
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
-from gausslite.perception.ground_truth import RegionDetector
-from gausslite.perception.relevance_estimator import RelevanceEstimator, TaskRelevanceEstimator
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire import convert, convert_task

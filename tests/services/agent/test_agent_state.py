@@ -23,7 +23,7 @@ from gausslite.domain.region import BallRegion
 from gausslite.domain.voxel_batch import VoxelBatch
 from gausslite.domain.voxel_operations import group_by_voxel
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.perception.fixed_relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Purpose, Spool

@@ -15,8 +15,8 @@ from fusion_running import frame
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.region import BallRegion
 from gausslite.evaluation.metrics import psnr
-from gausslite.perception.ground_truth import RegionDetector
-from gausslite.perception.relevance_estimator import TaskRelevanceEstimator
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.view.live_page import live_page, own_address
 from gausslite.wire.clients import AgentClient
 

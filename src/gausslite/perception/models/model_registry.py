@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
-from gausslite.perception.detect import BoxDetector, Detector, SegmentedDetector, Segmenter
+from gausslite.perception.detector import BoxDetector, Detector, SegmentedDetector, Segmenter, TiledDetector, Tiling
 from gausslite.perception.models.model_file import OpenModel, open_model
-from gausslite.perception.tiles import TiledDetector, Tiling
-from gausslite.perception.yolo_decode import MASK_COEFFICIENTS
+from gausslite.perception.yolo_network import MASK_COEFFICIENTS
 
 VOCABULARY: Final = "vocab.txt"
 OWN_MASKS, DEPTH = "yolo", "depth"
@@ -28,9 +27,8 @@ class ModelFamily(StrEnum):
 
 def identify_family(model: OpenModel) -> ModelFamily:
     """Return the family of an open model. Raises ModelFileError if it is not supported."""
-    from gausslite.perception.grounding import is_grounding
-    from gausslite.perception.phrase_vectors import TOKEN_ID_TYPES
-    from gausslite.perception.prompted_yolo import is_prompted
+    from gausslite.perception.open_vocabulary import is_grounding, is_prompted
+    from gausslite.perception.text_features import TOKEN_ID_TYPES
 
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
     if is_grounding([each.name for each in inputs], [each.name for each in outputs]):
@@ -116,12 +114,12 @@ def _open_vocabulary(
 ) -> BoxDetector:
     """Return a detector of any phrase with its text encoder."""
     if family is ModelFamily.GROUNDING_DINO:
-        from gausslite.perception.grounding import GroundingDino
-        from gausslite.perception.grounding_text import BertTokenizer
+        from gausslite.perception.open_vocabulary import GroundingDino
+        from gausslite.perception.text_features import BertTokenizer
 
         return GroundingDino(model, BertTokenizer(vocabulary or model.path.parent / VOCABULARY))
-    from gausslite.perception.phrase_vectors import open_phrase_vectors
-    from gausslite.perception.prompted_yolo import PromptedYolo
+    from gausslite.perception.open_vocabulary import PromptedYolo
+    from gausslite.perception.text_features import open_phrase_vectors
 
     return PromptedYolo(model, open_phrase_vectors(model.path.parent, vocabulary, threads))
 
@@ -132,7 +130,7 @@ def _segmenter(name: str, threads: int | None) -> Segmenter:
 
     if name == DEPTH:
         return DepthSegmenter()
-    from gausslite.perception.class_agnostic import ClassAgnosticSegmenter
+    from gausslite.perception.yolo import ClassAgnosticSegmenter
     from gausslite.perception.yolo_network import YoloNetwork
 
     network = YoloNetwork(open_model(Path(name), threads))

@@ -22,7 +22,7 @@ from gausslite.mapping.tracking.tracker import CameraTracker
 from gausslite.mission.build import build_mapper, build_tracker
 from gausslite.mission.settings import MissionSettings, PoseMode
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.fixed_relevance import NoTaskEstimator
+from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.render.rasterizer import Rendering
 
 PRIOR_STD = np.array([0.1] * 3 + [0.1] * 3)

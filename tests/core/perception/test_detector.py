@@ -1,4 +1,4 @@
-"""Tiles cover the image, find what is too small for the whole image, and leave large objects to it."""
+"""Limits on the size of boxes, and small objects in enlarged tiles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounMatch
 from gausslite.domain.relevance import Detection
-from gausslite.perception.tiles import Tile, TiledDetector, Tiling, crop, tiles_of
+from gausslite.perception.detector import BoxSizeLimits, Tile, TiledDetector, Tiling, crop, tiles_of
 
 HEIGHT_PX, WIDTH_PX = 60, 80
 INPUT_WIDTH_PX = 80
@@ -62,7 +62,7 @@ def frame_with(*squares: tuple[int, int, int]) -> Frame:
 @pytest.mark.parametrize("per_side", [1, 2, 3, 4])
 def test_tiles_cover_every_pixel_and_lie_within_the_image(size_px, per_side):
     covered = np.zeros(size_px, np.bool_)
-    tiles = list(tiles_of(size_px, per_side))
+    tiles = list(tiles_of(size_px, Tiling(per_side)))
     assert len(tiles) == per_side**2
     for tile in tiles:
         assert 0 <= tile.left_px < tile.right_px <= size_px[1]
@@ -73,7 +73,7 @@ def test_tiles_cover_every_pixel_and_lie_within_the_image(size_px, per_side):
 
 def test_an_object_of_a_tenth_of_a_side_is_whole_in_a_tile_wherever_it_is():
     for left in range(0, 73):
-        tiles = tiles_of((HEIGHT_PX, WIDTH_PX), 2)
+        tiles = tiles_of((HEIGHT_PX, WIDTH_PX), Tiling(2))
         assert any(tile.left_px <= left and left + 8 <= tile.right_px for tile in tiles)
 
 
@@ -154,3 +154,48 @@ def test_without_time_for_a_tile_the_whole_image_is_still_searched():
 def test_numbers_of_tiles_out_of_range_are_refused(per_side):
     with pytest.raises(InvalidInputError, match="tiles: expected 1 to 4 per side"):
         Tiling(per_side)
+
+
+CAMERA = Camera(100.0, 100.0, 100.0, 75.0, 200, 150)
+WHOLE_IMAGE = (0.0, 0.0, 200.0, 150.0)
+
+
+def frame_at(depth_m: float) -> Frame:
+    return Frame(0, 0, np.zeros((150, 200, 3), np.uint8), np.full((150, 200), depth_m, np.float32), CAMERA, np.eye(4))
+
+
+@pytest.mark.parametrize("depth_m", [0.4, 1.0, 2.5])
+def test_the_extent_is_the_longer_side_at_the_measured_depth(depth_m):
+    assert BoxSizeLimits().extent_m((20.0, 30.0, 120.0, 60.0), frame_at(depth_m)) == pytest.approx(depth_m)
+    assert BoxSizeLimits().extent_m((20.0, 30.0, 40.0, 110.0), frame_at(depth_m)) == pytest.approx(0.8 * depth_m)
+
+
+def test_a_near_object_may_fill_the_image_and_a_far_one_may_not():
+    limits = BoxSizeLimits()
+    assert limits.accepts("mug", 0.5, WHOLE_IMAGE, frame_at(0.4))
+    assert not limits.accepts("mug", 0.5, WHOLE_IMAGE, frame_at(1.0))
+    assert limits.accepts("chair", 0.5, WHOLE_IMAGE, frame_at(0.5))
+    assert not limits.accepts("chair", 0.5, WHOLE_IMAGE, frame_at(1.0))
+    assert limits.accepts("couch", 0.5, WHOLE_IMAGE, frame_at(1.0))
+    assert limits.accepts("table", 0.5, WHOLE_IMAGE, frame_at(2.5))
+    assert not limits.accepts("wardrobe", 0.5, WHOLE_IMAGE, frame_at(2.5))
+
+
+def test_a_confident_detection_may_be_larger():
+    accepted = [BoxSizeLimits().accepts("monitor", score, WHOLE_IMAGE, frame_at(0.7)) for score in (0.3, 0.6, 0.8)]
+    assert accepted == [False, False, True]
+
+
+def test_the_nearer_part_of_a_box_counts():
+    frame = frame_at(4.0)
+    frame.depth_m[:75] = 0.4
+    assert BoxSizeLimits().extent_m(WHOLE_IMAGE, frame) == pytest.approx(0.8)
+
+
+def test_without_depth_the_share_of_the_image_counts():
+    limits, frame = BoxSizeLimits(), frame_at(0.0)
+    assert BoxSizeLimits().extent_m(WHOLE_IMAGE, frame) is None
+    assert BoxSizeLimits().extent_m((300.0, 10.0, 320.0, 20.0), frame) is None
+    assert limits.accepts("mug", 0.9, (0.0, 0.0, 60.0, 60.0), frame)
+    assert not limits.accepts("mug", 0.9, (0.0, 0.0, 100.0, 100.0), frame)
+    assert limits.accepts("bed", 0.9, (0.0, 0.0, 150.0, 150.0), frame)

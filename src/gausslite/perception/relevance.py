@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.noun_match import NounReport, match_warnings
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.relevance import DetectedImage, Detection, RelevanceMap
+from gausslite.domain.region import Region
+from gausslite.domain.relevance import NO_TARGET, DetectedImage, Detection, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
-from gausslite.perception.detect import Detector
+from gausslite.perception.detector import Detector
 from gausslite.perception.lifting import best_depth_m
 from gausslite.perception.object_map import Landmark
-from gausslite.perception.relevance_tracker import RelevanceTracker, RelevanceTrackerSettings
+from gausslite.perception.relevance_tracker import RelevanceTracker
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.perception.supporting_surface import nouns_known_by_height
 
 
@@ -43,63 +48,87 @@ class RelevanceEstimate:
     detected: DetectedImage | None = None
 
 
-@runtime_checkable
-class RelevanceEstimator(Protocol):
-    """Estimate which pixels of each frame are relevant to the task."""
+class RelevanceEstimator(ABC):
+    """Estimates which pixels of each frame are relevant to the task.
 
+    All members but `estimate` are those of an estimator whose frames are independent and that detects nothing.
+    """
+
+    @abstractmethod
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return the relevance of one frame. rendered_depth_m is rendered from the current map, 0 where it is empty."""
-        ...
 
     def evaluate_past(self, frame: Frame) -> RelevanceMap | None:
         """Return this task's relevance of an earlier frame; None while its detection runs, then call again.
 
         The caller proceeds from the newest frame to the oldest, one at a time.
         """
-        ...
+        return self.estimate(frame).relevance
 
     @property
     def known_objects(self) -> int:
         """The number of the task's objects that relevance maps include from now on."""
-        ...
+        return 0
 
     def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
         """Return an earlier frame's relevance with the objects that became known since, without a detection."""
-        ...
+        del frame
+        return relevance
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Messages for the operator about the frames so far, one line each."""
-        ...
+        return ()
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task so far; empty if the estimator has no object map."""
-        ...
+        return ()
 
     @property
     def nouns(self) -> tuple[NounReport, ...]:
         """What is searched for each noun of the task, and what was detected; empty without a detector."""
-        ...
+        return ()
 
     def state(self) -> State:
         """Return everything that the next frame's relevance depends on, except the frame, as named arrays."""
-        ...
+        return {}
 
     def restore(self, state: State) -> None:
-        """Replace the state by that of an estimator of the same task. Raises MapFileError."""
-        ...
+        """Replace the state by that of an estimator of the same task. Raises MapFileError, InvalidInputError."""
+        del state
 
 
-class TaskRelevanceEstimator:
-    """A RelevanceEstimator for a task graph that waits for its detector. Use from one thread at a time."""
+class NoTaskEstimator(RelevanceEstimator):
+    """A RelevanceEstimator for uniform maps: no pixel is relevant."""
 
-    def __init__(
-        self,
-        graph: TaskGraph,
-        detector: Detector,
-        settings: RelevanceTrackerSettings | None = None,
-    ) -> None:
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
+        """Return weight 0 everywhere."""
+        del rendered_depth_m
+        return RelevanceEstimate(RelevanceMap.empty(*frame.depth_m.shape))
+
+
+class RegionRelevanceEstimator(RelevanceEstimator):
+    """A RelevanceEstimator that marks given regions; region i is target i, and the first wins in an overlap."""
+
+    def __init__(self, regions: Sequence[Region]) -> None:
+        if not regions:
+            raise InvalidInputError("regions: expected at least one region, got none")
+        self._regions = tuple(regions)
+
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
+        """Return weight 1 on every pixel that shows a region; the rendered depth is not needed."""
+        del rendered_depth_m
+        target = np.full(frame.depth_m.shape, NO_TARGET, np.int16)
+        for index, region in reversed(list(enumerate(self._regions))):
+            target[region.mask(frame)] = index
+        return RelevanceEstimate(RelevanceMap((target != NO_TARGET).astype(np.float32), target))
+
+
+class DetectingEstimator(RelevanceEstimator):
+    """What the estimators with a detector share: the task's graph, the detector and the tracked objects."""
+
+    def __init__(self, graph: TaskGraph, detector: Detector, settings: RelevanceTrackerSettings | None = None) -> None:
         self._graph = graph
         self._detector = detector
         by_height = nouns_known_by_height(detector.matches(graph.queries))
@@ -114,81 +143,6 @@ class TaskRelevanceEstimator:
     def landmarks(self) -> tuple[Landmark, ...]:
         """All objects detected so far for the task's nouns, in world coordinates."""
         return self._tracker.landmarks
-
-    @property
-    def objects(self) -> tuple[ObjectLandmark, ...]:
-        """The confirmed objects of the task so far."""
-        return self._tracker.objects
-
-    @property
-    def nouns(self) -> tuple[NounReport, ...]:
-        """What the detector searches for each noun of the task, and what it has detected."""
-        return tuple(self._tracker.report(match) for match in self._detector.matches(self._graph.queries))
-
-    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
-        """Return weight 1 on the pixels of the targets that satisfy the task's relations."""
-        if not self._tracker.update_keyframe(frame):
-            return RelevanceEstimate(self._tracker.propagate(frame))
-        detections = self._detector.detect(frame, self._graph.queries)
-        depth_m = best_depth_m(frame.depth_m, rendered_depth_m)
-        relevance = self._tracker.integrate(frame, depth_m, detections)
-        return RelevanceEstimate(relevance, detected=DetectedImage.of(frame, detections))
-
-    def evaluate_past(self, frame: Frame) -> RelevanceMap:
-        """Return the relevance of an earlier frame after a detection on it."""
-        return self._tracker.integrate(frame, frame.depth_m, self._detector.detect(frame, self._graph.queries))
-
-    @property
-    def known_objects(self) -> int:
-        """The number of targets that were detected often enough so far."""
-        return self._tracker.known_objects
-
-    def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
-        """Return an earlier frame's relevance with the objects that became known since."""
-        return self._tracker.complete(frame, relevance)
-
-    def state(self) -> State:
-        """Return the tracker's state as named arrays."""
-        return self._tracker.state()
-
-    def restore(self, state: State) -> None:
-        """Replace the tracker's state by that of the same task. Raises MapFileError, InvalidInputError."""
-        self._tracker.restore(state)
-
-
-class AsyncRelevanceEstimator:
-    """A RelevanceEstimator that does not wait: detections run on an executor of one thread.
-
-    One detection runs at a time. Of the keyframes that arrive meanwhile, only the newest is queued. A finished
-    detection is propagated to the current frame, and the keyframe's own relevance is returned as delayed.
-    Evaluations of past frames use the same executor. Use from one thread at a time.
-    """
-
-    def __init__(
-        self,
-        graph: TaskGraph,
-        detector: Detector,
-        executor: Executor,
-        settings: RelevanceTrackerSettings | None = None,
-    ) -> None:
-        self._graph = graph
-        self._detector = detector
-        self._executor = executor
-        by_height = nouns_known_by_height(detector.matches(graph.queries))
-        self._tracker = RelevanceTracker(graph, settings or RelevanceTrackerSettings(), by_height)
-        self._frames = 0
-        self._skipped_keyframes = 0
-        self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
-        self._queued: _Keyframe | None = None
-        self._past_detection: tuple[Frame, Future[list[Detection]]] | None = None
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Nouns that the detector cannot find, anchors not seen yet, and the number of skipped keyframes."""
-        unsupported = match_warnings(self._detector.matches(self._graph.queries))
-        count = self._skipped_keyframes
-        skipped = (f"detector too slow: {count} keyframes were skipped",) if count else ()
-        return (*unsupported, *self._tracker.notes, *skipped)
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
@@ -216,6 +170,54 @@ class AsyncRelevanceEstimator:
     def restore(self, state: State) -> None:
         """Replace the tracker's state by that of the same task. Raises MapFileError, InvalidInputError."""
         self._tracker.restore(state)
+
+
+class TaskRelevanceEstimator(DetectingEstimator):
+    """A RelevanceEstimator for a task graph that waits for its detector. Use from one thread at a time."""
+
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
+        """Return weight 1 on the pixels of the targets that satisfy the task's relations."""
+        if not self._tracker.update_keyframe(frame):
+            return RelevanceEstimate(self._tracker.propagate(frame))
+        detections = self._detector.detect(frame, self._graph.queries)
+        depth_m = best_depth_m(frame.depth_m, rendered_depth_m)
+        relevance = self._tracker.integrate(frame, depth_m, detections)
+        return RelevanceEstimate(relevance, detected=DetectedImage.of(frame, detections))
+
+    def evaluate_past(self, frame: Frame) -> RelevanceMap:
+        """Return the relevance of an earlier frame after a detection on it."""
+        return self._tracker.integrate(frame, frame.depth_m, self._detector.detect(frame, self._graph.queries))
+
+
+class AsyncRelevanceEstimator(DetectingEstimator):
+    """A RelevanceEstimator that does not wait: detections run on an executor of one thread.
+
+    One detection runs at a time. Of the keyframes that arrive meanwhile, only the newest is queued. A finished
+    detection is propagated to the current frame, and the keyframe's own relevance is returned as delayed.
+    Evaluations of past frames use the same executor. Use from one thread at a time.
+    """
+
+    def __init__(
+        self,
+        graph: TaskGraph,
+        detector: Detector,
+        executor: Executor,
+        settings: RelevanceTrackerSettings | None = None,
+    ) -> None:
+        super().__init__(graph, detector, settings)
+        self._executor = executor
+        self._frames = 0
+        self._skipped_keyframes = 0
+        self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
+        self._queued: _Keyframe | None = None
+        self._past_detection: tuple[Frame, Future[list[Detection]]] | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Nouns that the detector cannot find, anchors not seen yet, and the number of skipped keyframes."""
+        count = self._skipped_keyframes
+        skipped = (f"detector too slow: {count} keyframes were skipped",) if count else ()
+        return (*super().notes, *skipped)
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return weight 1 on the pixels of the targets detected so far. Raises the detector's exceptions."""

@@ -1,0 +1,410 @@
+"""The measured surface of an object: votes of its masks on voxels, and its mask in any frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from numpy import ndarray
+
+from gausslite.domain.camera import back_project, project
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, transform_points
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.perception.colours import colour_counts
+from gausslite.perception.detector import bounding_box
+from gausslite.perception.settings import SurfaceSettings
+
+
+def is_in_large_part(
+    points_m: Float32[ndarray, "n 3"], weights: Int64[ndarray, " n"], settings: SurfaceSettings
+) -> Bool[ndarray, " n"]:
+    """Return True for the points of the part with the largest weight, and of parts with a fifth of that weight.
+
+    Points are connected if their cells touch. Masks that spill over leave small parts apart from the object.
+    """
+    if len(points_m) == 0:
+        return np.zeros(0, np.bool_)
+    keys, cell = np.unique(VoxelGrid(settings.part_cell_m).keys(points_m), return_inverse=True)
+    part = _parts(keys)
+    totals = np.bincount(part, weights=np.bincount(cell, weights=weights))
+    is_large: Bool[ndarray, " n"] = (totals >= settings.min_part_share * totals.max())[part[cell]]
+    return is_large
+
+
+def _parts(keys: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
+    """Return the number of the connected part of each cell: the smallest row spreads until nothing changes."""
+    neighbours = keys[:, None] + NEIGHBOUR_OFFSETS
+    position = np.minimum(np.searchsorted(keys, neighbours), len(keys) - 1)
+    own = np.arange(len(keys))[:, None]
+    rows = np.where(keys[position] == neighbours, position, own)
+    part = np.arange(len(keys))
+    while True:
+        spread = part[rows].min(axis=1)
+        spread = spread[spread]
+        if np.array_equal(spread, part):
+            return np.unique(part, return_inverse=True)[1]
+        part = spread
+
+
+def _neighbour_offsets() -> Int64[ndarray, " 27"]:
+    """Return the differences of a voxel's key to those of its 26 neighbours and its own."""
+    steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3), axis=-1).reshape(-1, 3)
+    centre = np.full((1, 3), 0.5)
+    offsets: Int64[ndarray, " 27"] = _keys(centre + steps) - _keys(centre)
+    return offsets
+
+
+def _keys(voxels: Float64[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
+    return VoxelGrid(1.0).keys(voxels.astype(np.float32))
+
+
+NEIGHBOUR_OFFSETS: Final = _neighbour_offsets()
+# median distance to the middle of a disc, times this number, is its diameter
+_DISC_DIAMETERS: Final = 2.8
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceVotes:
+    """Votes of voxels: in how many frames their visible pixels were inside the object's mask, or outside.
+
+    keys: ascending, without duplicates, in a grid of voxel_m, one of the settings: the finest whose votes fit the
+    memory. An object's surface consists of the voxels with at least as many votes inside as outside, and of their
+    neighbours without votes, because depth is inexact. A mask that once spills over to a wall is outvoted by the frames
+    that show the wall outside the mask; small parts that are apart from the object are left out.
+    """
+
+    keys: Int64[ndarray, " n"]
+    inside: Int64[ndarray, " n"]
+    outside: Int64[ndarray, " n"]
+    voxel_m: float
+    settings: SurfaceSettings
+
+    @classmethod
+    def empty(cls, settings: SurfaceSettings | None = None) -> SurfaceVotes:
+        """Return no votes."""
+        none, settings = np.zeros(0, np.int64), settings or SurfaceSettings()
+        return cls(none, none, none, settings.voxel_sizes_m[0], settings)
+
+    @classmethod
+    def from_points(
+        cls, points_m: Float64[ndarray, "n 3"], is_inside: Bool[ndarray, " n"], settings: SurfaceSettings
+    ) -> SurfaceVotes:
+        """Return one frame's votes: one for each voxel, by the majority of its points in the world."""
+        voxel_m = settings.voxel_sizes_m[0]
+        keys, voxel = np.unique(VoxelGrid(voxel_m).keys(points_m.astype(np.float32)), return_inverse=True)
+        total = np.bincount(voxel, minlength=len(keys))
+        inside = (2 * np.bincount(voxel, weights=is_inside, minlength=len(keys)) > total).astype(np.int64)
+        return cls(keys, inside, 1 - inside, voxel_m, settings)._limited()
+
+    def add(self, other: SurfaceVotes) -> SurfaceVotes:
+        """Return the sums of both votes, in the coarser grid of both."""
+        voxel_m = max(self.voxel_m, other.voxel_m)
+        both = [votes.coarsened(voxel_m) for votes in (self, other)]
+        keys = np.concatenate([votes.keys for votes in both])
+        inside = np.concatenate([votes.inside for votes in both])
+        outside = np.concatenate([votes.outside for votes in both])
+        return self._summed(keys, inside, outside, voxel_m)._limited()
+
+    def coarsened(self, voxel_m: float) -> SurfaceVotes:
+        """Return the sums of the votes in voxels of at least voxel_m, one of the settings."""
+        if voxel_m <= self.voxel_m:
+            return self
+        if voxel_m not in self._coarsened:
+            keys = VoxelGrid(voxel_m).keys(self._grid.centres_m(self.keys))
+            self._coarsened[voxel_m] = self._summed(keys, self.inside, self.outside, voxel_m)
+        return self._coarsened[voxel_m]
+
+    def _summed(
+        self, keys: Int64[ndarray, " n"], inside: Int64[ndarray, " n"], outside: Int64[ndarray, " n"], voxel_m: float
+    ) -> SurfaceVotes:
+        unique, voxel = np.unique(keys, return_inverse=True)
+        inside_sums = np.bincount(voxel, weights=inside, minlength=len(unique)).astype(np.int64)
+        outside_sums = np.bincount(voxel, weights=outside, minlength=len(unique)).astype(np.int64)
+        return SurfaceVotes(unique, inside_sums, outside_sums, voxel_m, self.settings)
+
+    @cached_property
+    def extent_m(self) -> float:
+        """Diameter of a disc with the surface's median distance from its middle; 0 without a surface."""
+        centres = self.surface_m.astype(np.float64)
+        if len(centres) == 0:
+            return 0.0
+        distances_m = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+        return _DISC_DIAMETERS * float(np.median(distances_m))
+
+    def lowest_m(self, up: Float64[ndarray, "3"], percentile: float) -> float:
+        """Return the level of the surface's bottom, along up in the world; NaN without a surface."""
+        levels_m = self.surface_m.astype(np.float64) @ up
+        return float(np.percentile(levels_m, percentile)) if len(levels_m) else np.nan
+
+    def resolved(self, min_voxel_m: float) -> SurfaceVotes:
+        """Return the votes in voxels of a twelfth of the extent, and of at least min_voxel_m."""
+        wanted_m = max(min_voxel_m, self.extent_m / self.settings.extent_voxels)
+        sizes = [size for size in self.settings.voxel_sizes_m if size <= 2**0.5 * wanted_m]
+        return self.coarsened(max(sizes, default=self.settings.voxel_sizes_m[0]))
+
+    @cached_property
+    def _coarsened(self) -> dict[float, SurfaceVotes]:
+        """The votes in the coarser grids that were asked for."""
+        return {}
+
+    def _limited(self) -> SurfaceVotes:
+        """Return the votes in a coarser grid if the surface is too large for memory, without the least voted voxels."""
+        if len(self.keys) <= self.settings.max_voxels:
+            return self
+        sizes_m = self.settings.voxel_sizes_m
+        if np.count_nonzero(self.inside) > self.settings.max_inside_voxels and self.voxel_m < sizes_m[-1]:
+            return self.coarsened(next(size for size in sizes_m if size > self.voxel_m))._limited()
+        kept = np.sort(np.lexsort((-self.outside, -self.inside))[: self.settings.max_voxels])
+        return replace(self, keys=self.keys[kept], inside=self.inside[kept], outside=self.outside[kept])
+
+    def is_on_surface(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """Return True for points in a voxel of the object's surface."""
+        return _is_member(self._grid.keys(points_m.astype(np.float32)), self.surface_keys)
+
+    @property
+    def _grid(self) -> VoxelGrid:
+        return VoxelGrid(self.voxel_m)
+
+    @cached_property
+    def _is_inside(self) -> Bool[ndarray, " n"]:
+        is_inside = self.inside >= self.outside
+        is_inside[is_inside] = is_in_large_part(
+            self._grid.centres_m(self.keys[is_inside]), self.inside[is_inside], self.settings
+        )
+        return is_inside
+
+    @cached_property
+    def _inside_keys(self) -> Int64[ndarray, " m"]:
+        keys: Int64[ndarray, " m"] = self.keys[self._is_inside]
+        return keys
+
+    @cached_property
+    def _outside_keys(self) -> Int64[ndarray, " m"]:
+        keys: Int64[ndarray, " m"] = self.keys[~self._is_inside]
+        return keys
+
+    def is_surely_inside(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """Return True for points in a voxel of the surface that touches no voxel with more votes outside."""
+        return self._is_far_from(points_m, self._inside_keys, self._outside_keys)
+
+    def is_surely_outside(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """Return True for points in a voxel with more votes outside that touches no voxel of the surface."""
+        return self._is_far_from(points_m, self._outside_keys, self._inside_keys)
+
+    def _is_far_from(
+        self, points_m: Float64[ndarray, "n 3"], own: Int64[ndarray, " m"], others: Int64[ndarray, " k"]
+    ) -> Bool[ndarray, " n"]:
+        """Return True for points in an own voxel without a neighbour among the others."""
+        keys, voxel = np.unique(self._grid.keys(points_m.astype(np.float32)), return_inverse=True)
+        is_far = _is_member(keys, own)
+        rows = np.flatnonzero(is_far)
+        near = (keys[rows, None] + NEIGHBOUR_OFFSETS).reshape(-1)
+        is_far[rows] = ~_is_member(near, others).reshape(len(rows), len(NEIGHBOUR_OFFSETS)).any(axis=1)
+        result: Bool[ndarray, " n"] = is_far[voxel]
+        return result
+
+    @cached_property
+    def surface_keys(self) -> Int64[ndarray, " m"]:
+        """The keys of the surface's voxels, ascending."""
+        near = np.unique((self._inside_keys[:, None] + NEIGHBOUR_OFFSETS).reshape(-1))
+        keys: Int64[ndarray, " m"] = near[~_is_member(near, self._outside_keys)]
+        return keys
+
+    @cached_property
+    def surface_m(self) -> Float32[ndarray, "m 3"]:
+        """The centres in the world of the surface's voxels that have votes."""
+        return self._grid.centres_m(self._inside_keys)
+
+
+def _is_member(keys: Int64[ndarray, " n"], ascending: Int64[ndarray, " m"]) -> Bool[ndarray, " n"]:
+    if len(ascending) == 0:
+        return np.zeros(len(keys), np.bool_)
+    position = np.minimum(np.searchsorted(ascending, keys), len(ascending) - 1)
+    result: Bool[ndarray, " n"] = ascending[position] == keys
+    return result
+
+
+def snapped_to_edges(
+    mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"], settings: SurfaceSettings
+) -> Bool[ndarray, "h w"]:
+    """Return the mask with the pixels near its outline assigned to the side that has their colour.
+
+    A guided filter finds the side (He et al., PAMI 2013).
+    """
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return mask
+    # a filtered pixel depends on pixels up to twice the radius away, and a changed pixel is one radius outside
+    margin_px = 3 * settings.edge_radius_px
+    window = tuple(slice(max(0, int(at[0]) - margin_px), int(at[-1]) + margin_px + 1) for at in (rows, columns))
+    part = mask[window]
+    lab = cv2.cvtColor(np.ascontiguousarray(rgb[window]), cv2.COLOR_RGB2LAB).astype(np.float32) / np.float32(255)
+    share = _guided_filter(lab, part.astype(np.float32), settings)
+    kernel = np.ones(_edge_window(settings), np.uint8)
+    near_outline = cv2.dilate(part.astype(np.uint8), kernel) > cv2.erode(part.astype(np.uint8), kernel)
+    snapped = mask.copy()
+    snapped[window] = np.where(near_outline, share > 0.5, part)
+    return snapped
+
+
+def _edge_window(settings: SurfaceSettings) -> tuple[int, int]:
+    return 2 * settings.edge_radius_px + 1, 2 * settings.edge_radius_px + 1
+
+
+def _guided_filter(
+    guide: Float32[ndarray, "h w 3"], values: Float32[ndarray, "h w"], settings: SurfaceSettings
+) -> Float32[ndarray, "h w"]:
+    """Return the values as locally linear functions of the guide's three channels, fitted in each window."""
+    window = _edge_window(settings)
+    guide_mean, value_mean = cv2.blur(guide, window), cv2.blur(values, window)
+    products = cv2.blur(guide * values[..., None], window) - guide_mean * value_mean[..., None]
+    outer = (guide[..., :, None] * guide[..., None, :]).reshape(*values.shape, 9)
+    variance = np.dstack([cv2.blur(np.ascontiguousarray(outer[..., i]), window) for i in range(9)])
+    variance = variance.reshape(*values.shape, 3, 3) - guide_mean[..., :, None] * guide_mean[..., None, :]
+    slope = np.linalg.solve(
+        variance + np.float32(settings.edge_epsilon) * np.eye(3, dtype=np.float32), products[..., None]
+    )[..., 0]
+    offset = value_mean - (slope * guide_mean).sum(axis=-1)
+    slope_mean = cv2.blur(np.ascontiguousarray(slope), window)
+    filtered: Float32[ndarray, "h w"] = (slope_mean * guide).sum(axis=-1) + cv2.blur(offset, window)
+    return filtered
+
+
+Window = tuple[slice, slice]
+
+
+def mask_votes(
+    mask: Bool[ndarray, "h w"],
+    frame: Frame,
+    settings: SurfaceSettings,
+    siblings: Bool[ndarray, "h w"] | None = None,
+) -> SurfaceVotes:
+    """Return the votes of a detected mask: inside for its pixels, outside for the other pixels around it.
+
+    siblings: pixels of the frame's detections of the same noun. They never vote outside: adjacent objects of one noun
+    may be one landmark.
+    """
+    box_px = bounding_box(mask)
+    if box_px is None:
+        return SurfaceVotes.empty(settings)
+    left, top, right, bottom = box_px
+    margin_px = max(settings.min_margin_px, round(settings.vote_margin_share * max(right - left, bottom - top)))
+    low, high = np.array((top, left)) - margin_px, np.array((bottom, right)) + margin_px
+    window = _clipped(low.astype(np.int64), high.astype(np.int64), frame)
+    pixels = frame.depth_m[window].size
+    points_m, is_known = window_points_m(frame, window, math.ceil(math.sqrt(pixels / settings.max_voting_pixels)))
+    is_inside = mask[window][is_known]
+    if siblings is not None:
+        has_vote = is_inside | ~siblings[window][is_known]
+        points_m, is_inside = points_m[has_vote], is_inside[has_vote]
+    return SurfaceVotes.from_points(points_m, is_inside, settings)
+
+
+def mask_colours(
+    mask: Bool[ndarray, "h w"], frame: Frame, settings: SurfaceSettings
+) -> Float64[ndarray, "balances ranges"]:
+    """Return the `colour_counts` of a mask's pixels, without its outline, which mixes with what is behind."""
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    pixels = frame.rgb[inner if np.count_nonzero(inner) >= settings.min_inner_pixels else mask]
+    return colour_counts(pixels[:: max(1, len(pixels) // settings.max_colour_pixels)])
+
+
+def surface_mask(votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
+    """Return the pixels of a frame that show the object's surface, and gaps in depth between such pixels.
+
+    A pixel whose depth is not that of the surface shows something in front of the object, or what is behind it. The
+    outline follows the colour edges next to it.
+    """
+    mask = np.zeros(frame.depth_m.shape, np.bool_)
+    window = _projected_window(votes, frame)
+    if window is None:
+        return mask
+    votes = _resolved(votes, frame)
+    points_m, is_known = window_points_m(frame, window)
+    shown = np.zeros(is_known.shape, np.bool_)
+    closing = np.ones((votes.settings.gap_px, votes.settings.gap_px), np.uint8)
+    shown[is_known] = votes.is_on_surface(points_m)
+    closed = cv2.morphologyEx(shown.astype(np.uint8), cv2.MORPH_CLOSE, closing) > 0
+    mask[window] = shown | (closed & ~is_known)
+    return snapped_to_edges(mask, frame.rgb, votes.settings)
+
+
+def refined_mask(detected: Bool[ndarray, "h w"], votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
+    """Return a detected mask with the pixels that are surely of the object, without those that are surely not.
+
+    The detection decides where voxels inside and outside the object touch: it is finer than the voxels.
+    """
+    mask = detected.copy()
+    box_px = bounding_box(detected)
+    windows = (_projected_window(votes, frame), None if box_px is None else _box_window(box_px))
+    votes = _resolved(votes, frame)
+    for window in windows:
+        if window is not None:
+            points_m, is_known = window_points_m(frame, window)
+            part = mask[window]
+            part[is_known] |= votes.is_surely_inside(points_m)
+            part[is_known] &= ~votes.is_surely_outside(points_m)
+    return mask
+
+
+def _resolved(votes: SurfaceVotes, frame: Frame) -> SurfaceVotes:
+    """Return the votes in voxels that the frame resolves: of a pixel's width, and of twice its depth's deviation."""
+    z_m = transform_points(inverse(frame.T_world_camera), votes.surface_m.astype(np.float64))[:, 2]
+    nearest_m = votes.settings.min_depth_m
+    middle_m = max(nearest_m, float(np.median(z_m))) if len(z_m) else nearest_m
+    return votes.resolved(max(frame.camera.length_m(1.0, middle_m), 2.0 * depth_deviation_m(middle_m)))
+
+
+def depth_deviation_m(depth_m: float) -> float:
+    """Return the standard deviation of a structured-light camera's depth (Nguyen et al., 3DIMPVT 2012, Eq. 3)."""
+    return 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
+
+
+def _box_window(box_px: tuple[float, float, float, float]) -> Window:
+    left, top, right, bottom = (int(edge) for edge in box_px)
+    return slice(top, bottom), slice(left, right)
+
+
+def window_points_m(
+    frame: Frame, window: Window, step: int = 1
+) -> tuple[Float64[ndarray, "n 3"], Bool[ndarray, "h w"]]:
+    """Return the world points of the window's pixels with depth, and which pixels these are.
+
+    step: use every step-th pixel of every step-th row.
+    """
+    depth_m = frame.depth_m[window]
+    is_known = np.zeros(depth_m.shape, np.bool_)
+    is_known[::step, ::step] = depth_m[::step, ::step] > 0
+    points = back_project(depth_m, frame.camera, window[1].start, window[0].start)[is_known].astype(np.float64)
+    if frame.motion is not None:
+        rows = np.broadcast_to(np.arange(window[0].start, window[0].stop)[:, None], is_known.shape)[is_known]
+        points = frame.motion.to_middle_row(points, (rows + 0.5) / frame.camera.height_px)
+    return transform_points(frame.T_world_camera, points), is_known
+
+
+def _projected_window(votes: SurfaceVotes, frame: Frame) -> Window | None:
+    """Return the window of a frame that contains the surface; None if it is out of view."""
+    step = -(-len(votes.surface_m) // votes.settings.max_projected_points) or 1
+    surface_m = votes.surface_m[::step].astype(np.float64)
+    points = transform_points(inverse(frame.T_world_camera), surface_m)
+    points = points[points[:, 2] > votes.settings.min_depth_m].astype(np.float32)
+    if len(points) == 0:
+        return None
+    pixels = np.floor(project(points, frame.camera)[:, ::-1]).astype(np.int64)
+    margin_px = votes.settings.min_margin_px
+    window = _clipped(pixels.min(axis=0) - margin_px, pixels.max(axis=0) + margin_px, frame)
+    is_empty = any(side.stop <= side.start for side in window)
+    return None if is_empty else window
+
+
+def _clipped(low: ndarray, high: ndarray, frame: Frame) -> Window:
+    """Return the window between two corners (row, column) inside the frame."""
+    shape = frame.depth_m.shape
+    (top, left), (bottom, right) = np.clip(low, 0, shape).tolist(), np.clip(high, 0, shape).tolist()
+    return slice(top, bottom), slice(left, right)
