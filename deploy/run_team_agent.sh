@@ -34,6 +34,6 @@ IFS=';' read -ra tasks <<<"$TASKS"
 IFS=';' read -ra sources <<<"$SOURCES"
 index=$((number - 1))
 # the seed differs, so that two agents with the same sequence and task have different maps
-exec gausslite-agent --agent-id "agent-$number" --seed $index \
+exec gausslite-agent --agent-id "agent-$number" --set seed=$index \
   --task "${tasks[index % ${#tasks[@]}]}" --source "${sources[index % ${#sources[@]}]}" \
-  --state "$folder/mission.state" --spool "$folder/uplink.spool" --out "$folder" "$@"
+  --state "$folder/mission.state" --set spool="$folder/uplink.spool" --out "$folder" "$@"

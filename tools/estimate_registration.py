@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Estimate the registration of unregistered depth to colour in a sequence, for the option --register-depth.
+"""Estimate the registration of unregistered depth to colour in a sequence, for the option register-depth.
 
     tools/estimate_registration.py SOURCE [--frames START:STOP:STEP] [--count 40]
 

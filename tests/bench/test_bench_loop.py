@@ -12,7 +12,7 @@ from gausslite.mapping.stages import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameTiming
 from gausslite_bench.loop.frame_costs import CostLog, FrameCost, LoopTiming
 
-SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--threads", "1")
+SMALL = ("--size", "96x72", "--max-gaussians", "1500", "--set", "threads=1")
 
 
 def cost(perception_s: float, iterations: int) -> FrameCost:

@@ -32,7 +32,18 @@ def test_the_slope_is_fitted_to_the_second_half() -> None:
 def test_a_looped_run_reports_its_memory_and_the_gap_to_unlimited_time(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
-    small = ("--frames", "0:16", "--size", "96x72", "--max-gaussians", "1500", "--threads", "1", "--iterations", "4")
+    small = (
+        "--frames",
+        "0:16",
+        "--size",
+        "96x72",
+        "--max-gaussians",
+        "1500",
+        "--set",
+        "threads=1",
+        "--iterations",
+        "4",
+    )
     options = ("--objects", "table", "--loop", "18", "--unlimited", "6", "--json")
     assert main(["bench", "loop", "sim:home?seed=0&trajectory=0", *small, *options]) == 0
     report = json.loads(capsys.readouterr().out)

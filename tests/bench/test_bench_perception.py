@@ -129,7 +129,7 @@ def arguments(tmp_path) -> list[str]:
 
 
 def test_the_command_prints_its_figures(arguments, tmp_path, capsys):
-    arguments += ["--threads", "1", "--absent", "dog"]
+    arguments += ["--set", "threads=1", "--absent", "dog"]
     assert main([*arguments, "--json", "--task", "Find the mug=mug", "--pictures", str(tmp_path / "sheets")]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert [task["task"] for task in printed["tasks"]] == ["Find the mug", "Find the dog"]
@@ -153,7 +153,7 @@ def test_absent_nouns_are_the_detectors_classes_then_a_sample_of_its_vocabulary(
 
 
 def test_a_number_of_absent_nouns_is_chosen_and_summarised(arguments, capsys):
-    assert main([*arguments, "--threads", "1", "--absent", "1", "--present", "vase", "--json"]) == 0
+    assert main([*arguments, "--set", "threads=1", "--absent", "1", "--present", "vase", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["absent"] == {"nouns": 1, "searched": 1, "marked": 0, "over_limit": 0}
     assert printed["tasks"][-1]["task"] == "Find the dog"

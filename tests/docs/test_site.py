@@ -66,5 +66,5 @@ def test_the_reference_has_the_public_names_and_all_commands(site: Path) -> None
     python = (site / "reference" / "python.html").read_text(encoding="utf-8")
     commands = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     assert "Map a sequence for a task" in python
-    for heading in ("gausslite-map", "gausslite-bench-quality", "gausslite-models-inspect", "gausslite-agent"):
+    for heading in ("gausslite-map", "gausslite-bench-quality", "gausslite-models-source", "gausslite-agent"):
         assert f'id="{heading}"' in commands

@@ -22,7 +22,7 @@ from gausslite.domain.pose import transform_points
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
-SMALL = ("--size", "128x96", "--max-gaussians", "5000", "--iterations", "3", "--refine-iterations", "20")
+SMALL = ("--size", "128x96", "--max-gaussians", "5000", "--iterations", "3", "--set", "refine-iterations=20")
 
 
 def _children_named(marker: str) -> list[int]:

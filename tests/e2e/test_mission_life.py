@@ -58,7 +58,7 @@ def require_complete(life: Life, frames: int) -> None:
 
 def test_a_mission_with_a_killed_agent_from_its_task_to_the_refined_map(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
-    options = ["--detector", str(model), "--max-gaussians", "3000", "--iterations", "2", "--threads", "1"]
+    options = ["--detector", str(model), "--max-gaussians", "3000", "--iterations", "2", "--set", "threads=1"]
     life = live(tmp_path, box_frames(_FRAMES), "Pick up the cup", options, kill=True, noun="cup")
     require_complete(life, _FRAMES)
     assert life.objects >= 1
@@ -67,6 +67,6 @@ def test_a_mission_with_a_killed_agent_from_its_task_to_the_refined_map(tmp_path
 def test_a_mission_in_the_kitchen(tmp_path: Path) -> None:
     if not (_KITCHEN.exists() and _DETECTOR.exists()):
         pytest.skip(f"expected {_KITCHEN} and {_DETECTOR}, got nothing there")
-    options = ["--detector", str(_DETECTOR), "--max-gaussians", "20000", "--iterations", "2", "--threads", "1"]
+    options = ["--detector", str(_DETECTOR), "--max-gaussians", "20000", "--iterations", "2", "--set", "threads=1"]
     life = live(tmp_path, encoded_frames(_KITCHEN, 6, 4), "Pick up the bottle", options, kill=False)
     require_complete(life, 6)

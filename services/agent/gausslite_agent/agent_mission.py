@@ -167,7 +167,7 @@ class AgentMission:
             return ""
         return (
             f"lost {left.voxels_waiting} voxels and {left.keyframes_waiting} keyframes that were not sent; "
-            "--spool FILE keeps them until the next start"
+            "--set spool=FILE keeps them until the next start"
         )
 
     def save(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.config.option import check_options, option
 
 
 class QueuePolicy(StrEnum):
@@ -23,13 +23,17 @@ class LoadSettings:
     free_space: observe the free space of every fifth frame, for the fusion server.
     """
 
-    queue_frames: int = 4
-    queue_policy: QueuePolicy = QueuePolicy.OLDEST
-    idle_iterations: int = 0
-    free_space: bool = False
+    queue_frames: int = option(4, "length of the frame queue", key="queue", low=1, high=1000)
+    queue_policy: QueuePolicy = option(QueuePolicy.OLDEST, "frame that a full queue drops")
+    idle_iterations: int = option(
+        0,
+        "training iterations while the queue is empty (default: 64 at a rate, else 0)",
+        low=0,
+        high=10_000,
+    )
+    free_space: bool = option(
+        False, "send what the camera has observed as free: it shows frames that do not fit (default: true)"
+    )
 
     def __post_init__(self) -> None:
-        if not 1 <= self.queue_frames <= 1000:
-            raise InvalidInputError(f"queue: expected 1 to 1000 frames, got {self.queue_frames}")
-        if not 0 <= self.idle_iterations <= 10_000:
-            raise InvalidInputError(f"idle_iterations: expected 0 to 10000, got {self.idle_iterations}")
+        check_options(self)

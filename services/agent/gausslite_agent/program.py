@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the agent and return its exit code.
 
-    1 if data that no --spool keeps was not sent, 2 with one line on stderr for an error the operator can fix, else 0.
+    1 if data that no spool keeps was not sent, 2 with one line on stderr for an error the operator can fix, else 0.
     """
 
     async def serve() -> int:
@@ -180,7 +180,7 @@ def _open_uplink(settings: AgentSettings, stack: ExitStack, has_restored_map: bo
 
 
 def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: ExitStack) -> None:
-    """Insert teammates' voxels of the task's region into the map, if --team-map is set."""
+    """Insert teammates' voxels of the task's region into the map, if team-map is set."""
     link = settings.link
     if link.fusion is None or link.team_map == NONE:
         return

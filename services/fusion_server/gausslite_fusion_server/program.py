@@ -64,10 +64,10 @@ def _open_database(url: str) -> FusionStore:
 
 def _open_store(settings: ServerSettings) -> FusionStore:
     """Return the store. Raises InvalidInputError, StorageError."""
-    if settings.database is not None:
-        return _open_database(settings.database)
     if settings.store is None:
         return MemoryStore()
+    if isinstance(settings.store, str):
+        return _open_database(settings.store)
     return SqliteStore(settings.store, settings.store_max_bytes)
 
 

@@ -9,8 +9,8 @@ from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues,
 from gausslite.cli.progress import progress_bar
 from gausslite.cli.source_options import open_recorded
 from gausslite.codec.files import write_atomic
-from gausslite.config.toml_text import to_toml
-from gausslite.config.values import read_camera_correction, read_up_axis
+from gausslite.config.plain_values import to_toml
+from gausslite.config.values import read_correction, read_up_axis
 from gausslite.mission.results import CALIBRATION_FILE, as_text, prepare_file
 
 _STEPS = 3
@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     """Estimate, print and write the options. Returns the exit code."""
     if options.out is not None:
         prepare_file(options.out, CALIBRATION_FILE)
-    lens = read_camera_correction(f"lens={options.lens}").lens if options.lens else None
+    lens = read_correction(f"lens={options.lens}").lens if options.lens else None
     source = open_recorded(options.source, options.up)
     with progress_bar(_STEPS, "calibrate", "estimate") as bar:
 

@@ -47,7 +47,7 @@ class _PrintVersion(argparse.Action):
         parser.exit()
 
 
-def build_parser(configured: Collection[str] = tuple(SUMMARIES)) -> argparse.ArgumentParser:
+def build_parser(configured: Collection[str] = tuple(SUMMARIES)) -> CommandParser:
     """Return the parser of `gausslite`. configured: commands that get their options; each imports its module."""
     parser = CommandParser(prog="gausslite", description="Online 3D Gaussian maps that spend their detail on a task.")
     parser.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")

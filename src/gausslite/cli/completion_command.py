@@ -9,12 +9,13 @@ from pathlib import Path
 from types import ModuleType
 
 from gausslite.cli.commands import build_parser
-from gausslite.config.layers import add_configuration, subcommands
-from gausslite.config.paths import read_path
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError
 
 _SHELLS = ("bash", "zsh", "fish")
 _GAUSSLITE = "gausslite"
+_FILE_METAVARS = ("DIR", "FILE", "FILE.npz", "FILE.onnx", "FILE.toml")
 _SERVICES = {
     "gausslite-agent": ("gausslite_agent.settings", "build_parser"),
     "gausslite-fusion-server": ("gausslite_fusion_server.settings", "build_parser_with_commands"),
@@ -41,32 +42,19 @@ def run(options: argparse.Namespace) -> int:
     shtab = _import_shtab()
     parser = _parser_of(options.program)
     for action in _actions(parser):
-        if action.type in (Path, read_path):
+        if action.type in (Path, read_path) or action.metavar in _FILE_METAVARS:
             # shtab reads this attribute of an action
             vars(action)["complete"] = shtab.DIRECTORY if action.metavar == "DIR" else shtab.FILE
     print(shtab.complete(parser, options.shell))
     return 0
 
 
-def _parser_of(program: str) -> argparse.ArgumentParser:
+def _parser_of(program: str) -> CommandParser:
     if program == _GAUSSLITE:
-        parser = build_parser()
-    else:
-        module, function = _SERVICES[program]
-        parser = getattr(importlib.import_module(module), function)()
-    for configurable in _configurable(parser):
-        add_configuration(configurable)
+        return build_parser()
+    module, function = _SERVICES[program]
+    parser: CommandParser = getattr(importlib.import_module(module), function)()
     return parser
-
-
-def _configurable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """Yield the parsers that read a configuration: commands of `gausslite`, or a service program itself."""
-    commands = subcommands(parser)
-    if commands is None or parser.prog in _SERVICES:
-        yield parser
-    else:
-        for command in commands.values():
-            yield from _configurable(command)
 
 
 def _import_shtab() -> ModuleType:
@@ -79,11 +67,8 @@ def _import_shtab() -> ModuleType:
     return shtab
 
 
-def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+def _actions(parser: CommandParser) -> Iterator[argparse.Action]:
     """Yield the options and arguments of the parser and of all its sub-commands."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for command in action.choices.values():
-                yield from _actions(command)
-        else:
-            yield action
+    yield from parser._actions
+    for command in parser.commands.values():
+        yield from _actions(command)

@@ -6,7 +6,7 @@ import argparse
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from types import FrameType
 
@@ -14,26 +14,16 @@ from gausslite.cli.demo.report import agent_reports, demo_report, report_tables
 from gausslite.cli.demo.results_folder import remove_results, require_no_demo
 from gausslite.cli.demo.scenario import HOME_SIZE, Scenario, recorded_scenario, simulated_scenario
 from gausslite.cli.demo.services import DemoPlan, collect_maps, running_services, watch_missions
+from gausslite.cli.map_inputs import mission_settings
+from gausslite.cli.source_options import RecordingOptions
 from gausslite.codec.ply import read_ply
 from gausslite.codec.png import write_png
-from gausslite.config.mapping_options import (
-    add_budget,
-    add_detector,
-    add_policy,
-    add_voxel_size,
-    mission_options,
-    mission_settings,
-    perception_options,
-    perception_settings,
-)
-from gausslite.config.options_without_effect import require_effect
-from gausslite.config.source_options import add_camera_correction, add_register_depth
-from gausslite.config.switches import add_switch
-from gausslite.config.toml_text import OptionValue
-from gausslite.config.values import AUTO, read_names
-from gausslite.config.view_option import add_view
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build, option, plain_options
+from gausslite.config.plain_values import Plain
+from gausslite.config.program import Program
+from gausslite.config.values import VOXEL_SIZE, read_text
 from gausslite.datasets.sequence_name import default_world_frame
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_name
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.team import TeamScores, score_team
@@ -42,42 +32,57 @@ from gausslite.export.packages import import_extra
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_models
 from gausslite.mission.frame_stream import CorruptFrames
-from gausslite.mission.results import prepare_folder, require_writable, write_json
+from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
+from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
 from gausslite.process.messages import print_message
 from gausslite.process.siblings import Sibling, sibling
+from gausslite.wire.address import MAX_PORT
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `gausslite demo`."""
-    add = parser.add_argument
-    add("--source", metavar="SOURCE", help="a sequence to divide between the agents (default: a simulated home)")
-    add("--task-a", metavar="TEXT", default="Pick up the mug on the table", help="task of agent-a")
-    add("--task-b", metavar="TEXT", default="Identify the chair closest to the table", help="task of agent-b")
-    add("--frames-a", metavar="START:STOP:STEP", help="frames of agent-a (default: the first half)")
-    add("--frames-b", metavar="START:STOP:STEP", help="frames of agent-b (default: the second half)")
-    add(
-        "--objects",
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """The options of `gausslite demo` beside those of perception and mapping."""
+
+    out: Path = option(MISSING, "folder for report.html, report.json, maps and pictures", metavar="DIR")
+    source: str | None = option(
+        None, "a sequence to divide between the agents (default: a simulated home)", metavar="SOURCE", convert=read_text
+    )
+    task_a: str = option("Pick up the mug on the table", "task of agent-a")
+    task_b: str = option("Identify the chair closest to the table", "task of agent-b")
+    frames_a: str | None = option(None, "frames of agent-a (default: the first half)", metavar="START:STOP:STEP")
+    frames_b: str | None = option(None, "frames of agent-b (default: the second half)", metavar="START:STOP:STEP")
+    objects: tuple[str, ...] = option(
+        (),
+        "objects whose region of interest (ROI) is scored (default: the tasks' targets)",
         metavar="A,B",
-        type=read_names,
-        default=(),
-        help="objects whose region of interest (ROI) is scored (default: the tasks' targets)",
     )
-    add("--size", metavar="WxH", help=f"image size (default: the recorded size; {HOME_SIZE} in the home)")
-    add_register_depth(parser, allow_auto=True, default_text=AUTO)
-    add_camera_correction(parser, allow_auto=True, default_text=AUTO)
-    add_voxel_size(parser)
-    add("--refine-iterations", metavar="N", type=int, default=500, help="joint refinement of the fused map; 0: none")
-    add_detector(parser)
-    add_policy(parser, allow_auto=True)
-    add_budget(parser)
-    add("--out", metavar="DIR", type=Path, required=True, help="folder for report.html, report.json, maps and pictures")
-    add_switch(parser, "--overwrite", "replace the results of an earlier demo in --out")
-    add(
-        "--world-frame",
+    size: str | None = option(None, f"image size (default: the recorded size; {HOME_SIZE} in the home)", metavar="WxH")
+    voxel_size: VoxelGrid = option(VoxelGrid(), "edge of the fusion's voxels", **VOXEL_SIZE)
+    refine_iterations: int = option(
+        500, "joint refinement of the fused map; 0: none", low=0, high=MAX_REFINE_ITERATIONS
+    )
+    overwrite: bool = option(False, "replace the results of an earlier demo in --out")
+    world_frame: str | None = option(
+        None,
+        "name of the poses' frame in all maps (default: the sequence folder's name or the simulated home)",
         metavar="NAME",
-        help="name of the poses' frame in all maps (default: the sequence folder's name or the simulated home)",
     )
-    add_view(parser, "the fused map and each agent's")
+    view: int | None = option(
+        None,
+        "show the fused map and each agent's on a page at http://127.0.0.1:PORT; 0 chooses a port (extra: view)",
+        metavar="PORT",
+        low=0,
+        high=MAX_PORT,
+    )
+
+
+def configure(parser: CommandParser) -> None:
+    """Add the options of `gausslite demo`."""
+    Program.of(
+        *(DemoOptions, RecordingOptions, PerceptionSettings, MissionSettings),
+        flags="source task-a task-b objects size detector max-gaussians iterations seed out overwrite",
+        removed=REMOVED,
+    ).add_to(parser)
     parser.set_defaults(run=run)
 
 
@@ -85,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the services, score the maps, write and print the report. Returns the exit code."""
     signal.signal(signal.SIGHUP, _raise_interrupt)
     _require_valid(options)
-    require_name("--world-frame", options.world_frame or "")
+    require_name("world-frame", options.world_frame or "")
     if not options.overwrite:
         require_no_demo(options.out)
     require_writable(options.out)
@@ -93,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     plan = DemoPlan(
         scenario.agents,
         _shared_agent_options(options, scenario),
-        options.voxel_size,
+        options.voxel_size.size_m,
         options.refine_iterations,
         options.seed,
     )
@@ -116,7 +121,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _page(options: argparse.Namespace, fusion_address: str) -> Iterator[None]:
-    """Show the fusion server on a page, if --view is set."""
+    """Show the fusion server on a page, if view is set."""
     if options.view is None:
         yield
         return
@@ -127,19 +132,12 @@ def _page(options: argparse.Namespace, fusion_address: str) -> Iterator[None]:
 
 def _require_valid(options: argparse.Namespace) -> None:
     """Raise InvalidInputError or ModelFileError for options that every agent would refuse later."""
-    if not 0 <= options.refine_iterations <= MAX_REFINE_ITERATIONS:
-        raise InvalidInputError(
-            f"--refine-iterations: expected 0 to {MAX_REFINE_ITERATIONS}, got {options.refine_iterations}"
-        )
     if options.view is not None:
         import_extra("viser", "view", "--view")
-    require_effect(options)
-    mission_settings(options)
-    VoxelGrid(options.voxel_size)
-    open_models(perception_settings(options))
+    open_models(build(PerceptionSettings, options).at_rate(mission_settings(options)))
 
 
-def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> dict[str, OptionValue]:
+def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> dict[str, Plain]:
     """Return the options that all agents share; two agents share the processor, so each has one thread by default."""
     settings = mission_settings(options)
     threads = 1 if settings.threads is None else settings.threads
@@ -148,13 +146,13 @@ def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> di
     registration, correction = scenario.depth_registration, scenario.camera_correction
     return {
         "size": f"{width}x{height}",
-        "voxel-size": options.voxel_size,
+        "voxel-size": options.voxel_size.size_m,
         "world-frame": _world_frame(options, scenario),
         "test-every": scenario.test_every,
         "register-depth": None if registration is None else str(registration),
         "camera-correction": None if correction.is_identity else str(correction),
-        **mission_options(settings),
-        **perception_options(perception_settings(options)),
+        **plain_options(settings),
+        **plain_options(build(PerceptionSettings, options).absolute()),
     }
 
 

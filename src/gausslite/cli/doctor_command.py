@@ -13,7 +13,7 @@ from gausslite.cli.doctor.extra_checks import extra_checks
 from gausslite.cli.doctor.machine_checks import machine_checks
 from gausslite.cli.doctor.model_checks import model_checks
 from gausslite.cli.doctor.rasterizer_checks import rasterizer_checks
-from gausslite.config.paths import read_path
+from gausslite.config.values import read_path
 from gausslite.process.messages import printable
 
 

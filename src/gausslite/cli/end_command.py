@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gausslite.cli.team_options import add_address, agent_client
-from gausslite.config.numbers import Number
-from gausslite.config.switches import add_switch
+from gausslite.config.command_parser import bounded
 
 _MAX_DRAIN_S = 86_400.0
 
@@ -14,11 +13,15 @@ _MAX_DRAIN_S = 86_400.0
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite end`."""
     add_address(parser, "the agent")
-    add_switch(parser, "--handover", "also send the map outside the task's region (default: as the agent's option)")
+    parser.add_argument(
+        "--handover",
+        action="store_true",
+        help="also send the map outside the task's region (default: as the agent's option)",
+    )
     parser.add_argument(
         "--drain-timeout",
         metavar="S",
-        type=Number("drain-timeout", float, 0, _MAX_DRAIN_S),
+        type=bounded(float, 0, _MAX_DRAIN_S),
         help="longest time for sending, in seconds (default: the agent's)",
     )
     parser.set_defaults(run=run, handover=None)

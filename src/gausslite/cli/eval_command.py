@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
 
 from jaxtyping import Float64
@@ -13,8 +13,7 @@ from numpy import ndarray
 from gausslite.calibration.calibrate import StatedValues
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.cli.source_options import (
-    add_regions,
-    add_source,
+    RecordingOptions,
     calibrate_with_messages,
     open_recorded,
     selected_regions,
@@ -22,10 +21,10 @@ from gausslite.cli.source_options import (
 )
 from gausslite.codec.ply import read_ply
 from gausslite.codec.png import write_png
-from gausslite.config.mapping_options import add_threads
-from gausslite.config.source_options import add_camera_correction
-from gausslite.config.switches import add_switch
-from gausslite.config.values import AUTO, NONE, read_camera_correction, read_depth_registration
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import option
+from gausslite.config.program import Program
+from gausslite.config.values import NONE, read_correction, read_registration_or_auto
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
@@ -51,43 +50,53 @@ from gausslite.mission.results import (
     read_trajectory,
     write_evaluation,
 )
-from gausslite.mission.settings import PoseMode
+from gausslite.mission.settings import PoseMode, SourceSettings, TaskSettings
 from gausslite.process.messages import print_message
+from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
 
 _PICTURES = 8
-_REGISTRATION_DEFAULT = f"that of the report next to MAP; {AUTO} without a report"
-_FIT_VIEWS_DEFAULT = "as --poses"
-_POSES_DEFAULT = "as the report next to MAP states that the map was made, else given"
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `gausslite eval`."""
-    parser.add_argument("map", metavar="MAP", type=Path, help="a PLY file")
-    add_source(parser, default_text=_REGISTRATION_DEFAULT)
-    add_camera_correction(parser, allow_auto=True, default_text=_REGISTRATION_DEFAULT)
-    add_regions(parser)
-    add_switch(parser, "--strict", "end at a frame that cannot be read (default: skip it)")
-    parser.add_argument(
-        "--test-every",
+@dataclass(frozen=True, slots=True)
+class EvalOptions:
+    """The options of `gausslite eval` beside those of the source and the regions."""
+
+    map: Path = option(MISSING, "a PLY file", metavar="MAP")
+    strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
+    test_every: int | None = option(
+        None,
+        "score only every N-th selected frame: those that `map --test-every N` holds out",
         metavar="N",
-        type=int,
-        help="score only every N-th selected frame: those that `map --test-every N` holds out",
+        low=2,
     )
-    parser.add_argument(
-        "--fit-views",
-        action=argparse.BooleanOptionalAction,
-        help=f"fit pose and exposure of each view before scoring, for real cameras (default: {_FIT_VIEWS_DEFAULT})",
+    fit_views: bool | None = option(
+        None, "fit pose and exposure of each view before scoring, for real cameras (default: as poses)"
     )
-    parser.add_argument(
-        "--poses",
-        choices=[str(mode) for mode in PoseMode],
-        help="given: score views from the given poses; refine: fit each view first; track: also start from "
-        f"{TRAJECTORY} next to MAP, for tracked maps (default: {_POSES_DEFAULT})",
+    poses: PoseMode | None = option(
+        None,
+        f"given: score views from the given poses; refine: fit each view first; track: also start from {TRAJECTORY} "
+        "next to MAP, for tracked maps (default: as the report next to MAP states that the map was made, else given)",
     )
-    parser.add_argument("--pictures", metavar="DIR", type=Path, help="write side-by-side pictures of a few views")
-    add_switch(parser, "--save-scores", f"write the scores to {EVALUATION} next to MAP, for `gausslite report`")
-    add_threads(parser)
-    add_switch(parser, "--json", "print JSON for scripts")
+    pictures: Path | None = option(None, "write side-by-side pictures of a few views", metavar="DIR")
+    save_scores: bool = option(False, f"write the scores to {EVALUATION} next to MAP, for `gausslite report`")
+    threads: int | None = option(
+        None,
+        "threads (default: all that the processor has)",
+        low=1,
+        high=MAX_THREADS,
+        computed=lambda _: choose_threads(None),
+    )
+    json: bool = option(False, "print JSON for scripts")
+
+
+def configure(parser: CommandParser) -> None:
+    """Add the options of `gausslite eval`."""
+    Program.of(
+        *(EvalOptions, SourceSettings, RecordingOptions, TaskSettings),
+        flags="frames size roi objects test-every poses pictures save-scores strict json",
+        positional="map source",
+        omit=("task", "pose-prior"),
+    ).add_to(parser)
     parser.set_defaults(run=run)
 
 
@@ -150,11 +159,11 @@ class _Conditions:
         registration, correction = options.register_depth, options.camera_correction
         fit_views = options.fit_views
         if registration is None and "colour_camera" in report:
-            registration = read_depth_registration(str(report["colour_camera"] or NONE))
-            from_report += [f"--register-depth {registration}"] if registration != NONE else []
+            registration = read_registration_or_auto(str(report["colour_camera"] or NONE))
+            from_report += [f"register-depth {registration}"] if registration != NONE else []
         if correction is None and "camera_correction" in report:
-            correction = read_camera_correction(str(report["camera_correction"] or NONE))
-            from_report += [] if correction.is_identity else [f"--camera-correction '{correction}'"]
+            correction = read_correction(str(report["camera_correction"] or NONE))
+            from_report += [] if correction.is_identity else [f"camera-correction '{correction}'"]
         poses = options.poses
         if poses is None and report.get("view_error") is not None:
             poses = PoseMode.TRACK if report.get("poses") == PoseMode.TRACK else PoseMode.REFINE

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.keyframe_views import KeyframeView
-from gausslite.config.numbers import Number
+from gausslite.config.command_parser import bounded
 from gausslite.domain.errors import InvalidInputError
 from gausslite.evaluation.views import view_map
 from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map
@@ -32,19 +32,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add(
         "--voxel",
         metavar="M",
-        type=Number("voxel", float, 0.001, 10),
+        type=bounded(float, 0.001, 10),
         help="voxel size in metres (default: 0.05; mesh: 0.01)",
     )
     add(
         "--min-opacity",
         metavar="A",
-        type=Number("min-opacity", float, 0, 1),
+        type=bounded(float, 0, 1),
         help=f"for octomap and nav2 (default: {_MIN_OPACITY:g})",
     )
     add(
         "--seconds",
         metavar="S",
-        type=Number("seconds", float, 0.1, 600),
+        type=bounded(float, 0.1, 600),
         help=f"length of a video (default: {_VIDEO_S:g})",
     )
     add("--overwrite", action="store_true", help="replace an existing file")

@@ -6,7 +6,7 @@ import argparse
 
 from gausslite.cli.team_options import add_address, fusion_client
 from gausslite.codec.files import write_atomic
-from gausslite.config.paths import read_path
+from gausslite.config.values import read_path
 from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.wire.clients import Export
 

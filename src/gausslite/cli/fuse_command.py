@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
-from gausslite.config.mapping_options import add_voxel_size
-from gausslite.config.paths import read_path
+from gausslite.config.command_parser import bounded
+from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError, MismatchError
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid
 from gausslite.fusion.offline import fuse_maps
 from gausslite.mission.results import MAP_FILE, as_text, prepare_file
 from gausslite.process.messages import print_message
@@ -25,7 +25,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="FILE.ply", type=read_path, required=True, help="the fused map; not an input file"
     )
-    add_voxel_size(parser)
+    parser.add_argument(
+        "--voxel-size",
+        metavar="M",
+        type=bounded(float, MIN_VOXEL_M, MAX_VOXEL_M),
+        default=VoxelGrid().size_m,
+        help="edge of the voxels in metres (default: %(default)s)",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
 
@@ -79,7 +85,7 @@ def _common_world_frame(frames: Mapping[Path, str]) -> str:
     names = sorted(set(frames.values()) - {""})
     if len(names) > 1:
         found = ", ".join(f"{frame!r} in {path}" for path, frame in frames.items() if frame)
-        hint = "if the poses share one frame, map both with the same --world-frame NAME"
+        hint = "if the poses share one frame, map both with the same --set world-frame=NAME"
         raise MismatchError(f"maps: expected one world frame, got {found}; {hint}")
     return names[0] if names else ""
 

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
-from gausslite.config.tls_options import add_tls, read_tls
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build
+from gausslite.config.program import add_flags
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.process.messages import print_message
 from gausslite.wire.health import require_serving
+from gausslite.wire.tls import TlsFiles
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return 0 if the service is SERVING, 1 with one line on stderr if not, 2 for wrong options."""
-    parser = argparse.ArgumentParser(prog="python -m gausslite.cli.health_check")
+    parser = CommandParser(prog="python -m gausslite.cli.health_check")
     parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
-    add_tls(parser)
+    add_flags(parser, TlsFiles)
     options = parser.parse_args(arguments)
     try:
-        require_serving(options.address, read_tls(options))
+        require_serving(options.address, build(TlsFiles, options).read())
     except InvalidInputError as error:
         print_message(str(error))
         return 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import errno
 import io
 import os
@@ -10,12 +9,10 @@ import sys
 from collections.abc import Sequence
 
 from gausslite.cli.commands import build_parser
+from gausslite.config.program import parse_options
 from gausslite.domain.errors import GaussLiteError
 from gausslite.process.interrupts import Terminated, raise_interrupts
 from gausslite.process.messages import print_message
-
-_CONFIGURABLE = frozenset({"map", "demo", "eval", "bench"})
-"""Commands whose options may also come from a configuration file and from the environment."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,29 +36,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _dispatch(arguments: list[str]) -> int:
     chosen = [word for word in arguments if not word.startswith("-")][:1]
     # import only the chosen command: the others need seconds
-    options = _parse(build_parser(chosen), arguments)
+    options = parse_options(build_parser(chosen), arguments, warn=print_message)
     run = options.run
     raise_interrupts()
     return int(run(options))
-
-
-def _parse(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:
-    """Return the options of the chosen command, which may also come from a file and from the environment."""
-    if arguments and arguments[0] in _CONFIGURABLE:
-        from gausslite.config.layers import parse_options
-
-        return parse_options(parser, arguments, warn=print_message)
-    options, unknown = parser.parse_known_args(arguments)
-    if unknown:
-        from gausslite.config.layers import leaf_parser
-
-        # of the sub-command, whose help has the options
-        leaf_parser(parser, arguments)[0].error(f"unrecognized arguments: {' '.join(unknown)}")
-    from gausslite.config.environment import describe_unknown_variables
-
-    for message in describe_unknown_variables((), os.environ, getattr(options, "llm_key_variable", None)):
-        print_message(f"gausslite: {message}")
-    return options
 
 
 def _fail(message: str) -> int:

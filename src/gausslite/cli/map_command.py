@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 
 from gausslite.cli.depth_check import depth_notes, require_mappable_depth
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
-    add_regions,
-    add_source,
+    RecordingOptions,
     report_region_file,
     selected_regions,
     stated_values,
@@ -20,11 +20,9 @@ from gausslite.cli.source_options import (
 from gausslite.cli.trajectory_report import tracking_text, trajectory_report
 from gausslite.codec.object_report import noun_as_json, object_as_json
 from gausslite.codec.png import write_png
-from gausslite.config.mapping_options import HOLD_OUT_HELP, add_budget, add_detector, add_policy
-from gausslite.config.source_options import add_camera_correction
-from gausslite.config.switches import add_switch
-from gausslite.config.values import AUTO
-from gausslite.config.view_option import add_view
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import option
+from gausslite.config.program import Program
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.names import require_name
@@ -50,7 +48,15 @@ from gausslite.mission.results import (
     write_results,
 )
 from gausslite.mission.runner import MissionResult, MissionRunner
-from gausslite.mission.settings import PoseMode, SceneInfo
+from gausslite.mission.settings import (
+    REMOVED,
+    MissionSettings,
+    PerceptionSettings,
+    PoseMode,
+    SceneInfo,
+    SourceSettings,
+    TaskSettings,
+)
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.mission.task_schedule import ScheduledTaskMapper, TaskSchedule
 from gausslite.mission.timeline import Timeline
@@ -58,52 +64,59 @@ from gausslite.process.interrupts import DeferredInterrupt
 from gausslite.process.messages import print_message
 from gausslite.process.siblings import Sibling, sibling
 from gausslite.render.choose import choose_rasterizer
+from gausslite.wire.address import MAX_PORT
 
 _NOT_RESUMED = -1
-_WORLD_FRAME_HELP = (
-    "name of the poses' frame, for `fuse`, which accepts only maps of one frame (default: the sequence folder's name "
-    "or the simulated home)"
-)
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `gausslite map`."""
-    add_source(parser, default_text=AUTO)
-    add_switch(parser, "--strict", "end at a frame that cannot be read (default: skip it)")
-    parser.add_argument("--task", metavar="TEXT", help='the robot\'s task, such as "Pick up the mug on the table"')
-    parser.add_argument(
-        "--task-at",
-        metavar="FRAME:TASK",
-        action="append",
-        default=[],
-        help="switch to another task at this frame number; may be repeated",
-    )
-    add_camera_correction(parser, allow_auto=True, default_text=AUTO)
-    add_detector(parser)
-    add_regions(parser)
-    add_policy(parser, allow_auto=True, default_policy=policy_of)
-    add_budget(parser)
-    parser.add_argument("--test-every", metavar="N", type=int, help=HOLD_OUT_HELP)
-    add_view(parser, "the map")
-    group = parser.add_argument_group("output")
-    add = group.add_argument
-    add(
-        "--out",
+@dataclass(frozen=True, slots=True)
+class MapOptions:
+    """The options of `gausslite map` beside those of its source, task, perception and mapping."""
+
+    out: Path = option(
+        MISSING,
+        "folder for map.ply, its history, report.json, frames.csv, keyframes.json, views and preview.png",
         metavar="DIR",
-        type=Path,
-        required=True,
-        help="folder for map.ply, its history, report.json, frames.csv, keyframes.json, views and preview.png",
     )
-    add_switch(group, "--overwrite", "replace a map in --out (--resume does so without this option)")
-    add("--world-frame", metavar="NAME", help=_WORLD_FRAME_HELP)
-    add("--save-state", metavar="FILE", type=Path, help="save the whole run here at its end, for --resume")
-    add("--resume", metavar="FILE", type=Path, help="continue a saved run with the frames after its last one")
+    overwrite: bool = option(False, "replace a map in --out (resume does so without this option)")
+    strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
+    task_at: tuple[str, ...] = option(
+        (), "switch to another task at this frame number", metavar="FRAME:TASK", repeats=True
+    )
+    view: int | None = option(
+        None,
+        "show the map on a page at http://127.0.0.1:PORT while it grows; 0 chooses a port (extra: view)",
+        metavar="PORT",
+        low=0,
+        high=MAX_PORT,
+    )
+    world_frame: str | None = option(
+        None,
+        "name of the poses' frame, for `fuse`, which accepts only maps of one frame (default: the sequence folder's "
+        "name or the simulated home)",
+        metavar="NAME",
+    )
+    save_state: Path | None = option(None, "save the whole run here at its end, for resume", metavar="FILE")
+    resume: Path | None = option(None, "continue a saved run with the frames after its last one", metavar="FILE")
+
+
+def configure(parser: CommandParser) -> None:
+    """Add the options of `gausslite map`."""
+    Program.of(
+        *(MapOptions, TaskSettings, SourceSettings, RecordingOptions, PerceptionSettings, MissionSettings),
+        flags="task detector frames size max-gaussians iterations rate roi objects policy seed poses test-every out "
+        "overwrite",
+        positional="source",
+        defaults={"policy": None},
+        computed={"policy": policy_of},
+        removed=REMOVED,
+    ).add_to(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results. Errors in the options are raised before the work starts."""
-    require_name("--world-frame", options.world_frame or "")
+    require_name("world-frame", options.world_frame or "")
     if options.view is not None:
         import_extra("viser", "view", "--view")
     if options.resume is None and not options.overwrite:
@@ -227,7 +240,7 @@ class _Run:
         result.raise_if_stopped()
 
     def raise_if_unsaved(self) -> None:
-        """Raise the error of --save-state, after the other results were written."""
+        """Raise the error of saving the state, after the other results were written."""
         if self._save_error is not None:
             raise self._save_error
 
@@ -297,8 +310,8 @@ def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str
         return "no frame was mapped, and no file was written"
     text = f"{result.totals.frames} frames are mapped; map.ply, report.json and {PREVIEW} are in {options.out}"
     if options.save_state is None:
-        return f"{text}; only a run with --save-state can be resumed"
-    return f"{text}; continue with --resume {options.save_state}"
+        return f"{text}; only a run with save-state can be resumed"
+    return f"{text}; continue with --set resume={options.save_state}"
 
 
 def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[str, ...]:
@@ -315,7 +328,7 @@ def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[s
 def _unreached_notes(schedule: TaskSchedule, last_index: int) -> tuple[str, ...]:
     """Return a note for each scheduled task after the last frame."""
     return tuple(
-        f"--task-at {frame}: not reached, the last frame was {last_index}"
+        f"task-at {frame}: not reached, the last frame was {last_index}"
         for frame, _ in schedule.switches
         if frame > last_index
     )

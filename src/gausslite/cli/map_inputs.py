@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, replace
 from typing import Any
 
 from gausslite.calibration.calibrate import StatedValues
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.codec.task_json import graph_as_json
-from gausslite.config.mapping_options import mission_settings, perception_settings
-from gausslite.config.options_without_effect import require_effect
+from gausslite.config.option import build, option
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.selection import frame_step
 from gausslite.datasets.sequence_name import default_world_frame
@@ -43,7 +42,7 @@ FRAMES_KEY = "frames"
 class _Sequence:
     """The sequence of a saved run: a folder may move, but it must keep its name."""
 
-    name: str = field(metadata={"flag": "SOURCE"})
+    name: str = option(MISSING, "name of the sequence", key="SOURCE")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,24 +62,19 @@ class MapInputs:
     @classmethod
     def of(cls, options: argparse.Namespace) -> MapInputs:
         """Return the inputs of the command line. Raises InvalidInputError, DatasetError, TaskError."""
-        require_effect(options)
-        task = TaskSettings(options.task, options.roi, tuple(options.objects), tuple(options.roi_ball))
-        mission = mission_settings(options, policy_of(options))
+        task = build(TaskSettings, options)
+        mission = mission_settings(options)
         schedule = _schedule(parse_task(options), [TaskSwitch.parse(text) for text in options.task_at])
         require_poses = mission.poses is not PoseMode.TRACK
         recorded = open_recorded(options.source, options.up, require_poses)
-        source = SourceSettings(
-            options.source,
-            options.frames,
-            options.size,
-            options.up,
-            options.test_every,
-            require_poses=require_poses,
+        source = build(
+            SourceSettings, options, depth_registration=None, camera_correction=None, require_poses=require_poses
         )
         stream = FrameStream.select(recorded, source)
         source = replace(source, size=f"{stream.size[0]}x{stream.size[1]}")
         _report_uniform_map(options)
-        return cls(mission, perception_settings(options), source, task, stream, schedule)
+        perception = build(PerceptionSettings, options).at_rate(mission)
+        return cls(mission, perception, source, task, stream, schedule)
 
     def calibrated(self, stated: StatedValues) -> MapInputs:
         """Return the inputs with registration, correction and prior: those stated, else guaranteed or estimated."""
@@ -159,6 +153,12 @@ class MapInputs:
         }
 
 
+def mission_settings(options: argparse.Namespace) -> MissionSettings:
+    """Return the mapping's settings; a pose prior that is still to be estimated counts as exact."""
+    prior = options.pose_prior if isinstance(options.pose_prior, PoseExposurePrior) else PoseExposurePrior()
+    return build(MissionSettings, options, policy=options.policy or policy_of(options), pose_prior=prior)
+
+
 def parse_task(options: argparse.Namespace) -> TaskGraph | None:
     """Return the task of the options; None for regions of space, and for a uniform map.
 
@@ -166,14 +166,14 @@ def parse_task(options: argparse.Namespace) -> TaskGraph | None:
     """
     regions = has_regions(options)
     if options.task is not None and regions:
-        raise InvalidInputError("--task: give either a task, or regions with --roi or --roi-ball, not both")
+        raise InvalidInputError("--task: give either a task, or regions with --roi, --objects or roi-ball, not both")
     if options.detector is not None and options.task is None:
         raise InvalidInputError("--detector: it finds the nouns of a task; give the task with --task TEXT")
     if options.task is None:
         if options.policy is not None and not regions and MissionSettings(policy=options.policy).follows_task:
             raise InvalidInputError(
                 f"--policy {options.policy}: expected a task, with --task TEXT, or regions, with --roi FILE.npz or "
-                "--roi-ball X,Y,Z,R"
+                "--set roi-ball=X,Y,Z,R"
             )
         return None
     from gausslite.task.rules import RuleParser
@@ -213,15 +213,15 @@ def _report_uniform_map(options: argparse.Namespace) -> None:
 
 
 def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSchedule:
-    """Return the schedule of --task and --task-at. Raises InvalidInputError, TaskError."""
+    """Return the schedule of the task and task-at. Raises InvalidInputError, TaskError."""
     if not switches:
         return TaskSchedule(first)
     if first is None:
-        raise InvalidInputError("--task-at: expected a first task, with --task TEXT, got none")
+        raise InvalidInputError("task-at: expected a first task, with --task TEXT, got none")
     frames = [switch.frame for switch in switches]
     for frame in frames:
         if frames.count(frame) > 1:
-            raise InvalidInputError(f"--task-at: expected one task for a frame, got {frames.count(frame)} for {frame}")
+            raise InvalidInputError(f"task-at: expected one task for a frame, got {frames.count(frame)} for {frame}")
     from gausslite.task.rules import RuleParser
 
     return TaskSchedule(first, tuple((switch.frame, RuleParser().parse(switch.text)) for switch in switches))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gausslite.config.paths import read_path
+from gausslite.config.values import read_path
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

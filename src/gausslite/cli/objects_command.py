@@ -7,24 +7,27 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gausslite.codec.object_report import object_as_json, object_from_json
-from gausslite.config.tls_options import add_tls, read_tls
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build
+from gausslite.config.program import add_flags
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import quote_name
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.team_objects import find_objects
 from gausslite.mission.results import as_text, read_report
+from gausslite.wire.tls import TlsFiles
 
 _NS_PER_S = 1e9
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite objects`."""
     add = parser.add_argument
     add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
     add("noun", metavar="NOUN", nargs="?", default="", help='a noun phrase such as "mug" (default: all objects)')
     add("--json", action="store_true", help="print JSON for scripts")
-    add_tls(parser)
+    add_flags(parser, TlsFiles)
     parser.set_defaults(run=run)
 
 
@@ -49,7 +52,7 @@ def _query(options: argparse.Namespace) -> Sequence[TeamObject]:
     from gausslite.wire.clients import FusionClient
 
     require_callable("a fusion server or the output folder of a run", options.place)
-    with FusionClient(options.place, tls=read_tls(options)) as client:
+    with FusionClient(options.place, tls=build(TlsFiles, options).read()) as client:
         return client.query_objects(options.noun)
 
 

@@ -5,24 +5,34 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from dataclasses import MISSING, dataclass
 
 from gausslite.codec.task_json import graph_as_json
-from gausslite.config.task_parser_options import add_backend, backend_settings
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build, option
+from gausslite.config.program import Program
 from gausslite.domain.task import TargetRole, TaskGraph
-from gausslite.task.backends import open_parser
+from gausslite.task.backends import BackendSettings, open_parser
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+@dataclass(frozen=True, slots=True)
+class ParseOptions:
+    """The options of `gausslite parse` beside those of the backend."""
+
+    text: str = option(MISSING, 'for example "Pick up the mug on the table"', metavar="TEXT")
+    json: bool = option(False, "print JSON for scripts")
+
+
+def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite parse`."""
-    parser.add_argument("text", metavar="TEXT", help='for example "Pick up the mug on the table"')
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
-    add_backend(parser)
+    Program.of(ParseOptions, BackendSettings, flags="json backend llm-model llm-url", positional="text").add_to(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Parse the sentence and print its graph. Returns the exit code."""
-    graph = open_parser(backend_settings(options, os.environ)).parse(options.text)
+    key = os.environ.get(options.llm_key_variable) or None
+    graph = open_parser(build(BackendSettings, options, api_key=key)).parse(options.text)
     print(json.dumps(graph_as_json(graph)) if options.json else _as_text(graph))
     return 0
 

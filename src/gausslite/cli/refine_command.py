@@ -7,8 +7,8 @@ import argparse
 from gausslite.cli.progress import progress_bar
 from gausslite.cli.team_options import add_address, fusion_client
 from gausslite.codec.files import write_atomic
-from gausslite.config.numbers import Number
-from gausslite.config.paths import read_path
+from gausslite.config.command_parser import bounded
+from gausslite.config.values import read_path
 from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.wire.clients import Export
 
@@ -22,14 +22,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add(
         "--iterations",
         metavar="N",
-        type=Number("iterations", int, 1, _MAX_ITERATIONS),
+        type=bounded(int, 1, _MAX_ITERATIONS),
         default=0,
         help="training iterations (default: the server's)",
     )
     add(
         "--seed",
         metavar="N",
-        type=Number("seed", int, 0, _MAX_SEED),
+        type=bounded(int, 0, _MAX_SEED),
         default=0,
         help="seed of the random views (default: %(default)s)",
     )

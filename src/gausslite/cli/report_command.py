@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.config.paths import read_path
+from gausslite.config.values import read_path
 from gausslite.mission.results import REPORT_PAGE, as_text, prepare_folder
 from gausslite.process.messages import print_message
 from gausslite.report.page import require_replaceable, write_page

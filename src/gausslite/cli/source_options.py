@@ -1,34 +1,68 @@
-"""Declare SOURCE and regions of space as options, and open the sequence, with messages on stderr."""
+"""Declare the options for what a recording does not state, and open a sequence, with messages on stderr."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+from dataclasses import dataclass
 
 from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
-from gausslite.config.source_options import add_frames
-from gausslite.config.values import NONE, read_names, read_numbers
+from gausslite.config.option import option
+from gausslite.config.values import (
+    AUTO,
+    CAMERA_FORM,
+    CORRECTION_FORM,
+    NONE,
+    PRIOR_FORM,
+    read_correction_or_auto,
+    read_prior_or_auto,
+    read_registration_or_auto,
+    write_correction,
+    write_prior,
+)
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import BallRegion, Region
+from gausslite.domain.region import Region
 from gausslite.mission.frame_stream import region_file_note
+from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
 from gausslite.process.messages import print_message
 from gausslite.process.siblings import Sibling, sibling
 
 
-def add_source(parser: argparse.ArgumentParser, default_text: str) -> None:
-    """Add SOURCE and the options of its frames; default_text as in `add_frames`."""
-    parser.add_argument(
-        "source",
-        metavar="SOURCE",
-        help='a folder (TUM, 7-Scenes, Replica, ZED or Record3D layout), a ROS bag ("bag:run1.mcap?depth=TOPIC"), '
-        'or "sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
+@dataclass(frozen=True, slots=True)
+class RecordingOptions:
+    """What a recording may not state, for programs that read all of it first, and may estimate it."""
+
+    register_depth: DepthRegistration | str | None = option(
+        None,
+        f"{REGISTRATION_HELP}; auto: estimate the camera from image edges if the layout does not guarantee registered "
+        "depth, for example 7-Scenes (default: auto, or what the report next to a map states)",
+        metavar=f"{AUTO}|{NONE}|{CAMERA_FORM}",
+        plain_type=str,
+        convert=read_registration_or_auto,
+        to_plain=str,
     )
-    add_frames(parser, allow_auto=True, default_text=default_text)
+    camera_correction: CameraCorrection | str | None = option(
+        None,
+        f"{CORRECTION_HELP}; auto: the lens that the sequence's files state, and times estimated from pairs of frames "
+        "(default: auto, none for simulated homes, or what the report next to a map states)",
+        metavar=f"{AUTO}|{NONE}|{CORRECTION_FORM}",
+        plain_type=str,
+        convert=read_correction_or_auto,
+        to_plain=write_correction,
+    )
+    pose_prior: PoseExposurePrior | str = option(
+        AUTO,
+        f"{POSE_PRIOR_HELP}; auto: estimated from pairs of frames",
+        metavar=f"{AUTO}|{NONE}|{PRIOR_FORM}",
+        plain_type=str,
+        convert=read_prior_or_auto,
+        to_plain=write_prior,
+        presets={"paper": NONE},
+    )
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True) -> Source:
@@ -63,42 +97,18 @@ def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> 
     if not source.depth_registered and stated.registration is None and not stated.depth_as_recorded:
         print_message(
             f"{spec}: this layout does not state whether depth is registered to colour; the registration is estimated "
-            f"now, --register-depth {NONE} uses depth as recorded"
+            f"now, --set register-depth={NONE} uses depth as recorded"
         )
     return calibrate(source, stated, _report_estimate)
 
 
 def _report_estimate(evidence: Evidence) -> None:
     if not evidence.guaranteed:
-        print_message(f"--{evidence}")
-
-
-def add_regions(parser: argparse.ArgumentParser) -> None:
-    """Add --roi, --objects and --roi-ball: ground-truth regions of space."""
-    parser.add_argument("--roi", metavar="FILE.npz", type=Path, help="voxel file of ground-truth regions")
-    parser.add_argument(
-        "--objects", metavar="A,B", type=read_names, default=(), help="objects of --roi (default: all) or of SOURCE"
-    )
-    parser.add_argument(
-        "--roi-ball",
-        metavar="X,Y,Z,R",
-        type=read_ball,
-        action="append",
-        default=[],
-        help="a ball in metres; may be repeated",
-    )
-
-
-def read_ball(text: str) -> BallRegion:
-    """Return the ball of "x,y,z,r" in metres. Raises ArgumentTypeError."""
-    x, y, z, radius_m = read_numbers(text, 4)
-    if radius_m <= 0:
-        raise argparse.ArgumentTypeError(f"expected a radius above 0, got {radius_m}")
-    return BallRegion((x, y, z), radius_m)
+        print_message(str(evidence))
 
 
 def selected_regions(options: argparse.Namespace, source: Source) -> list[Region]:
-    """Return the objects of --roi (those of --objects, or all) and every --roi-ball.
+    """Return the objects of --roi (those of --objects, or all) and every ball of roi-ball.
 
     --objects without --roi selects regions of the source. Empty if the user selects nothing. Raises
     InvalidInputError, DatasetError.

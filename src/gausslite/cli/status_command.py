@@ -8,8 +8,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from gausslite.cli.team_options import add_address, add_json
-from gausslite.config.tls_options import read_tls
+from gausslite.config.option import build
 from gausslite.wire.service_status import query_status
+from gausslite.wire.tls import TlsFiles
 
 _STATE_PREFIX = "AGENT_STATE_"
 
@@ -23,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the status. Returns the exit code. Raises UnavailableError, InvalidInputError."""
-    status = query_status(options.address, read_tls(options))
+    status = query_status(options.address, build(TlsFiles, options).read())
     if options.json:
         print(json.dumps(status.values))
     else:

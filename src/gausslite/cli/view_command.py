@@ -9,35 +9,37 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from gausslite.config.numbers import Number
-from gausslite.config.tls_options import add_tls, read_tls
+from gausslite.config.command_parser import CommandParser, bounded
+from gausslite.config.option import build
+from gausslite.config.program import add_flags
 from gausslite.process.messages import print_message
 from gausslite.view.level_of_detail import DEFAULT_LIMIT
 from gausslite.view.open_page import open_page
 from gausslite.view.run_contents import read_contents, read_past
+from gausslite.wire.tls import TlsFiles
 
 _DEFAULT_PORT = 8099
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite view`."""
     add = parser.add_argument
     add("place", metavar="MAP.ply|RUN|HOST:PORT", help="a PLY file, a results folder, an agent or a fusion server")
     add(
         "--port",
         metavar="PORT",
-        type=Number("port", int, 0, 65535),
+        type=bounded(int, 0, 65535),
         default=_DEFAULT_PORT,
         help=f"port of the page on 127.0.0.1, 0 for a free one (default: {_DEFAULT_PORT})",
     )
     add(
         "--max-shown",
         metavar="N",
-        type=Number("max-shown", int, 10_000, 2_000_000),
+        type=bounded(int, 10_000, 2_000_000),
         default=DEFAULT_LIMIT,
         help=f"draw the N most important Gaussians; a slider changes it (default: {DEFAULT_LIMIT})",
     )
-    add_tls(parser)
+    add_flags(parser, TlsFiles)
     parser.set_defaults(run=run)
 
 
@@ -68,7 +70,7 @@ def _follow(options: argparse.Namespace) -> AbstractContextManager[str]:
     from gausslite.view.live_page import live_page
     from gausslite.wire.service_status import query_status
 
-    tls = read_tls(options)
+    tls = build(TlsFiles, options).read()
     is_agent = query_status(options.place, tls).is_agent
     return live_page(options.port, options.place, is_agent, tls, options.max_shown)
 

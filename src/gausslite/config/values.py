@@ -1,28 +1,52 @@
-"""Read option values from text."""
+"""Read the values of options that have a text form of their own, and write them."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
 
-import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-
-from gausslite.datasets.poses import pose_from_quaternion
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
-from gausslite.domain.errors import PoseError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.mapping.stages import SkippableStage
+from gausslite.domain.region import BallRegion
+from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid
 
 AUTO, NONE = "auto", "none"
 
 
-def read_names(text: str) -> tuple[str, ...]:
-    """Return the parts of "a,b" without surrounding spaces."""
-    return tuple(part.strip() for part in text.split(",") if part.strip())
+CAMERA_FORM = "FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]]"
+CORRECTION_FORM = "lens=MODEL:K1,...;readout=S;offset=S"
+PRIOR_FORM = "M,DEG[,GAIN,OFFSET]"
+VOXEL_SIZE: Mapping[str, Any] = {
+    "key": "voxel-size",
+    "unit": "m",
+    "low": MIN_VOXEL_M,
+    "high": MAX_VOXEL_M,
+    "plain_type": float,
+    "convert": VoxelGrid,
+    "to_plain": attrgetter("size_m"),
+}
+"""The declaration of an option whose field is a grid."""
+
+
+def read_text(text: str) -> str:
+    """Return the text. Raises InvalidInputError if it is empty."""
+    if not text:
+        raise InvalidInputError("expected a text, got an empty one")
+    return text
+
+
+def read_path(text: str) -> Path:
+    """Return the path. Raises InvalidInputError for an empty text, which would stand for the current folder."""
+    if not text:
+        raise InvalidInputError("path: expected the name of a file or folder, got an empty text")
+    return Path(text)
 
 
 def read_numbers(text: str, count: int) -> list[float]:
@@ -42,44 +66,60 @@ def read_up_axis(text: str) -> UpAxis:
     return (x, y, z)
 
 
-def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
-    """Return the transform of "x,y,z" in metres, or with a quaternion "x,y,z,qx,qy,qz,qw". Raises ArgumentTypeError."""
-    values = np.array(read_numbers(text, 3 if text.count(",") < 3 else 7))
-    try:
-        return pose_from_quaternion("", values[:3], values[3:] if len(values) == 7 else np.array([0.0, 0.0, 0.0, 1.0]))
-    except PoseError:
-        raise argparse.ArgumentTypeError(f"expected a quaternion of length 1 as qx,qy,qz,qw, got {text!r}") from None
+def write_numbers(values: Sequence[float]) -> str:
+    """Return the text that `read_numbers` reads."""
+    return ",".join(f"{value:.17g}" for value in values)
 
 
-def read_skip_stages(text: str) -> tuple[SkippableStage, ...]:
-    """Return the stages of "publishing,seeding", each once. Raises ArgumentTypeError."""
-    try:
-        return tuple(dict.fromkeys(SkippableStage(name) for name in read_names(text)))
-    except ValueError:
-        known = ", ".join(SkippableStage)
-        raise argparse.ArgumentTypeError(f"expected names among {known}, got {text!r}") from None
+def read_balls(texts: Sequence[str]) -> tuple[BallRegion, ...]:
+    """Return the balls of "x,y,z,r", in metres. Raises ArgumentTypeError, InvalidInputError."""
+    balls = []
+    for text in texts:
+        x, y, z, radius_m = read_numbers(text, 4)
+        balls.append(BallRegion((x, y, z), radius_m))
+    return tuple(balls)
 
 
-def read_depth_registration(text: str) -> DepthRegistration | str:
+def write_balls(balls: Sequence[BallRegion]) -> list[str]:
+    """Return the texts that `read_balls` reads."""
+    return [write_numbers((*ball.centre_m, ball.radius_m)) for ball in balls]
+
+
+def read_registration(text: str) -> DepthRegistration | None:
+    """Return the camera to register depth to, None for NONE. Raises InvalidInputError."""
+    return None if text == NONE else DepthRegistration.parse(text)
+
+
+def read_registration_or_auto(text: str) -> DepthRegistration | str:
     """Return AUTO, NONE or a camera. Raises InvalidInputError."""
     return text if text in (AUTO, NONE) else DepthRegistration.parse(text)
 
 
-def read_camera_correction(text: str) -> CameraCorrection:
+def read_correction(text: str) -> CameraCorrection:
     """Return the correction of NONE (images as recorded) or of its text form. Raises InvalidInputError."""
     return CameraCorrection() if text == NONE else CameraCorrection.parse(text)
 
 
-def read_camera_correction_or_auto(text: str) -> CameraCorrection | str:
-    """Return AUTO, or the correction that `read_camera_correction` returns. Raises InvalidInputError."""
-    return text if text == AUTO else read_camera_correction(text)
+def write_correction(correction: CameraCorrection | str) -> str:
+    """Return the text that `read_correction` reads; AUTO stays."""
+    return NONE if isinstance(correction, CameraCorrection) and correction.is_identity else str(correction)
 
 
-def read_pose_prior(text: str) -> PoseExposurePrior:
+def read_correction_or_auto(text: str) -> CameraCorrection | str:
+    """Return AUTO, or the correction that `read_correction` returns. Raises InvalidInputError."""
+    return text if text == AUTO else read_correction(text)
+
+
+def read_prior(text: str) -> PoseExposurePrior:
     """Return the prior of NONE (exact poses) or of numbers. Raises InvalidInputError."""
     return PoseExposurePrior() if text == NONE else PoseExposurePrior.parse(text)
 
 
-def read_pose_prior_or_auto(text: str) -> PoseExposurePrior | str:
-    """Return AUTO, or the prior that `read_pose_prior` returns. Raises InvalidInputError."""
-    return text if text == AUTO else read_pose_prior(text)
+def write_prior(prior: PoseExposurePrior | str) -> str:
+    """Return the text that `read_prior` reads; AUTO stays."""
+    return NONE if isinstance(prior, PoseExposurePrior) and prior.is_exact else str(prior)
+
+
+def read_prior_or_auto(text: str) -> PoseExposurePrior | str:
+    """Return AUTO, or the prior that `read_prior` returns. Raises InvalidInputError."""
+    return text if text == AUTO else read_prior(text)

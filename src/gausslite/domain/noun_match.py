@@ -53,7 +53,7 @@ class NounMatch:
         similar = f"the class most similar to {self.noun!r} is {self.classes[0]!r} (similarity {self.similarity:.2f})"
         if self.accepted:
             return f"{similar}: it counts as {self.noun!r}, because similar classes are accepted"
-        return f"{similar}, a different thing: nothing is searched; --accept-similar accepts it"
+        return f"{similar}, a different thing: nothing is searched; accept-similar = true accepts it"
 
     def describe(self) -> str:
         """Return one line for the operator."""

@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 
+MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
 _BITS_PER_AXIS = 21
 _OFFSET = 1 << (_BITS_PER_AXIS - 1)
 _MASK = (1 << _BITS_PER_AXIS) - 1
@@ -25,8 +26,8 @@ class VoxelGrid:
     size_m: float = 0.10
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.size_m) and 1e-3 <= self.size_m <= 1e3):
-            raise InvalidInputError(f"voxel size_m: expected 0.001 to 1000, got {self.size_m}")
+        if not (np.isfinite(self.size_m) and MIN_VOXEL_M <= self.size_m <= MAX_VOXEL_M):
+            raise InvalidInputError(f"voxel size_m: expected {MIN_VOXEL_M} to {MAX_VOXEL_M:g}, got {self.size_m}")
 
     @property
     def max_coordinate_m(self) -> float:

@@ -287,7 +287,7 @@ class FusionEngine:
         if not encoded or len(gaussians) == 0:
             raise MismatchError(
                 f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
-                f"{len(encoded)} keyframes; agents send keyframes with --handover"
+                f"{len(encoded)} keyframes; agents send keyframes with handover = true"
             )
         return gaussians, self.in_fused_frame(self._mission.keyframes.decode(encoded)), revision
 

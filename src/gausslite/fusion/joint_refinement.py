@@ -15,12 +15,14 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from gausslite.config.option import option
 from gausslite.domain.depth_edges import without_depth_edges
 from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.optimize.density import DensitySettings, densify, prune
 from gausslite.optimize.rates import REFINE_RATES
 from gausslite.optimize.splat_table import SplatTable
@@ -40,7 +42,13 @@ class RefineSettings:
     are masked, unlike the mapper's. normalise_by_image gave 0.05 dB less.
     """
 
-    iterations: int = 500
+    iterations: int = option(
+        500,
+        "iterations of joint refinement if a request states none",
+        key="refine-iterations",
+        low=1,
+        high=MAX_REFINE_ITERATIONS,
+    )
     headroom: float = 1.25
     max_gaussians: int = 3_000_000
     seed: int = 0

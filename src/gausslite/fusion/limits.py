@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
+from gausslite.config.option import option
+from gausslite.config.values import VOXEL_SIZE
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.names import require_identifier, require_name
 from gausslite.domain.revision_log import MAX_REMOVED_VOXELS
@@ -18,6 +20,13 @@ MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
 
 
+_CORRECT, _TRUST = "correct", "trust"
+
+
+def _read_alignment(text: str) -> AlignmentSettings | None:
+    return AlignmentSettings() if text == _CORRECT else None
+
+
 @dataclass(frozen=True, slots=True)
 class Quotas:
     """Upper limits of one mission. voxels_per_agent includes tombstones, because the store keeps them.
@@ -26,11 +35,13 @@ class Quotas:
     with 8 iterations a frame trains a Gaussian at most 32 times a second.
     """
 
-    agents: int = 64
-    voxels_per_agent: int = 500_000
-    gaussians_per_agent: int = 3_000_000
-    keyframes_per_agent: int = 64
-    keyframe_pixels: int = 1920 * 1080
+    agents: int = option(64, "largest number of agents", key="quota-agents", low=1)
+    voxels_per_agent: int = option(500_000, "largest number of voxels per agent", key="quota-voxels", low=1)
+    gaussians_per_agent: int = option(3_000_000, "largest number of Gaussians per agent", key="quota-gaussians", low=1)
+    keyframes_per_agent: int = option(64, "largest number of keyframes per agent", key="quota-keyframes", low=1)
+    keyframe_pixels: int = option(
+        1920 * 1080, "largest number of pixels of a keyframe", key="quota-keyframe-pixels", low=1
+    )
     keyframe_bytes_per_agent: int = 64 << 20
     kappa_at_join: int = 120_000
     kappa_per_second: int = 200
@@ -55,12 +66,20 @@ class FusionSettings:
     during which no other robot can take its name.
     """
 
-    grid: VoxelGrid = field(default_factory=VoxelGrid)
-    mission_id: str = ""
-    world_frame: str = ""
+    grid: VoxelGrid = option(VoxelGrid(), "edge of the voxels", **VOXEL_SIZE)
+    mission_id: str = option("", "the mission to serve (default: the first agent's)", key="mission", metavar="ID")
+    world_frame: str = option("", "frame of all maps (default: the first agent's)", metavar="NAME")
     quotas: Quotas = field(default_factory=Quotas)
     max_removed_voxels: int = MAX_REMOVED_VOXELS
-    alignment: AlignmentSettings | None = None
+    alignment: AlignmentSettings | None = option(
+        None,
+        "correct the misfit of agents' frames and quarantine gross ones, or trust them (default: correct)",
+        key="frame-alignment",
+        choices=(_CORRECT, _TRUST),
+        plain_type=str,
+        convert=_read_alignment,
+        to_plain=lambda _: _CORRECT,
+    )
     lease_s: float = DEFAULT_LEASE_S
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gausslite.codec.state_file import read_state, write_state
+from gausslite.config.option import option_key
 from gausslite.domain.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.domain.state import State, add_prefix, encode_text, get_array, get_text, int_array, select_prefix
 from gausslite.mission.serialisation import field_from_plain, to_plain
@@ -55,9 +56,13 @@ class ResumeConfig:
             raise MapFileError(f"state config: {error}") from error
 
     def differences(self, *settings: Any) -> tuple[str, ...]:
-        """Return one text for each option of these settings that differs, with its flag and both values."""
+        """Return one text for each option of these settings that differs, with its key and both values."""
         current = ResumeConfig.of(*settings)
-        flags = {(type(each).__name__, name): flag for each in settings for name, flag in _flags(each).items()}
+        keys = {
+            (type(section).__name__, item.name): option_key(type(section), item.name)
+            for section in settings
+            for item in fields(section)
+        }
         names = {
             (section, name)
             for config in (self, current)
@@ -68,8 +73,8 @@ class ResumeConfig:
         for section, name in names:
             saved, given = (config.sections.get(section, {}).get(name) for config in (self, current))
             if saved != given and not (saved in _NOTHING and given in _NOTHING):
-                flag = flags.get((section, name), _flag_of(name))
-                texts.append(f"{flag} {_show(saved)} (got {_show(given)})")
+                key = keys.get((section, name), name.replace("_", "-"))
+                texts.append(f"{key} {_show(saved)} (got {_show(given)})")
         return tuple(sorted(texts))
 
 
@@ -144,14 +149,6 @@ def _fixed_fields(settings: Any) -> dict[str, Any]:
             value = Path(value).name
         fixed[each.name] = to_plain(value)
     return fixed
-
-
-def _flags(settings: Any) -> dict[str, str]:
-    return {each.name: each.metadata.get("flag", _flag_of(each.name)) for each in fields(settings)}
-
-
-def _flag_of(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def _show(value: Any) -> str:

@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 
+from gausslite.config.option import check_options, option
+from gausslite.config.values import (
+    CAMERA_FORM,
+    CORRECTION_FORM,
+    NONE,
+    PRIOR_FORM,
+    read_balls,
+    read_correction,
+    read_prior,
+    read_registration,
+    read_text,
+    read_up_axis,
+    write_balls,
+    write_correction,
+    write_numbers,
+    write_prior,
+)
 from gausslite.datasets.source import Source
-from gausslite.domain.arguments import require_instance, require_number, require_whole
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
@@ -17,12 +34,14 @@ from gausslite.domain.object_names import meant_by
 from gausslite.domain.pose import UpAxis, require_up_axis
 from gausslite.domain.pose_exposure_prior import TRACKED_PRIOR, PoseExposurePrior
 from gausslite.domain.region import BallRegion, Region
-from gausslite.mapping.policies import TASK, UNIFORM, disable, follows_task, policy
+from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM, disable, follows_task, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.stages import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
-from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE
-from gausslite.render.cpu_kernels import MAX_THREADS
+from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
+from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.render.choose import BACKENDS
+from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
 
 DEFAULT_MAX_GAUSSIANS = 150_000
 """The number that two CPU cores can train online at 640x480; the paper's cap of a million is for a GPU."""
@@ -35,6 +54,29 @@ MAY_CHANGE = {"may_change": True}
 """Metadata of a settings field that may differ when a saved run is resumed."""
 FILE = {"is_file": True}
 """Metadata of a settings field that names a file: a resumed run compares the name and not the folder."""
+
+REMOVED = {
+    "resegment": "masks between detections are cut by depth, which is as accurate in a third of the time",
+}
+"""Options of earlier versions, and what has replaced them."""
+REGISTRATION_HELP = (
+    "shift each depth image onto the colour image (registration), for sensors with two cameras: the colour camera's "
+    "intrinsics in pixels, then the depth camera's position (metres) and rotation vector (degrees) in its frame; none: "
+    "use depth as recorded"
+)
+CORRECTION_HELP = (
+    "correct images for lens distortion (radtan or fisheye with OpenCV's coefficients), for the rolling shutter's "
+    "readout time, and for the offset between the times of images and poses (seconds); none: use images as recorded"
+)
+POSE_PRIOR_HELP = (
+    "standard deviations of the errors of poses (metres, degrees) and of exposure (gain and offset, 0 to 1), within "
+    "which views are corrected; none: poses and colours are exact"
+)
+_DISABLE_HELP = (
+    "switch off parts of the policy: sb (ROI seed budgeting; ROI: the task's region of interest), mvo (multi-view "
+    "optimisation), roi (ROI optimisation), sis (stratified initial scaling), gfd (gradient-focused densification), "
+    f"{', '.join(EXTENSION_FLAGS)}"
+)
 
 
 def require_rate(rate_hz: float) -> None:
@@ -87,19 +129,51 @@ class SceneInfo:
 class SourceSettings:
     """A sequence and which of its frames a mission uses.
 
-    spec: a folder or a simulated home; size: "WxH", None for the original size; test_every: every N-th frame is kept
-    from mapping, for evaluation; depth_registration: the colour camera to register depth to, None if depth is
-    registered already. camera_correction: lens, rolling shutter and time offset, None for images as recorded.
-    require_poses: False also uses frames without a pose, for tracking.
+    depth_registration: the colour camera to register depth to, None if depth is registered already.
+    camera_correction: lens, rolling shutter and time offset, None for images as recorded. require_poses: False also
+    uses frames without a pose, for tracking.
     """
 
-    spec: str = field(metadata=MAY_CHANGE)
-    frames: str = field(default=":", metadata=MAY_CHANGE)
-    size: str | None = None
-    up_axis: UpAxis | None = field(default=None, metadata={"flag": "--up"})
-    test_every: int | None = None
-    depth_registration: DepthRegistration | None = field(default=None, metadata={"flag": "--register-depth"})
-    camera_correction: CameraCorrection | None = None
+    spec: str = option(
+        MISSING,
+        'a folder (TUM, 7-Scenes, Replica, ZED or Record3D layout), a ROS bag ("bag:run1.mcap?depth=TOPIC"), or '
+        '"sim:home?seed=0&trajectory=0", sim:home-1 to sim:home-8',
+        key="source",
+        metavar="SOURCE",
+        convert=read_text,
+        metadata=MAY_CHANGE,
+    )
+    frames: str = option(":", "frame numbers to use (default: all)", metavar="START:STOP:STEP", metadata=MAY_CHANGE)
+    size: str | None = option(None, "resize images to this size (default: the recorded size)", metavar="WxH")
+    up_axis: UpAxis | None = option(
+        None,
+        "upward direction of the world (default: the source's)",
+        key="up",
+        metavar="X,Y,Z",
+        plain_type=str,
+        convert=read_up_axis,
+        to_plain=write_numbers,
+    )
+    test_every: int | None = option(
+        None, "hold out every N-th selected frame from mapping, for evaluation", metavar="N", low=2
+    )
+    depth_registration: DepthRegistration | None = option(
+        None,
+        REGISTRATION_HELP,
+        key="register-depth",
+        metavar=f"{NONE}|{CAMERA_FORM}",
+        plain_type=str,
+        convert=read_registration,
+        to_plain=str,
+    )
+    camera_correction: CameraCorrection | None = option(
+        None,
+        CORRECTION_HELP,
+        metavar=f"{NONE}|{CORRECTION_FORM}",
+        plain_type=str,
+        convert=read_correction,
+        to_plain=write_correction,
+    )
     require_poses: bool = True
 
 
@@ -107,97 +181,179 @@ class SourceSettings:
 class TaskSettings:
     """The task in natural language, or regions of space in its place; neither for a uniform map."""
 
-    task: str | None = None
-    roi: Path | None = field(default=None, metadata=FILE)
-    objects: tuple[str, ...] = ()
-    roi_ball: tuple[BallRegion, ...] = ()
+    task: str | None = option(None, 'the robot\'s task, such as "Pick up the mug on the table"', metavar="TEXT")
+    roi: Path | None = option(None, "voxel file of ground-truth regions", metavar="FILE.npz", metadata=FILE)
+    objects: tuple[str, ...] = option((), "objects of --roi (default: all) or of SOURCE", metavar="A,B")
+    roi_ball: tuple[BallRegion, ...] = option(
+        (),
+        "balls of space in metres",
+        metavar="X,Y,Z,R",
+        repeats=True,
+        plain_type=tuple[str, ...],
+        convert=read_balls,
+        to_plain=write_balls,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class PerceptionSettings:
     """The models that find the task's nouns. Without a model file, the ground truth of the sequence is used.
 
-    model: a YOLO, YOLO-World or Grounding DINO file. segmenter: how detected boxes become masks, "yolo" (the
-    detector's masks), "depth" or a FastSAM file; None for the model's own masks, or depth if it has none. vocabulary:
-    the text encoder's file; None for vocab.txt (Grounding DINO) or tokenizer.json (YOLO-World) next to the model.
+    segmenter: how detected boxes become masks, "yolo" (the detector's masks), "depth" or a FastSAM file; None for the
+    model's own masks, or depth if it has none. Masks of frames between detections are cut by depth inside the
+    re-projected boxes, which on a real kitchen is as accurate as the segmenter at a third of the time.
 
     asynchronous: mapping does not wait for detections; they run on their own thread and take effect when they are
-    finished. accept_similar: also map objects of a class that is only similar to the task's noun.
-
-    tiles: the detector also runs in tiles x tiles parts of each keyframe, which finds small, distant objects; 1: off.
-    detection_time_s: no further tile is started if it would end later than this; None for no limit.
+    finished. detection_time_s: no further tile is started if it would end later than this; None for no limit.
     """
 
-    model: Path | None = field(default=None, metadata={"flag": "--detector", **FILE})
+    model: Path | None = option(
+        None,
+        "a YOLO, YOLO-World or Grounding DINO model (default: the source's ground truth)",
+        key="detector",
+        metavar="FILE.onnx",
+        metadata=FILE,
+    )
     threads: int | None = field(default=None, metadata=MAY_CHANGE)
     asynchronous: bool = field(default=False, metadata=MAY_CHANGE)
-    segmenter: str | None = field(default=None, metadata=FILE)
-    vocabulary: Path | None = field(default=None, metadata=FILE)
-    accept_similar: bool = False
-    tiles: int = DEFAULT_TILES_PER_SIDE
+    segmenter: str | None = option(
+        None,
+        "a FastSAM model, the detector's own masks, or segmentation by depth and colour",
+        metavar="FILE.onnx|yolo|depth",
+        needs="detector",
+        metadata=FILE,
+    )
+    vocabulary: Path | None = option(
+        None,
+        "the text encoder's vocabulary (default: vocab.txt or tokenizer.json in the model's folder)",
+        metavar="FILE.txt",
+        needs="detector",
+        metadata=FILE,
+    )
+    accept_similar: bool = option(False, "also map objects of a class that is only similar to the task's noun")
+    tiles: int = option(
+        DEFAULT_TILES_PER_SIDE,
+        "also detect in NxN enlarged parts of each keyframe, as time allows, to find small, distant objects; 1: off",
+        low=1,
+        high=MAX_TILES_PER_SIDE,
+        needs="detector",
+    )
     detection_time_s: float | None = field(default=None, metadata=MAY_CHANGE)
+
+    def absolute(self) -> PerceptionSettings:
+        """Return these settings for another process: paths do not depend on the current folder."""
+        model = None if self.model is None else self.model.absolute()
+        return replace(self, model=model, vocabulary=None if self.vocabulary is None else self.vocabulary.absolute())
+
+    def at_rate(self, mission: MissionSettings) -> PerceptionSettings:
+        """Return these settings with the mission's threads; at a rate, detection is asynchronous, on one thread."""
+        if mission.rate_hz is None:
+            return replace(self, threads=mission.threads)
+        # the next keyframe comes at the latest after this time
+        detection_time_s = RelevanceTrackerSettings().max_frames / mission.rate_hz
+        return replace(self, threads=1, asynchronous=True, detection_time_s=detection_time_s)
+
+
+def _iterations_of_policy(options: Namespace) -> int | None:
+    """Return the iterations per frame of the chosen policy; None at a rate."""
+    if getattr(options, "rate", None) is not None:
+        return None
+    settings = policy(getattr(options, "policy", None) or TASK).optimization
+    return settings.warmup_iterations + settings.active_iterations
 
 
 @dataclass(frozen=True, slots=True)
 class MissionSettings:
     """Policy, budget, scheduling and hardware settings of one robot's mapping.
 
-    disabled: parts of the policy to switch off (see `gausslite.mapping.policies.disable`). rate_hz: frames per second;
-    each frame then trains as many iterations as fit into its time instead of a fixed number. min_iterations,
-    skip_stages and deadline_slack apply at a rate only, see `SchedulerSettings`. pose_prior: standard deviations of
-    pose and exposure errors; tracked poses have TRACKED_PRIOR if it allows no pose error. motion: what predicts tracked
-    poses.
+    disabled: see `gausslite.mapping.policies.disable`. rate_hz: each frame then trains as many iterations as fit into
+    its time instead of a fixed number. min_iterations, skip_stages and deadline_slack: see `SchedulerSettings`.
+    pose_prior: tracked poses have TRACKED_PRIOR if it allows no pose error.
     """
 
-    policy: str = TASK
-    disabled: frozenset[str] = field(default=frozenset(), metadata={"flag": "--disable"})
-    max_gaussians: int = DEFAULT_MAX_GAUSSIANS
-    iterations: int | None = None
-    rate_hz: float | None = field(default=None, metadata={"flag": "--rate"})
-    min_iterations: int = _SCHEDULER.min_iterations
-    skip_stages: tuple[SkippableStage, ...] = _SCHEDULER.skip_stages
-    deadline_slack: float = _SCHEDULER.deadline_slack
-    seed: int = 0
-    threads: int | None = field(default=None, metadata=MAY_CHANGE)
-    backend: str = field(default="auto", metadata=MAY_CHANGE)
-    pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
-    poses: PoseMode = PoseMode.REFINE
-    motion: MotionModel = field(default=MotionModel.VELOCITY, metadata={"flag": "--track-motion"})
+    policy: str = option(
+        TASK,
+        "how the map is seeded and trained",
+        metavar="NAME",
+        choices=tuple(sorted(POLICIES)),
+        presets={"paper": "paper"},
+    )
+    disabled: frozenset[str] = option(frozenset(), _DISABLE_HELP, key="disable", metavar="A,B")
+    max_gaussians: int = option(
+        DEFAULT_MAX_GAUSSIANS, "upper limit of the map's size", low=1, presets={"paper": 1_000_000}
+    )
+    iterations: int | None = option(
+        None,
+        "iterations per frame (default: 8)",
+        low=0,
+        high=MAX_ITERATIONS,
+        excludes="rate",
+        computed=_iterations_of_policy,
+    )
+    rate_hz: float | None = option(
+        None,
+        "frames per second; each frame trains as long as its time allows",
+        key="rate",
+        metavar="HZ",
+        unit="Hz",
+        low=MIN_RATE_HZ,
+        high=MAX_RATE_HZ,
+    )
+    min_iterations: int = option(
+        _SCHEDULER.min_iterations,
+        "iterations that every frame should get",
+        low=0,
+        high=MAX_ITERATIONS,
+        needs="rate",
+    )
+    skip_stages: tuple[SkippableStage, ...] = option(
+        _SCHEDULER.skip_stages, "stages that a frame without enough time skips, in this order", needs="rate"
+    )
+    deadline_slack: float = option(
+        _SCHEDULER.deadline_slack,
+        "share of a frame's time that it may overrun for its minimum iterations",
+        low=0,
+        high=1,
+        needs="rate",
+    )
+    seed: int = option(0, "seed of every random choice (default: 0)", low=0, high=MAX_SEED)
+    threads: int | None = option(
+        None,
+        "threads (default: all that the processor has)",
+        low=1,
+        high=MAX_THREADS,
+        computed=lambda _: choose_threads(None),
+        metadata=MAY_CHANGE,
+    )
+    backend: str = option(
+        "auto", "backend that renders and trains", key="rasterizer", choices=BACKENDS, metadata=MAY_CHANGE
+    )
+    pose_prior: PoseExposurePrior = option(
+        PoseExposurePrior(),
+        POSE_PRIOR_HELP,
+        metavar=f"{NONE}|{PRIOR_FORM}",
+        plain_type=str,
+        convert=read_prior,
+        to_plain=write_prior,
+        presets={"paper": NONE},
+    )
+    poses: PoseMode = option(
+        PoseMode.REFINE,
+        "given: map with the given poses; refine: refine them within pose-prior; track: find poses by tracking the "
+        "camera against the map, from the first given pose on",
+    )
+    motion: MotionModel = option(
+        MotionModel.VELOCITY,
+        "what predicts the motion between two frames without enough common features: the last velocity or the given "
+        "odometry",
+        key="track-motion",
+        needs="poses=track",
+    )
 
     def __post_init__(self) -> None:
-        self._require_types()
-        if self.rate_hz is not None:
-            require_rate(self.rate_hz)
-        if not 0 <= self.min_iterations <= MAX_ITERATIONS:
-            raise InvalidInputError(f"min_iterations: expected 0 to {MAX_ITERATIONS}, got {self.min_iterations}")
-        if not 0 <= self.deadline_slack <= 1:
-            raise InvalidInputError(
-                f"deadline_slack: expected a share of a frame's time, 0 to 1, got {self.deadline_slack}"
-            )
-        if self.iterations is not None and not 0 <= self.iterations <= MAX_ITERATIONS:
-            raise InvalidInputError(f"iterations: expected 0 to {MAX_ITERATIONS}, got {self.iterations}")
-        if not 0 <= self.seed <= MAX_SEED:
-            raise InvalidInputError(f"seed: expected 0 to {MAX_SEED}, got {self.seed}")
-        if self.threads is not None and not 1 <= self.threads <= MAX_THREADS:
-            raise InvalidInputError(f"threads: expected 1 to {MAX_THREADS}, got {self.threads}")
-        # raises for an unknown policy or component, and for a cap of 0
+        check_options(self)
+        # raises for an unknown policy or component
         self.mapper_settings()
-
-    def _require_types(self) -> None:
-        """Raise InvalidInputError for values of other types than the fields'."""
-        require_instance("policy", self.policy, str, "the name of a policy as text")
-        require_instance("disabled", self.disabled, (frozenset, set), "a set of names such as frozenset({'sb'})")
-        require_instance("pose_prior", self.pose_prior, PoseExposurePrior, "a PoseExposurePrior")
-        require_instance("poses", self.poses, PoseMode, "a PoseMode")
-        require_instance("motion", self.motion, MotionModel, "a MotionModel")
-        require_instance("backend", self.backend, str, "the name of a backend as text")
-        for name in ("max_gaussians", "iterations", "min_iterations", "seed", "threads"):
-            value = getattr(self, name)
-            if value is not None or name not in ("iterations", "threads"):
-                require_whole(name, value)
-        if self.rate_hz is not None:
-            require_number("rate_hz", self.rate_hz)
-        require_number("deadline_slack", self.deadline_slack)
 
     @property
     def follows_task(self) -> bool:

@@ -23,7 +23,7 @@ class TaskSwitch:
         """Return the switch written as "120:Find the mug". Raises InvalidInputError."""
         number, colon, task = text.partition(":")
         if not (colon and number.isascii() and number.isdigit() and len(number) < 10 and task.strip()):
-            raise InvalidInputError(f"--task-at: expected a frame and a task such as '120:Find the mug', got {text!r}")
+            raise InvalidInputError(f"task-at: expected a frame and a task such as '120:Find the mug', got {text!r}")
         return cls(int(number), task.strip())
 
 

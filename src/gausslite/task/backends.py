@@ -7,6 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
+from gausslite.config.option import check_options, option
 from gausslite.domain.errors import InvalidInputError
 from gausslite.task.language.model import LanguageModel
 from gausslite.task.parser import TaskParser
@@ -24,23 +25,57 @@ class Backend(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class BackendSettings:
-    """model: a folder for onnx, a name for http; timeout_s: longest time of a model before the rules parse the task."""
+    """The task parser and its language model. key_variable: the environment variable whose value is api_key."""
 
-    backend: Backend = Backend.RULES
-    model: str | None = None
-    url: str | None = None
-    response_format: str = RESPONSE_FORMATS[0]
-    timeout_s: float = 10.0
+    backend: Backend = option(
+        Backend.RULES,
+        "parse tasks by rules, by a language model in this process (onnx) or on a server (http)",
+    )
+    model: str | None = option(
+        None,
+        "http: the model's name; onnx: a folder with genai_config.json",
+        key="llm-model",
+        metavar="NAME|FOLDER",
+        needs="backend=onnx|http",
+    )
+    url: str | None = option(
+        None,
+        "base of an OpenAI-compatible server, http://localhost:8000/v1",
+        key="llm-url",
+        metavar="URL",
+        needs="backend=http",
+    )
+    response_format: str = option(
+        RESPONSE_FORMATS[0],
+        "response format to request",
+        key="llm-format",
+        choices=RESPONSE_FORMATS,
+        needs="backend=http",
+    )
+    timeout_s: float = option(
+        10.0,
+        "longest wait for the model; rules parse the task after that",
+        key="llm-timeout",
+        unit="s",
+        low=0.001,
+        high=600,
+    )
+    key_variable: str = option(
+        "GAUSSLITE_LLM_API_KEY",
+        "environment variable that holds the API key of the server",
+        key="llm-key-variable",
+        metavar="NAME",
+    )
+
     api_key: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        check_options(self)
         if self.backend is not Backend.RULES and not self.model:
             expected = "a folder" if self.backend is Backend.ONNX else "the model's name at the server"
             raise InvalidInputError(f"backend {self.backend}: expected --llm-model, {expected}, got none")
         if self.backend is Backend.HTTP and not self.url:
             raise InvalidInputError("backend http: expected --llm-url, such as http://localhost:8000/v1, got none")
-        if not 0 < self.timeout_s <= 600:
-            raise InvalidInputError(f"backend timeout: expected up to 600 seconds, got {self.timeout_s}")
 
 
 def open_parser(settings: BackendSettings) -> TaskParser:

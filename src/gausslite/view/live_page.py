@@ -70,7 +70,7 @@ def own_address(listen: str) -> str:
         return listen
     host, port = host_and_port("--listen", listen)
     if port == 0:
-        raise InvalidInputError("--view: expected a fixed port in --listen, got 0")
+        raise InvalidInputError("view: expected a fixed port in --listen, got 0")
     return f"localhost:{port}" if host in _ANY_HOST else listen
 
 

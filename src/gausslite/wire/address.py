@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from gausslite.domain.errors import InvalidInputError
 
+PARSER_ADDRESS = "127.0.0.1:50051"
+FUSION_ADDRESS = "127.0.0.1:50052"
+AGENT_ADDRESS = "127.0.0.1:50053"
+"""The addresses on which the services listen by default."""
 UNIX = "unix:"
-_LAST_PORT = 65535
+MAX_PORT = 65535
 _WEB_SCHEMES = ("http://", "https://")
 
 
@@ -15,7 +19,7 @@ def host_and_port(name: str, address: str) -> tuple[str, int]:
         if address.startswith(scheme):
             raise InvalidInputError(f"{name}: expected HOST:PORT without {scheme}, got {address!r}")
     host, _, port = address.rpartition(":")
-    if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > _LAST_PORT:
+    if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > MAX_PORT:
         raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH, got {address!r}")
     return host, int(port)
 

@@ -6,9 +6,10 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
-from gausslite.domain.errors import InvalidInputError, RateLimitError
+from gausslite.config.option import check_options, option
+from gausslite.domain.errors import RateLimitError
 from gausslite.wire.caller import Caller
 from gausslite.wire.token_bucket import TokenBucket
 
@@ -27,15 +28,13 @@ class CallLimits:
     call is closed.
     """
 
-    calls: int = 64
-    kbps: int = 200_000
-    connections: int = 1000
-    idle_s: int = 60
+    calls: int = option(64, "largest number of open calls of one caller", key="limit-calls", low=1)
+    kbps: int = option(200_000, "largest bandwidth of one caller's requests", key="limit-kbps", unit="kbit/s", low=1)
+    connections: int = option(1000, "largest number of connections", key="limit-connections", low=1)
+    idle_s: int = option(60, "longest time of a connection without a call", key="limit-idle", unit="s", low=1)
 
     def __post_init__(self) -> None:
-        for limit in fields(self):
-            if getattr(self, limit.name) < 1:
-                raise InvalidInputError(f"limit {limit.name}: expected at least 1, got {getattr(self, limit.name)}")
+        check_options(self)
 
     @property
     def connection_options(self) -> tuple[tuple[str, int], ...]:

@@ -44,7 +44,7 @@ from gausslite.wire.stored_keyframe import StoredKeyframe, stored_keyframe_from_
 from gausslite.wire.tls import Tls
 
 MAX_END_S = 90_000.0
-"""Longer than any agent takes to end a mission: its --drain-timeout is at most a day."""
+"""Longer than any agent takes to end a mission: its drain-timeout is at most a day."""
 # larger than the default, because a server may send larger blocks
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
 

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 import grpc
 
+from gausslite.config.option import option
 from gausslite.domain.errors import InvalidInputError
 
 
@@ -20,6 +21,36 @@ class Identity:
 
     certificate: bytes
     key: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """The PEM files of encrypted connections."""
+
+    certificate: Path | None = option(
+        None, "this process's certificate, PEM (default: no encryption)", key="tls-cert", metavar="FILE"
+    )
+    key: Path | None = option(
+        None, "the certificate's private key, PEM, without a passphrase", key="tls-key", metavar="FILE"
+    )
+    authorities: Path | None = option(
+        None,
+        "trust only these authorities, and require a certificate of theirs from every caller",
+        key="tls-ca",
+        metavar="FILE",
+    )
+
+    def read(self) -> Tls | None:
+        """Return the certificates, None without any file. Raises InvalidInputError."""
+        paths = self.certificate, self.key, self.authorities
+        return None if paths == (None, None, None) else Tls.read(*paths)
+
+    def read_for_server(self) -> Tls | None:
+        """Return the same for a program that listens. Raises InvalidInputError if its own certificate is missing."""
+        tls = self.read()
+        if tls is not None:
+            tls.server_credentials()
+        return tls
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from gausslite.config.values import read_names, read_numbers
+from gausslite.config.plain_values import split_names
+from gausslite.config.values import read_numbers
 
 
 def read_image_sizes(text: str) -> tuple[tuple[int, int], ...]:
     """Parse "WxH,WxH"."""
-    sizes = tuple(tuple(_positive(side) for side in part.lower().split("x")) for part in read_names(text))
+    sizes = tuple(tuple(_positive(side) for side in part.lower().split("x")) for part in split_names(text))
     pairs = tuple((size[0], size[1]) for size in sizes if len(size) == 2)
     if not sizes or len(pairs) != len(sizes):
         raise argparse.ArgumentTypeError(f"expected sizes such as 320x240,640x480, got {text!r}")
@@ -26,7 +27,7 @@ def read_image_size(text: str) -> tuple[int, int]:
 
 def read_counts(text: str) -> tuple[int, ...]:
     """Parse "N,N" with N > 0."""
-    counts = tuple(_positive(part) for part in read_names(text))
+    counts = tuple(_positive(part) for part in split_names(text))
     if not counts:
         raise argparse.ArgumentTypeError(f"expected whole numbers such as 20000,100000, got {text!r}")
     return counts
@@ -34,7 +35,7 @@ def read_counts(text: str) -> tuple[int, ...]:
 
 def read_seeds(text: str) -> tuple[int, ...]:
     """Parse "N,N" with N >= 0."""
-    parts = read_names(text)
+    parts = split_names(text)
     if not parts or not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
         raise argparse.ArgumentTypeError(f"expected whole numbers such as 0,1,2, got {text!r}")
     return tuple(int(part) for part in parts)

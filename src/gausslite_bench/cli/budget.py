@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar
 from gausslite.codec.files import write_atomic
-from gausslite.config.values import read_names
+from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import write_json
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes
@@ -39,7 +39,7 @@ def configure_budget(parser: argparse.ArgumentParser) -> None:
     add(
         "--pairs",
         metavar="A,B",
-        type=read_names,
+        type=split_names,
         default=(),
         help=f"homes or home-task pairs (default: {','.join(_PAIRS)}, or none with --real)",
     )

@@ -10,7 +10,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
-from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.chaos.run import ChaosResult, ChaosSettings, run_chaos
 
@@ -24,7 +23,7 @@ def configure_chaos(parser: argparse.ArgumentParser) -> None:
     add("--agents", type=int, default=defaults.agents, metavar="N", help="agents that send (default: %(default)s)")
     add("--seed", type=int, default=defaults.seed, metavar="N", help="seed of all faults (default: %(default)s)")
     add("--out", type=Path, metavar="FOLDER", help="keep the store, the journals and the logs there (default: no)")
-    add_switch(parser, "--json", "print JSON for scripts")
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_command)
 
 

@@ -12,8 +12,7 @@ from tqdm import tqdm
 
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.files import write_atomic
-from gausslite.config.switches import add_switch
-from gausslite.config.values import read_names
+from gausslite.config.plain_values import split_names
 from gausslite.mission.results import as_text, prepare_folder, write_json
 from gausslite_bench.cli.study_options import add_study_options, scene_plans
 from gausslite_bench.codec.formats import codec_formats
@@ -29,14 +28,14 @@ def configure_codec(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pairs",
         metavar="A,B",
-        type=read_names,
+        type=split_names,
         default=(),
         help=f"homes or pairs of a home and a task (default: {_DEFAULT_TASK})",
     )
     parser.add_argument(
         "--max-gaussians", metavar="N", type=int, default=60_000, help="hard cap of the map (default: %(default)s)"
     )
-    add_switch(parser, "--json", "print JSON for scripts")
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     add_study_options(parser, (0,))
     parser.set_defaults(run=run_codec)
 

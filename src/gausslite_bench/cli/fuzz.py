@@ -11,7 +11,6 @@ from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.files import write_atomic
-from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.fuzz.run import FuzzResult, FuzzSettings, run_fuzz
 
@@ -27,7 +26,7 @@ def configure_fuzz(parser: argparse.ArgumentParser) -> None:
     add("--corpus", type=Path, metavar="FOLDER", help="valid messages, TARGET/NAME.bin (default: those of the package)")
     add("--detector", type=Path, metavar="FILE.onnx", help="of the agent (default: it refuses tasks and frames)")
     add("--out", type=Path, metavar="FOLDER", help="write the messages that failed there (default: no)")
-    add_switch(parser, "--json", "print JSON for scripts")
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_command)
 
 

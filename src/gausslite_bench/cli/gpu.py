@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 
-from gausslite.config.switches import add_switch
 from gausslite.domain.errors import KernelError
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.cli.argument_types import read_counts
@@ -24,7 +23,7 @@ def configure_gpu(parser: argparse.ArgumentParser) -> None:
         help=f"numbers of Gaussians (default: {counts})",
     )
     add("--reps", metavar="N", type=int, default=100, help="timed iterations of each kind (default: %(default)s)")
-    add_switch(parser, "--json", "print JSON for scripts")
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_gpu)
 
 

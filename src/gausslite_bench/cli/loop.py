@@ -9,22 +9,21 @@ from dataclasses import asdict, dataclass
 from gausslite.cli.map_inputs import choose_roi
 from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import (
-    add_regions,
+    RecordingOptions,
     calibrate_with_messages,
     open_recorded,
     selected_regions,
     stated_values,
 )
-from gausslite.config.mapping_options import add_budget, add_detector, add_policy, mission_settings, perception_settings
-from gausslite.config.options_without_effect import require_effect
-from gausslite.config.source_options import add_frames
-from gausslite.config.switches import add_switch
-from gausslite.config.values import AUTO
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build, option
+from gausslite.config.program import Program
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.views import HeldOutView
@@ -33,7 +32,13 @@ from gausslite.mapping.policies import TASK
 from gausslite.mission.build import EstimatorFactory, build_mapper, region_estimator
 from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.results import as_text, peak_rss_mib
-from gausslite.mission.settings import SceneInfo
+from gausslite.mission.settings import (
+    MissionSettings,
+    PerceptionSettings,
+    SceneInfo,
+    SourceSettings,
+    TaskSettings,
+)
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.perception.relevance import RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
@@ -47,34 +52,33 @@ _HOME_TASK = "Pick up the mug on the table"
 _MEMORY_SAMPLES = 40
 
 
-def configure_loop(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench loop`."""
-    parser.add_argument("source", metavar="SOURCE", nargs="?", default=_HOME, help="as in map (default: %(default)s)")
-    add_frames(parser, allow_auto=True, default_text=AUTO)
-    parser.add_argument("--task", metavar="TEXT", help=f'as in map (on the default source "{_HOME_TASK}")')
-    add_detector(parser)
-    add_regions(parser)
-    add_policy(parser)
-    add_budget(parser)
-    add = parser.add_argument_group("benchmark").add_argument
-    add("--loop", metavar="N", type=int, help="map N frames, back and forth along the sequence, and sample the memory")
-    add(
-        "--unlimited",
-        metavar="N",
-        type=int,
-        help="also map with N iterations per frame and compare ROI PSNR; every 8th frame is held out",
+@dataclass(frozen=True, slots=True)
+class LoopOptions:
+    """The options of `bench loop` beside those of `gausslite map`."""
+
+    loop: int | None = option(None, "map N frames, back and forth along the sequence, and sample the memory", low=2)
+    unlimited: int | None = option(
+        None, "also map with N iterations per frame and compare ROI PSNR; every 8th frame is held out", low=1
     )
-    add_switch(parser, "--json", "print JSON for scripts")
+    json: bool = option(False, "print JSON for scripts")
+
+
+def configure_loop(parser: CommandParser) -> None:
+    """Add the options of `bench loop`."""
+    Program.of(
+        *(LoopOptions, RecordingOptions, SourceSettings, TaskSettings, PerceptionSettings, MissionSettings),
+        flags="frames size task detector roi objects policy max-gaussians iterations rate seed loop unlimited json",
+        positional="source",
+        omit=("pose-prior", "camera-correction", "test-every"),
+        defaults={"source": _HOME},
+    ).add_to(parser)
     parser.set_defaults(run=run_loop)
 
 
 def run_loop(options: argparse.Namespace) -> int:
     """Map the sequence and print the time of each stage. Reading frames is not counted."""
-    if options.source == _HOME and options.policy in (None, TASK) and not _has_task(options):
+    if options.source == _HOME and options.policy == TASK and not _has_task(options):
         options.task = _HOME_TASK
-    require_effect(options)
-    if options.loop is not None and options.loop < 2:
-        raise InvalidInputError(f"--loop: expected at least 2 frames, got {options.loop}")
     stated = stated_values(options.register_depth, CameraCorrection(), options.pose_prior)
     source = calibrate_with_messages(options.source, open_recorded(options.source, options.up), stated).source
     positions: Sequence[int] = select_frames(source, options.frames)
@@ -147,19 +151,25 @@ def _memory_line(memory: MemoryTrend) -> str:
     )
 
 
+def _mission_settings(options: argparse.Namespace) -> MissionSettings:
+    return build(MissionSettings, options, pose_prior=PoseExposurePrior())
+
+
 def _estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
     """Return the relevance estimator of the options: for a task, for regions, or for a uniform map."""
     roi = choose_roi(options, source)
     if not isinstance(roi, TaskGraph):
         return region_estimator(roi)
-    return EstimatorFactory(perception_settings(options), lambda: SceneInfo.of(source)).build(roi)
+    return EstimatorFactory(
+        build(PerceptionSettings, options).at_rate(_mission_settings(options)), lambda: SceneInfo.of(source)
+    ).build(roi)
 
 
 def _run_mapping(
     options: argparse.Namespace, source: Source, positions: Sequence[int], rasterizer: Rasterizer
 ) -> tuple[LoopBench, list[FrameCost], MemoryTrend | None]:
     """Return the loop after these positions, the cost of each frame, and with --loop the memory trend."""
-    settings, size = mission_settings(options), frame_size(options.size, source)
+    settings, size = _mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
     bench = LoopBench(_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
     log = CostLog()
@@ -188,7 +198,7 @@ def _gap(
     """Map the same frames again with --unlimited iterations and score both maps on the held-out frames."""
     size = frame_size(options.size, source)
     unlimited = _without_rate(options)
-    loop = LoopBench(_estimator(unlimited, source), build_mapper(mission_settings(unlimited)), VoxelGrid())
+    loop = LoopBench(_estimator(unlimited, source), build_mapper(_mission_settings(unlimited)), VoxelGrid())
     with MappingBar(len(positions), "unlimited") as bar:
         loop.run(FrameStream(source, positions, size).frames(), bar.count)
     regions = selected_regions(options, source)
@@ -203,7 +213,7 @@ def _without_rate(options: argparse.Namespace) -> argparse.Namespace:
 
 def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[int]) -> None:
     """Check before two runs that their maps can be compared. Raises InvalidInputError, DatasetError."""
-    mission_settings(_without_rate(options))
+    _mission_settings(_without_rate(options))
     if not held_out:
         raise InvalidInputError("--unlimited: expected at least 8 frames, so that one is held out; got fewer")
     regions, size = selected_regions(options, source), frame_size(options.size, source)

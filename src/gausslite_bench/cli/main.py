@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 
+from gausslite.config.command_parser import CommandParser
 from gausslite_bench.cli.budget import configure_budget
 from gausslite_bench.cli.camera import configure_camera
 from gausslite_bench.cli.chaos import configure_chaos
@@ -22,7 +22,7 @@ from gausslite_bench.cli.task_change import configure_task_change
 from gausslite_bench.cli.team import configure_team
 from gausslite_bench.cli.view import configure_view
 
-_BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str]] = {
+_BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str, str]] = {
     "raster": (
         configure_raster,
         "speed of the CPU rasterizer, per operation and stage",
@@ -125,7 +125,7 @@ _BENCHMARKS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str, str
 }
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure(parser: CommandParser) -> None:
     """Add the benchmarks and their options."""
     benchmarks = parser.add_subparsers(dest="bench", required=True, metavar="BENCHMARK")
     for name, (configure_benchmark, summary, description) in _BENCHMARKS.items():

@@ -7,34 +7,37 @@ import json
 import os
 import shlex
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gausslite.config.switches import add_switch
-from gausslite.config.task_parser_options import add_backend, backend_settings
-from gausslite.task.backends import open_parser
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build, option
+from gausslite.config.program import Program
+from gausslite.task.backends import BackendSettings, open_parser
 from gausslite_bench.parser_scores import SENTENCES, ParserScore, load_sentences, score_parser
 
 
-def configure_parser(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench parser`."""
-    add = parser.add_argument
-    add(
-        "--sentences",
-        metavar="FILE.json",
-        type=Path,
-        default=SENTENCES,
-        help="sentences with their expected graphs (default: the set in the package)",
+@dataclass(frozen=True, slots=True)
+class ParserBenchOptions:
+    """The options of `bench parser` beside those of the backend."""
+
+    sentences: Path = option(
+        SENTENCES, "sentences with their expected graphs (default: the set in the package)", metavar="FILE.json"
     )
-    add_switch(parser, "--json", "print JSON for scripts")
-    add_backend(parser)
+    json: bool = option(False, "print JSON for scripts")
+
+
+def configure_parser(parser: CommandParser) -> None:
+    """Add the options of `bench parser`."""
+    Program.of(ParserBenchOptions, BackendSettings, flags="sentences json backend llm-model llm-url").add_to(parser)
     parser.set_defaults(run=run_parser)
 
 
 def run_parser(options: argparse.Namespace) -> int:
     """Score the selected backend and print its scores."""
     sentences = load_sentences(options.sentences)
-    score = score_parser(options.backend, open_parser(backend_settings(options, os.environ)), sentences)
+    settings = build(BackendSettings, options, api_key=os.environ.get(options.llm_key_variable) or None)
+    score = score_parser(str(options.backend), open_parser(settings), sentences)
     if options.json:
         print(json.dumps({"command": shlex.join(sys.argv), **asdict(score)}, indent=2))
     else:

@@ -6,14 +6,20 @@ import argparse
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gausslite.cli.source_options import add_source, calibrate_with_messages, open_recorded, stated_values
+from gausslite.cli.source_options import (
+    RecordingOptions,
+    calibrate_with_messages,
+    open_recorded,
+    stated_values,
+)
 from gausslite.codec.png import write_png
-from gausslite.config.mapping_options import add_detector
-from gausslite.config.switches import add_switch
-from gausslite.config.values import AUTO, read_names
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import option
+from gausslite.config.plain_values import split_names
+from gausslite.config.program import Program
 from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.datasets.source import Source
 from gausslite.domain.camera_correction import CameraCorrection
@@ -23,6 +29,7 @@ from gausslite.domain.object_names import head_of, same_kind
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.domain.region import Region
 from gausslite.mission.results import as_text, prepare_folder
+from gausslite.mission.settings import PerceptionSettings, SourceSettings
 from gausslite.perception.detector import Detector, Tiling
 from gausslite.task.rules import RuleParser
 from gausslite_bench.perception.absent_nouns import AbsentSummary, absent_queries, choose_absent_nouns
@@ -33,36 +40,45 @@ _ANY_OBJECT = "object"
 _COLUMNS = ("IoU", "precision", "recall", "marked, %", "max, %", "frames", "right", "found", "late")
 
 
-def configure_perception(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench perception`."""
-    add_source(parser, default_text=AUTO)
-    add_detector(parser)
-    add = parser.add_argument_group("benchmark").add_argument
-    add("--roi", metavar="FILE.npz", type=Path, help="ground-truth regions (default: the source's own)")
-    add(
-        "--task",
+def read_absent(text: str) -> tuple[str, ...] | int:
+    """Return the nouns of "a,b", or the number of nouns to choose."""
+    return int(text) if text.isdecimal() else split_names(text)
+
+
+@dataclass(frozen=True, slots=True)
+class PerceptionBenchOptions:
+    """The options of `bench perception` beside those of the source and the detector."""
+
+    roi: Path | None = option(None, "ground-truth regions (default: the source's own)", metavar="FILE.npz")
+    task: tuple[str, ...] = option(
+        (),
+        "a task and the objects of its target; repeatable (default: a search for each kind of object)",
         metavar="TEXT=A,B",
-        action="append",
-        default=[],
-        help="a task and the objects of its target; repeatable (default: a search for each kind of object)",
+        repeats=True,
     )
-    add(
-        "--absent",
+    absent: tuple[str, ...] | int = option(
+        (),
+        "also search for these nouns, which must be absent, or for N nouns of the detector's vocabulary",
         metavar="A,B|N",
-        type=read_absent,
-        default=(),
-        help="also search for these nouns, which must be absent, or for N nouns of the detector's vocabulary",
+        plain_type=str,
+        convert=read_absent,
     )
-    add(
-        "--present",
-        metavar="A,B",
-        type=read_names,
-        default=(),
-        help="objects of the scene without ground truth: --absent N searches for none of them",
+    present: tuple[str, ...] = option(
+        (), "objects of the scene without ground truth: --absent N searches for none of them", metavar="A,B"
     )
-    add("--threads", metavar="N", type=int, help="the detector's threads (default: the runtime's choice)")
-    add("--pictures", metavar="DIR", type=Path, help="write a contact sheet for each task to this folder")
-    add_switch(parser, "--json", "print JSON for scripts")
+    threads: int | None = option(None, "the detector's threads (default: the runtime's choice)", low=1)
+    pictures: Path | None = option(None, "write a contact sheet for each task to this folder", metavar="DIR")
+    json: bool = option(False, "print JSON for scripts")
+
+
+def configure_perception(parser: CommandParser) -> None:
+    """Add the options of `bench perception`."""
+    Program.of(
+        *(PerceptionBenchOptions, RecordingOptions, SourceSettings, PerceptionSettings),
+        flags="detector frames size roi task absent present pictures json",
+        positional="source",
+        omit=("test-every", "camera-correction", "pose-prior"),
+    ).add_to(parser)
     parser.set_defaults(run=run_perception)
 
 
@@ -176,16 +192,11 @@ def _task_queries(texts: Sequence[str], regions: Mapping[str, Region]) -> list[T
                 raise InvalidInputError(
                     f"--task: expected a task and its objects such as 'Find the mug=mug_1', got {text!r}"
                 )
-        return [TaskQuery(parser.parse(task), read_names(objects)) for task, _, objects in parts]
+        return [TaskQuery(parser.parse(task), split_names(objects)) for task, _, objects in parts]
     kinds: dict[str, list[str]] = {}
     for name in regions:
         kinds.setdefault(head_of(name), []).append(name)
     return [TaskQuery(parser.parse(f"Find the {kind}"), tuple(objects)) for kind, objects in kinds.items()]
-
-
-def read_absent(text: str) -> tuple[str, ...] | int:
-    """Return the nouns of "a,b", or the number of nouns to choose."""
-    return int(text) if text.isdecimal() else read_names(text)
 
 
 def _absent_queries(options: argparse.Namespace, detector: Detector, regions: Mapping[str, Region]) -> list[TaskQuery]:

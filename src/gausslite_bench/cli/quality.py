@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausslite.config.values import read_names
+from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.settings import PerceptionSettings
@@ -27,14 +27,14 @@ def configure_quality(parser: argparse.ArgumentParser) -> None:
     add(
         "--pairs",
         metavar="A,B",
-        type=read_names,
+        type=split_names,
         default=(),
         help="homes or home-task pairs such as home-3,home-4-search (default: all 24 pairs)",
     )
     add(
         "--policies",
         metavar="A,B",
-        type=read_names,
+        type=split_names,
         default=tuple(POLICIES),
         help="policies; tables compare the first with the best other (default: all)",
     )
@@ -55,7 +55,7 @@ def configure_ablation(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pair",
         metavar="A,B",
-        type=read_names,
+        type=split_names,
         default=(),
         help=f"homes or home-task pairs (default: {_ABLATION_TASK}, or none with --real)",
     )

@@ -8,7 +8,6 @@ import shlex
 import sys
 from pathlib import Path
 
-from gausslite.config.switches import add_switch
 from gausslite.mission.results import prepare_file, write_json
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages
 from gausslite_bench.raster.block_cost import BlockCost
@@ -52,7 +51,9 @@ def configure_raster(parser: argparse.ArgumentParser) -> None:
         default=SHARES_PERCENT,
         help=f"percentages of the image for steps masked to a region, or 0 for none (default: {shares})",
     )
-    add_switch(parser, "--json", "print JSON: the minimum time of each operation, without --shares")
+    parser.add_argument(
+        "--json", action="store_true", help="print JSON: the minimum time of each operation, without --shares"
+    )
     add("--details", metavar="FILE", type=Path, help="write all measurements to this JSON file")
     parser.set_defaults(run=run_raster)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 
-from gausslite.config.mapping_options import add_budget
-from gausslite.config.source_options import add_frames
-from gausslite.config.values import read_names
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import option
+from gausslite.config.program import Program
 from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
@@ -14,31 +15,39 @@ from gausslite.datasets.selection import frame_size, select_frames
 from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.views import HeldOutView, MapViewer
-from gausslite.mapping.policies import POLICIES, TASK, follows_task
+from gausslite.mapping.policies import follows_task
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.runner import MissionRunner
-from gausslite.mission.settings import MissionSettings
+from gausslite.mission.settings import MissionSettings, SourceSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator, RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 
 
-def configure_registration(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `bench registration`."""
-    parser.add_argument("source", metavar="SOURCE", help="a folder with a recorded sequence")
-    add = parser.add_argument_group("benchmark").add_argument
-    add("--objects", metavar="A,B", type=read_names, default=(), help="objects of the task's region (default: all)")
-    add("--policy", choices=sorted(POLICIES), default=TASK, help="mapping policy (default: %(default)s)")
-    add(
-        "--masks",
+@dataclass(frozen=True, slots=True)
+class RegistrationOptions:
+    """The options of `bench registration` beside those of the source and the map."""
+
+    objects: tuple[str, ...] = option((), "objects of the task's region (default: all)", metavar="A,B")
+    masks: DepthRegistration | None = option(
+        None,
+        "registration for the region's masks, as in register-depth; use one value to compare several runs on the same "
+        "pixels (default: that of register-depth)",
         metavar="REGISTRATION",
-        type=DepthRegistration.parse,
-        help="registration for the region's masks, as in --register-depth; use one value to compare several runs on "
-        "the same pixels (default: that of --register-depth)",
+        plain_type=str,
+        convert=DepthRegistration.parse,
     )
-    add_frames(parser)
-    add_budget(parser)
+
+
+def configure_registration(parser: CommandParser) -> None:
+    """Add the options of `bench registration`."""
+    Program.of(
+        *(RegistrationOptions, SourceSettings, MissionSettings),
+        flags="objects policy frames size max-gaussians iterations seed register-depth masks",
+        positional="source",
+        omit=("test-every", "camera-correction", "pose-prior", "poses", "track-motion", "rate"),
+    ).add_to(parser)
     parser.set_defaults(run=run_registration)
 
 

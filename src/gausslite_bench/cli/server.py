@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from gausslite.cli.progress import progress_bar
-from gausslite.config.switches import add_switch
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.server.agent_load import LoadResult
 from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
@@ -25,8 +24,12 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
     add("--store", choices=["sqlite", "memory"], default="sqlite", help="store of the server (default: %(default)s)")
     add("--watchers", type=int, default=20, metavar="N", help="watchers that stop reading (default: %(default)s)")
     add("--server", default=DEFAULT_COMMAND, metavar="COMMAND", help="starts the server, to compare versions")
-    add_switch(parser, "--hostile", "also measure 8 agents beside one that resends a message of 200000 tombstones")
-    add_switch(parser, "--json", "print JSON for scripts")
+    parser.add_argument(
+        "--hostile",
+        action="store_true",
+        help="also measure 8 agents beside one that resends a message of 200000 tombstones",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_server)
 
 

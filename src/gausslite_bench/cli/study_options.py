@@ -7,14 +7,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gausslite.cli.source_options import calibrate_with_messages, open_recorded, stated_values
-from gausslite.config.mapping_options import add_pose_prior
-from gausslite.config.source_options import add_camera_correction, add_register_depth
-from gausslite.config.switches import add_switch
-from gausslite.config.values import AUTO, read_names, read_up_axis
+from gausslite.cli.source_options import (
+    RecordingOptions,
+    calibrate_with_messages,
+    open_recorded,
+    stated_values,
+)
+from gausslite.config.plain_values import split_names
+from gausslite.config.program import add_flags
+from gausslite.config.values import NONE, PRIOR_FORM, read_prior, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.selection import downscaled_size
 from gausslite.domain.errors import InvalidInputError
+from gausslite.mission.settings import POSE_PRIOR_HELP
 from gausslite_bench.cli.argument_types import read_image_size, read_seeds
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HomeTask, choose_home_tasks
@@ -29,7 +34,11 @@ def add_study_options(parser: argparse.ArgumentParser, default_seeds: tuple[int,
     """Add the output folder, the seeds, the frames and their poses, and the options of a real sequence."""
     add = parser.add_argument
     add("--out", metavar="DIR", type=Path, required=True, help="folder for tables, sheets and cached trials")
-    add_switch(parser, "--reuse-other-code", "also reuse cached trials from other code (default: compute them again)")
+    parser.add_argument(
+        "--reuse-other-code",
+        action="store_true",
+        help="also reuse cached trials from other code (default: compute them again)",
+    )
     seeds = ",".join(str(seed) for seed in default_seeds)
     add("--seeds", metavar="N,...", type=read_seeds, default=default_seeds, help=f"mapping seeds (default: {seeds})")
     add(
@@ -59,7 +68,12 @@ def add_study_options(parser: argparse.ArgumentParser, default_seeds: tuple[int,
 
 def add_real_sequence(parser: argparse.ArgumentParser) -> None:
     """Add the options of a real sequence, and how its pose errors are handled."""
-    add_pose_prior(parser, None, f"homes none, real {REAL_CAMERA.pose_prior}", allow_auto=False)
+    parser.add_argument(
+        "--pose-prior",
+        metavar=f"{NONE}|{PRIOR_FORM}",
+        type=read_prior,
+        help=f"{POSE_PRIOR_HELP} (default: homes none, real {REAL_CAMERA.pose_prior})",
+    )
     parser.add_argument(
         "--fit-views",
         action=argparse.BooleanOptionalAction,
@@ -74,10 +88,11 @@ def add_real_sequence(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help=f"its regions; one task per kind of object (default: FOLDER/{REGIONS_FILE})",
     )
-    add("--kinds", metavar="A,B", type=read_names, default=(), help="kinds of objects such as mug,chair (default: all)")
+    add(
+        "--kinds", metavar="A,B", type=split_names, default=(), help="kinds of objects such as mug,chair (default: all)"
+    )
     add("--up", metavar="X,Y,Z", type=read_up_axis, help="the world's upward direction (default: the source's)")
-    add_register_depth(group, allow_auto=True, default_text=AUTO)
-    add_camera_correction(group, allow_auto=True, default_text=AUTO)
+    add_flags(group, RecordingOptions, "register-depth", "camera-correction")
 
 
 def scene_plans(

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar
 from gausslite.codec.files import write_atomic
-from gausslite.config.switches import add_switch
-from gausslite.config.values import read_names
+from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings
@@ -38,7 +37,7 @@ def configure_task_change(parser: argparse.ArgumentParser) -> None:
     add(
         "--changes",
         metavar="A:B,...",
-        type=read_names,
+        type=split_names,
         default=_CHANGES,
         help=f"pairs of tasks in one home, first:second (default: {','.join(_CHANGES)})",
     )
@@ -48,7 +47,9 @@ def configure_task_change(parser: argparse.ArgumentParser) -> None:
     add("--max-gaussians", metavar="N", type=int, default=60_000, help="hard cap (default: %(default)s)")
     add("--iterations", metavar="N", type=int, default=8, help="iterations per frame (default: %(default)s)")
     add("--rate", metavar="HZ", type=float, default=4.0, help="frame rate in Hz (default: %(default)s)")
-    add_switch(parser, "--timed", "run as many iterations as fit into 1/rate seconds, not --iterations")
+    parser.add_argument(
+        "--timed", action="store_true", help="run as many iterations as fit into 1/rate seconds, not --iterations"
+    )
     add("--seed", metavar="S", type=int, default=0, help="seed of all random numbers (default: 0)")
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
     parser.set_defaults(run=run_task_change)

@@ -14,8 +14,7 @@ from tqdm import tqdm
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.files import write_atomic
-from gausslite.config.switches import add_switch
-from gausslite.config.values import read_names
+from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import as_text, prepare_folder, write_json
@@ -37,12 +36,14 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench team`."""
     add = parser.add_argument
     add("--out", metavar="DIR", type=Path, required=True, help="folder for team.md and team.json")
-    add("--homes", metavar="N,...", type=read_names, help="homes, 1 to 8 (default: 1, or none with --real)")
-    add("--team-sizes", metavar="N,...", type=read_names, default=("2",), help="numbers of agents, 2 to 4 (default: 2)")
+    add("--homes", metavar="N,...", type=split_names, help="homes, 1 to 8 (default: 1, or none with --real)")
+    add(
+        "--team-sizes", metavar="N,...", type=split_names, default=("2",), help="numbers of agents, 2 to 4 (default: 2)"
+    )
     add(
         "--policies",
         metavar="A,B",
-        type=read_names,
+        type=split_names,
         default=("task", "uniform", "splatam", "monogs", "gaussian-slam"),
         help="policies (default: task and the four baselines)",
     )
@@ -72,8 +73,14 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
         help="shift, turn and drift (share of the way) of all agents' frames except the first's (default: none)",
     )
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
-    add_switch(parser, "--late-joiner", "only measure a robot that joins late, alone and with the team's map")
-    add_switch(parser, "--positions", "only measure where perception places the objects of the first agent's task")
+    parser.add_argument(
+        "--late-joiner", action="store_true", help="only measure a robot that joins late, alone and with the team's map"
+    )
+    parser.add_argument(
+        "--positions",
+        action="store_true",
+        help="only measure where perception places the objects of the first agent's task",
+    )
     add(
         "--detector",
         metavar="FILE.onnx",
@@ -81,7 +88,7 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
         help="detector of --positions (default: exact masks of the ground truth)",
     )
     add_real_sequence(parser)
-    add_switch(parser, "--json", "print JSON for scripts")
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_team)
 
 

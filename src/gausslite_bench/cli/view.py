@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 
-from gausslite.config.switches import add_switch
 from gausslite.view.level_of_detail import DEFAULT_LIMIT
 from gausslite_bench.cli.argument_types import read_counts, read_image_size
 from gausslite_bench.view_rates import ViewRate, measure_view
@@ -21,7 +20,7 @@ def configure_view(parser: argparse.ArgumentParser) -> None:
     add("--max-shown", metavar="N", type=int, default=DEFAULT_LIMIT, help="Gaussians drawn (default: %(default)s)")
     add("--size", metavar="WxH", type=read_image_size, default=(1280, 720), help="window (default: 1280x720)")
     add("--seconds", metavar="S", type=float, default=10.0, help="length of the drag (default: %(default)g)")
-    add_switch(parser, "--json", "print JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run_view)
 
 

@@ -20,12 +20,12 @@ FUSION, AGENT = "FusionService", "AgentService"
 COMMANDS: Mapping[str, tuple[str, ...]] = {
     FUSION: (
         "gausslite_fusion_server",
-        *("--quota-agents", "200", "--quota-voxels", "2000", "--quota-gaussians", "20000", "--quota-keyframes", "8"),
-        *("--refine-iterations", "2", "--mission", "mission"),
+        *("--set", "quota-agents=200", "--set", "quota-voxels=2000", "--set", "quota-gaussians=20000"),
+        *("--set", "quota-keyframes=8", "--set", "refine-iterations=2", "--mission", "mission"),
     ),
     AGENT: (
         "gausslite_agent",
-        *("--iterations", "1", "--max-gaussians", "2000", "--threads", "1"),
+        *("--iterations", "1", "--max-gaussians", "2000", "--set", "threads=1"),
     ),
     "ParserService": ("gausslite_parser",),
 }

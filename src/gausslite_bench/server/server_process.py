@@ -18,9 +18,9 @@ DEFAULT_COMMAND = f"{shlex.quote(sys.executable)} -m gausslite_fusion_server"
 _START_LIMIT_S = 300.0
 _POLL_S = 0.02
 _QUOTAS = (
-    *("--quota-agents", "1000", "--quota-voxels", "20000000", "--quota-gaussians", "500000000"),
+    *("--set", "quota-agents=1000", "--set", "quota-voxels=20000000", "--set", "quota-gaussians=500000000"),
     # the agents' frames agree by construction
-    *("--frame-alignment", "trust"),
+    *("--set", "frame-alignment=trust"),
 )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gausslite.codec.subset_codec import encode_subset, split_batch
@@ -121,7 +121,7 @@ def map_agent(
 
 
 def _select_keyframes(keyframes: Sequence[Keyframe], grid: VoxelGrid) -> list[Frame]:
-    """Return the frames that an agent with --handover has sent at its end."""
+    """Return the frames that an agent with a handover has sent at its end."""
     selection = KeyframeSelection(_MAX_KEYFRAMES, grid)
     frames: dict[int | None, Frame] = {}
     for keyframe in keyframes:

@@ -15,7 +15,7 @@ pytest.importorskip("shtab", reason="completion needs the extra `completion`")
     ("program", "words"),
     [
         ("gausslite", {"doctor", "--max-gaussians", "--print-config"}),
-        ("gausslite-agent", {"--handover"}),
+        ("gausslite-agent", {"--listen"}),
         ("gausslite-fusion-server", {"--voxel-size", "verify"}),
         ("gausslite-parser", {"--listen"}),
     ],

@@ -12,8 +12,8 @@ import pytest
 from gausslite.cli.demo.scenario import AgentPlan
 from gausslite.cli.demo.service_processes import ServiceProcess
 from gausslite.cli.demo.services import DemoPlan, RunningService, RunningServices, watch_missions
-from gausslite.config.mapping_options import mission_options, perception_options
-from gausslite.config.toml_text import to_toml
+from gausslite.config.option import plain_options
+from gausslite.config.plain_values import to_toml
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.pose_exposure_prior import PoseExposurePrior
 from gausslite.mapping.stages import SkippableStage
@@ -51,7 +51,7 @@ def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
 def test_an_agent_restores_the_settings_of_its_configuration_file(tmp_path: Path, mission: MissionSettings) -> None:
     perception = PerceptionSettings(tmp_path / "a.onnx", segmenter="depth", vocabulary=tmp_path / "v", tiles=3)
     config = tmp_path / "config.toml"
-    config.write_text(to_toml({**mission_options(mission), **perception_options(perception)}))
+    config.write_text(to_toml({**plain_options(mission), **plain_options(perception)}))
     settings = parse_arguments(["--config", str(config)])
     assert settings.mission == mission
     at_rate = mission.rate_hz is not None

@@ -15,9 +15,9 @@ from tiny_yolo import write_tiny_yolo
 
 from gausslite.cli.doctor import machine_checks
 from gausslite.cli.main import main
-from gausslite.config.default_addresses import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.cpu_kernels import choose_simd
+from gausslite.wire.address import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
 
 Doctor = Callable[..., tuple[int, dict[str, dict[str, str]]]]
 

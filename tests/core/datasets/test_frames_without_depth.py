@@ -41,7 +41,7 @@ def test_a_sequence_without_any_depth_is_rejected(tmp_path: Path, capsys: pytest
 def test_frames_without_depth_are_not_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert map_uniformly(without_depth(tmp_path / "one", 4), tmp_path / "out") == 0
     capsys.readouterr()
-    options = ["--register-depth", "none", "--json"]
+    options = ["--set", "register-depth=none", "--json"]
     score = ["eval", str(tmp_path / "out" / "map.ply")]
     assert main([*score, str(tmp_path / "one"), *options]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 2

@@ -146,11 +146,11 @@ def test_an_invalid_text_is_rejected_in_one_line(text: str) -> None:
 
 def test_the_agent_passes_the_registration_to_its_source() -> None:
     text = "525,525,320,240,-0.025,0,0"
-    settings = parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--register-depth", text])
+    settings = parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--set", f"register-depth={text}"])
     assert settings.source is not None
     assert settings.source.depth_registration == DepthRegistration.parse(text)
     with pytest.raises(InvalidInputError, match="depth registration"):
-        parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--register-depth", "525"])
+        parse_arguments(["--source", "somewhere", "--task", "Find the mug", "--set", "register-depth=525"])
 
 
 def test_a_focal_length_far_from_the_depth_cameras_is_rejected(tmp_path: Path) -> None:

@@ -42,9 +42,9 @@ def test_an_estimated_registration_is_reported(tmp_path: Path, capsys: pytest.Ca
         notice, result = capsys.readouterr().err.splitlines()
         assert notice == (
             f"{seven}: this layout does not state whether depth is registered to colour; the registration is estimated "
-            "now, --register-depth none uses depth as recorded"
+            "now, --set register-depth=none uses depth as recorded"
         )
-        assert result.startswith("--register-depth none: registration: expected at least 1000 depth edge points")
+        assert result.startswith("register-depth none: registration: expected at least 1000 depth edge points")
     for spec, option in ((seven, NONE), (tum, None), (tum, AUTO)):
         assert calibrate(spec, option, EXACT).registration is None
     assert capsys.readouterr().err == ""
@@ -56,7 +56,7 @@ def test_an_estimated_pose_prior_is_reported(tmp_path: Path, capsys: pytest.Capt
     assert capsys.readouterr().err == ""
     assert calibrate(tum, None, AUTO).pose_prior.is_exact
     [line] = capsys.readouterr().err.splitlines()
-    assert line == "--pose-prior none: only 0 pairs of frames overlap, too few for an estimate"
+    assert line == "pose-prior none: only 0 pairs of frames overlap, too few for an estimate"
 
 
 def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

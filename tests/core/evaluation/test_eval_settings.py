@@ -22,7 +22,7 @@ def kitchen(tmp_path: Path) -> Path:
 
 
 def mapped(kitchen: Path, out: Path, *more: str) -> Path:
-    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150", "--out", str(out)]
+    common = ["--set", "roi-ball=0,0,2,0.4", "--set", "threads=1", "--max-gaussians", "150", "--out", str(out)]
     assert main(["map", str(kitchen), *common, *more]) == 0
     return out / "map.ply"
 
@@ -30,18 +30,20 @@ def mapped(kitchen: Path, out: Path, *more: str) -> Path:
 def test_the_report_next_to_a_map_sets_the_registration_and_fitting(
     kitchen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    map_path = mapped(kitchen, tmp_path / "out", "--register-depth", CAMERA, "--pose-prior", POSE_PRIOR)
+    map_path = mapped(
+        kitchen, tmp_path / "out", "--set", f"register-depth={CAMERA}", "--set", f"pose-prior={POSE_PRIOR}"
+    )
 
     def score(*more: str) -> tuple[dict[str, float], str]:
         capsys.readouterr()
-        assert main(["eval", str(map_path), str(kitchen), "--threads", "1", "--json", *more]) == 0
+        assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json", *more]) == 0
         captured = capsys.readouterr()
         return json.loads(captured.out), captured.err
 
     scores, message = score()
     assert message == f"from the report next to map.ply: --register-depth {CAMERA} --poses refine\n"
-    assert scores == score("--register-depth", CAMERA, "--fit-views")[0]
-    raw, message = score("--register-depth", CAMERA, "--no-fit-views")
+    assert scores == score("--set", f"register-depth={CAMERA}", "--set", "fit-views=true")[0]
+    raw, message = score("--set", f"register-depth={CAMERA}", "--set", "fit-views=false")
     assert (scores["fitted"], raw["fitted"], message) == (True, False, "")
     (map_path.parent / "report.json").write_text("[]")
     assert read_report(map_path.parent) == {}
@@ -51,17 +53,17 @@ def test_the_report_next_to_a_map_sets_the_registration_and_fitting(
 def test_eval_scores_the_frames_that_were_held_out(
     kitchen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ("--register-depth", "none", "--pose-prior", "none", "--test-every", "5")
+    options = ("--set", "register-depth=none", "--set", "pose-prior=none", "--test-every", "5")
     map_path = mapped(kitchen, tmp_path / "out", *options)
     report = json.loads((map_path.parent / "report.json").read_text())
     assert (report["frames"], report["hold_out"], report["view_error"]) == (8, 5, None)
     capsys.readouterr()
-    assert main(["eval", str(map_path), str(kitchen), "--threads", "1", "--json", "--test-every", "5"]) == 0
+    assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json", "--test-every", "5"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 2
 
 
 def test_a_map_has_a_preview_next_to_recorded_images(kitchen: Path, tmp_path: Path) -> None:
-    map_path = mapped(kitchen, tmp_path / "out", "--register-depth", "none", "--pose-prior", "none")
+    map_path = mapped(kitchen, tmp_path / "out", "--set", "register-depth=none", "--set", "pose-prior=none")
     preview = cv2.imread(str(map_path.parent / "preview.png"))
     # two keyframes in ten frames: one row each of recorded image, map, and the region in both
     assert preview.shape[1] > 4 * 320

@@ -152,12 +152,12 @@ def test_all_options_that_differ_are_named(saved: Path) -> None:
     with pytest.raises(MismatchError) as caught:
         run.require(*other)
     assert str(caught.value) == (
-        f"{saved}: expected the options of the saved run, --max-gaussians '150000' (got '9'), --policy 'task' (got "
-        "'uniform'), --rate unset (got '4'), --task 'Pick up the mug on the table' (got 'Find the chair')"
+        f"{saved}: expected the options of the saved run, max-gaussians '150000' (got '9'), policy 'task' (got "
+        "'uniform'), rate unset (got '4'), task 'Pick up the mug on the table' (got 'Find the chair')"
     )
     # an option that only one of them has counts as a difference, unless its value is false; resegment is no option now
     assert ResumeConfig({"Other": {"roi_ball": [], "resegment": False, "spool": None}}).differences() == ()
-    assert ResumeConfig({"Other": {"size": "1x2"}}).differences() == ("--size '1x2' (got unset)",)
+    assert ResumeConfig({"Other": {"size": "1x2"}}).differences() == ("size '1x2' (got unset)",)
 
 
 def test_a_mapper_that_is_too_small_is_refused(saved: Path) -> None:

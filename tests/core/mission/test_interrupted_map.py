@@ -23,8 +23,8 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 
 def mapped(sequence: Path, out: Path, *more: str) -> int:
     # without estimates, because these tests count which frames are read
-    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150"]
-    common += ["--register-depth", "none", "--pose-prior", "none"]
+    common = ["--set", "roi-ball=0,0,2,0.4", "--set", "threads=1", "--max-gaussians", "150"]
+    common += ["--set", "register-depth=none", "--set", "pose-prior=none"]
     return main(["map", str(sequence), *common, "--out", str(out), *more])
 
 
@@ -48,13 +48,13 @@ def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
 
     with monkeypatch.context() as patched:
         patched.setattr(SevenScenesSource, "frame", read_and_raise_signal)
-        assert mapped(sequence, tmp_path / "first", "--save-state", state) == code
+        assert mapped(sequence, tmp_path / "first", "--set", f"save-state={state}") == code
     last_line = capsys.readouterr().err.splitlines()[-1]
     kept = f"3 frames are mapped; map.ply, report.json and preview.png are in {tmp_path / 'first'}"
     assert last_line.endswith(f"ed: {kept}; continue with --resume {state}")
     report = json.loads((tmp_path / "first" / "report.json").read_text())
     assert (report["frames"], report["stopped_by"]) == (3, "interrupted")
-    assert mapped(sequence, tmp_path / "rest", "--resume", state) == 0
+    assert mapped(sequence, tmp_path / "rest", "--set", f"resume={state}") == 0
     assert (tmp_path / "rest" / "map.ply").read_bytes() == (tmp_path / "whole" / "map.ply").read_bytes()
 
 
@@ -89,8 +89,8 @@ def test_a_second_ctrl_c_interrupts_at_once() -> None:
 def test_a_resumed_run_without_new_frames_saves_its_state_again(tmp_path: Path) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen")
     first, second = tmp_path / "first.state", tmp_path / "second.state"
-    assert mapped(sequence, tmp_path / "out", "--save-state", str(first)) == 0
-    assert mapped(sequence, tmp_path / "again", "--resume", str(first), "--save-state", str(second)) == 0
+    assert mapped(sequence, tmp_path / "out", "--set", f"save-state={first}") == 0
+    assert mapped(sequence, tmp_path / "again", "--set", f"resume={first}", "--set", f"save-state={second}") == 0
     before, after = read_state(first), read_state(second)
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
@@ -102,6 +102,9 @@ def test_an_interrupt_during_the_calibration_leaves_no_folder(
     sequence = write_seven_scenes(tmp_path / "kitchen")
     monkeypatch.setattr(SevenScenesSource, "frame", lambda *_: signal.raise_signal(signal.SIGINT))
     out = tmp_path / "out"
-    assert main(["map", str(sequence), "--threads", "1", "--out", str(out), "--save-state", str(out / "state")]) == 130
+    assert (
+        main(["map", str(sequence), "--set", "threads=1", "--out", str(out), "--set", f"save-state={out / 'state'}"])
+        == 130
+    )
     assert capsys.readouterr().err.splitlines()[-1].startswith("gausslite: interrupted")
     assert not out.exists()

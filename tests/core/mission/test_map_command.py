@@ -22,7 +22,16 @@ FRAMES = tuple(range(0, 24, 4))
 
 
 def map_command(sequence: Path, out: Path, *more: str) -> int:
-    common = ["--threads", "1", "--max-gaussians", "150", "--register-depth", "none", "--pose-prior", "none"]
+    common = [
+        "--set",
+        "threads=1",
+        "--max-gaussians",
+        "150",
+        "--set",
+        "register-depth=none",
+        "--set",
+        "pose-prior=none",
+    ]
     return main(["map", str(sequence), *common, "--out", str(out), *more])
 
 
@@ -39,7 +48,7 @@ def corrupt(sequence: Path, position: int) -> Path:
 
 def test_an_existing_map_is_replaced_only_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence, out, state = write_seven_scenes(tmp_path / "kitchen", FRAMES), tmp_path / "out", tmp_path / "run.state"
-    assert map_command(sequence, out, "--frames", "0:12", "--save-state", str(state)) == 0
+    assert map_command(sequence, out, "--frames", "0:12", "--set", f"save-state={state}") == 0
     before = (out / "map.ply").read_bytes()
     capsys.readouterr()
     assert map_command(sequence, out) == 2
@@ -47,7 +56,7 @@ def test_an_existing_map_is_replaced_only_on_request(tmp_path: Path, capsys: pyt
     assert line.endswith("map.ply exists already; choose another --out, or replace it with --overwrite")
     assert (out / "map.ply").read_bytes() == before
     assert map_command(sequence, out, "--overwrite") == 0
-    assert map_command(sequence, out, "--resume", str(state)) == 0
+    assert map_command(sequence, out, "--set", f"resume={state}") == 0
     assert report_of(out)["frames"] == 3
 
 
@@ -86,7 +95,7 @@ def test_frames_without_depth_are_counted_apart_from_lost_ones() -> None:
 def test_with_strict_a_corrupt_frame_ends_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
     path = corrupt(sequence, 2)
-    assert map_command(sequence, tmp_path / "out", "--strict") == 2
+    assert map_command(sequence, tmp_path / "out", "--set", "strict=true") == 2
     assert path.name in capsys.readouterr().err.splitlines()[-1]
     report = report_of(tmp_path / "out")
     assert (report["frames"], report["frames_corrupt"]) == (2, 0)
@@ -115,7 +124,7 @@ def test_a_wrong_depth_unit_is_reported(
     camera = json.loads((sequence / "cam_params.json").read_text())
     camera["camera"]["scale"] = scale
     (sequence / "cam_params.json").write_text(json.dumps(camera))
-    assert map_command(sequence, tmp_path / "out", "--camera-correction", "none") == code
+    assert map_command(sequence, tmp_path / "out", "--set", "camera-correction=none") == code
     printed = capsys.readouterr()
     assert message in printed.out + printed.err
     assert "check the depth unit, `scale` in cam_params.json" in printed.out + printed.err
@@ -125,7 +134,7 @@ def test_a_wrong_depth_unit_is_reported(
 def test_a_map_is_written_although_its_state_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence, state = write_seven_scenes(tmp_path / "kitchen", FRAMES), tmp_path / "run.state"
     os.mkfifo(state)
-    assert map_command(sequence, tmp_path / "out", "--save-state", str(state)) == 2
+    assert map_command(sequence, tmp_path / "out", "--set", f"save-state={state}") == 2
     assert "run.state: expected a regular file or none" in capsys.readouterr().err
     assert report_of(tmp_path / "out")["frames"] == 6
     assert (tmp_path / "out" / "map.ply").exists()
@@ -136,7 +145,7 @@ def test_without_task_and_region_mapping_is_uniform(tmp_path: Path, capsys: pyte
     assert map_command(sequence, tmp_path / "out") == 0
     assert "mapping everything equally (--policy uniform)" in capsys.readouterr().err
     assert report_of(tmp_path / "out")["policy"] == "uniform"
-    assert map_command(sequence, tmp_path / "region", "--roi-ball", "0,0,2,0.4") == 0
+    assert map_command(sequence, tmp_path / "region", "--set", "roi-ball=0,0,2,0.4") == 0
     assert report_of(tmp_path / "region")["policy"] == "task"
 
 

@@ -20,13 +20,22 @@ FRAMES = tuple(range(0, 24, 4))
 
 
 def map_command(sequence: Path | str, out: Path | str, *more: str) -> int:
-    common = ["--threads", "1", "--max-gaussians", "150", "--register-depth", "none", "--pose-prior", "none"]
+    common = [
+        "--set",
+        "threads=1",
+        "--max-gaussians",
+        "150",
+        "--set",
+        "register-depth=none",
+        "--set",
+        "pose-prior=none",
+    ]
     return main(["map", str(sequence), *common, "--out", str(out), *more])
 
 
 def test_a_map_names_the_folder_or_the_given_world_frame(tmp_path: Path) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
-    for name, more in (("kitchen", ()), ("lab", ("--world-frame", "lab")), ("", ("--world-frame", ""))):
+    for name, more in (("kitchen", ()), ("lab", ("--set", "world-frame=lab")), ("", ("--set", "world-frame="))):
         assert map_command(sequence, tmp_path / "out", "--overwrite", *more) == 0
         assert read_world_frame(tmp_path / "out" / "map.ply") == name
 
@@ -62,7 +71,7 @@ def test_save_ply_names_the_world_frame(tmp_path: Path) -> None:
 
 def test_negative_first_coordinates_are_values(tmp_path: Path) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
-    assert map_command(sequence, tmp_path / "out", "--roi-ball", "-.1,-2e-1,2,0.4", "--up", "-1,0,0") == 0
+    assert map_command(sequence, tmp_path / "out", "--set", "roi-ball=-.1,-2e-1,2,0.4", "--set", "up=-1,0,0") == 0
 
 
 def test_a_missing_file_of_regions_is_not_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,10 +90,13 @@ def test_a_corrupt_first_frame_is_skipped(tmp_path: Path, capsys: pytest.Capture
         out = tmp_path / f"out-{folder.name}"
         assert map_command(folder, out) == 0
         assert "1 corrupt" in capsys.readouterr().out
-        assert map_command(folder, tmp_path / "strict", "--strict") == 2
+        assert map_command(folder, tmp_path / "strict", "--set", "strict=true") == 2
         assert path.name in capsys.readouterr().err
     find_registration(open_source(str(kitchen)))
-    assert main(["map", str(kitchen), "--threads", "1", "--max-gaussians", "150", "--out", str(tmp_path / "auto")]) == 0
+    assert (
+        main(["map", str(kitchen), "--set", "threads=1", "--max-gaussians", "150", "--out", str(tmp_path / "auto")])
+        == 0
+    )
 
 
 def test_eval_skips_and_counts_corrupt_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,7 +104,7 @@ def test_eval_skips_and_counts_corrupt_frames(tmp_path: Path, capsys: pytest.Cap
     assert map_command(sequence, out) == 0
     (sequence / "frame-000008.color.png").write_bytes(b"not an image")
     capsys.readouterr()
-    command = ["eval", str(out / "map.ply"), str(sequence), "--threads", "1"]
+    command = ["eval", str(out / "map.ply"), str(sequence), "--set", "threads=1"]
     assert main(command) == 0
     printed = capsys.readouterr()
     assert "(skipped: 1 corrupt)" in printed.out

@@ -12,34 +12,45 @@ from gausslite.cli.main import main
 
 
 def map_command(folder: Path, out: Path, *more: str) -> list[str]:
-    common = ["--roi-ball", "0,0,2,0.4", "--threads", "1", "--max-gaussians", "150", "--register-depth", "none"]
+    common = [
+        "--set",
+        "roi-ball=0,0,2,0.4",
+        "--set",
+        "threads=1",
+        "--max-gaussians",
+        "150",
+        "--set",
+        "register-depth=none",
+    ]
     return ["map", str(folder), *common, "--out", str(out), *more]
 
 
 def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen")
     state = str(tmp_path / "run.state")
-    assert main(map_command(sequence, tmp_path / "out", "--save-state", state)) == 0
+    assert main(map_command(sequence, tmp_path / "out", "--set", f"save-state={state}")) == 0
     capsys.readouterr()
     for options, difference in (
-        (("--max-gaussians", "149"), "--max-gaussians '150' (got '149')"),
-        (("--size", "32x24"), "--size '"),
-        (("--rate", "5"), "--rate unset (got '5')"),
-        (("--policy", "uniform"), "--policy 'task' (got 'uniform')"),
-        (("--roi-ball", "0,0,1,0.4"), "--roi-ball '0,0,2,0.4' (got '0,0,2,0.4,0,0,1,0.4')"),
-        (("--register-depth", "20,20,7.5,5.5"), "--register-depth unset (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
-        (("--up", "0,-1,0"), "--up unset (got '0,-1,0')"),
+        (("--max-gaussians", "149"), "max-gaussians '150' (got '149')"),
+        (("--size", "32x24"), "size '"),
+        (("--rate", "5"), "rate unset (got '5')"),
+        (("--policy", "uniform"), "policy 'task' (got 'uniform')"),
+        (("--set", "roi-ball=0,0,1,0.4"), "roi-ball '0,0,2,0.4' (got '0,0,2,0.4,0,0,1,0.4')"),
+        (("--set", "register-depth=20,20,7.5,5.5"), "register-depth unset (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
+        (("--set", "up=0,-1,0"), "up unset (got '0,-1,0')"),
     ):
-        assert main(map_command(sequence, tmp_path / "other", *options, "--resume", state)) == 2
+        assert main(map_command(sequence, tmp_path / "other", *options, "--set", f"resume={state}")) == 2
         [line] = capsys.readouterr().err.splitlines()
         assert difference in line
     assert not (tmp_path / "other").exists()
-    more = ("--resume", state, "--task", "Find the mug")
+    more = ("--set", f"resume={state}", "--task", "Find the mug")
     for options, difference in (
-        ((), "--task unset (got 'Find the mug')"),
-        (("--detector", "yolo.onnx", "--segmenter", "depth"), "--segmenter unset (got 'depth'), "),
+        ((), "task unset (got 'Find the mug')"),
+        (("--detector", "yolo.onnx", "--set", "segmenter=depth"), "segmenter unset (got 'depth'), "),
     ):
-        assert main(["map", str(sequence), "--threads", "1", "--out", str(tmp_path / "other"), *options, *more]) == 2
+        assert (
+            main(["map", str(sequence), "--set", "threads=1", "--out", str(tmp_path / "other"), *options, *more]) == 2
+        )
         assert difference in capsys.readouterr().err
 
 
@@ -53,8 +64,8 @@ def test_a_resumed_run_continues_after_the_last_frame(tmp_path: Path, capsys: py
 
     state = str(tmp_path / "states" / "run.state")
     whole, report = map_frames("whole")
-    map_frames("first", "--frames", "0:12", "--save-state", state)
-    resumed, rest = map_frames("rest", "--resume", state)
+    map_frames("first", "--frames", "0:12", "--set", f"save-state={state}")
+    resumed, rest = map_frames("rest", "--set", f"resume={state}")
     assert resumed == whole
     assert (report["frames"], rest["frames"], rest["resumed_from"]) == (6, 3, state)
     memory = report["memory_mib"]
@@ -70,17 +81,17 @@ def test_registration_and_prior_of_the_saved_run_are_not_estimated_again(
 ) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
     state = str(tmp_path / "run.state")
-    found = ["--register-depth", "20,20,7.5,5.5,-0.01,0,0,0,0,0", "--pose-prior", "0.01,0.5,0.1,0.03"]
-    first = map_command(sequence, tmp_path / "first", "--frames", "0:12", "--save-state", state, *found)
+    found = ["--set", "register-depth=20,20,7.5,5.5,-0.01,0,0,0,0,0", "--set", "pose-prior=0.01,0.5,0.1,0.03"]
+    first = map_command(sequence, tmp_path / "first", "--frames", "0:12", "--set", f"save-state={state}", *found)
     assert main(first) == 0
     capsys.readouterr()
-    rest = map_command(sequence, tmp_path / "rest", "--resume", state, "--register-depth", "auto")
+    rest = map_command(sequence, tmp_path / "rest", "--set", f"resume={state}", "--set", "register-depth=auto")
     assert main(rest) == 0
-    assert "--register-depth" not in capsys.readouterr().err
+    assert "register-depth" not in capsys.readouterr().err
     report = json.loads((tmp_path / "rest" / "report.json").read_text())
     assert (report["frames"], report["colour_camera"], report["view_error"]) == (3, found[1], found[3])
-    assert main([*rest, "--pose-prior", "none"]) == 2
-    assert "--pose-prior '0.01,0.5,0.1,0.03' (got '0,0,0,0')" in capsys.readouterr().err
+    assert main([*rest, "--set", "pose-prior=none"]) == 2
+    assert "pose-prior '0.01,0.5,0.1,0.03' (got '0,0,0,0')" in capsys.readouterr().err
 
 
 def test_a_state_of_another_sequence_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -90,27 +101,27 @@ def test_a_state_of_another_sequence_is_refused(tmp_path: Path, capsys: pytest.C
         write_seven_scenes(tmp_path / "office", numbers),
     )
     state = str(tmp_path / "run.state")
-    assert main(map_command(kitchen, tmp_path / "first", "--frames", "0:12", "--save-state", state)) == 0
+    assert main(map_command(kitchen, tmp_path / "first", "--frames", "0:12", "--set", f"save-state={state}")) == 0
     capsys.readouterr()
-    assert main(map_command(office, tmp_path / "rest", "--resume", state)) == 2
+    assert main(map_command(office, tmp_path / "rest", "--set", f"resume={state}")) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert "SOURCE 'kitchen' (got 'office')" in line
     assert not (tmp_path / "rest").exists()
     moved = kitchen.rename(tmp_path / "first" / "kitchen")
-    assert main(map_command(moved, tmp_path / "rest", "--resume", state)) == 0
+    assert main(map_command(moved, tmp_path / "rest", "--set", f"resume={state}")) == 0
 
 
 def test_another_step_of_frames_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kitchen, state = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4))), str(tmp_path / "run.state")
-    assert main(map_command(kitchen, tmp_path / "first", "--frames", "0:12:4", "--save-state", state)) == 0
-    assert main(map_command(kitchen, tmp_path / "same", "--frames", "::4", "--resume", state)) == 0
+    assert main(map_command(kitchen, tmp_path / "first", "--frames", "0:12:4", "--set", f"save-state={state}")) == 0
+    assert main(map_command(kitchen, tmp_path / "same", "--frames", "::4", "--set", f"resume={state}")) == 0
     assert "--frames:" not in capsys.readouterr().err
-    assert main(map_command(kitchen, tmp_path / "other", "--frames", "::8", "--resume", state)) == 0
+    assert main(map_command(kitchen, tmp_path / "other", "--frames", "::8", "--set", f"resume={state}")) == 0
     assert "--frames: the saved run has a step of 4 frames, this one of 8" in capsys.readouterr().err
 
 
 def test_a_resumed_run_without_new_frames_states_the_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kitchen, state = write_seven_scenes(tmp_path / "kitchen"), str(tmp_path / "run.state")
-    assert main(map_command(kitchen, tmp_path / "first", "--save-state", state)) == 0
-    assert main(map_command(kitchen, tmp_path / "rest", "--resume", state)) == 0
+    assert main(map_command(kitchen, tmp_path / "first", "--set", f"save-state={state}")) == 0
+    assert main(map_command(kitchen, tmp_path / "rest", "--set", f"resume={state}")) == 0
     assert "no selected frame comes after frame 8, the last one of the resumed run" in capsys.readouterr().out

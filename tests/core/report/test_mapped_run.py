@@ -24,8 +24,28 @@ def kitchen(tmp_path: Path) -> Path:
 
 
 def map_region(sequence: Path, out: Path, *more: str) -> None:
-    common = ["--threads", "1", "--max-gaussians", "150", "--register-depth", "none", "--pose-prior", "none"]
-    command = ["map", str(sequence), *common, "--roi-ball", "0,0,2,0.4", "--test-every", "5", "--out", str(out), *more]
+    common = [
+        "--set",
+        "threads=1",
+        "--max-gaussians",
+        "150",
+        "--set",
+        "register-depth=none",
+        "--set",
+        "pose-prior=none",
+    ]
+    command = [
+        "map",
+        str(sequence),
+        *common,
+        "--set",
+        "roi-ball=0,0,2,0.4",
+        "--test-every",
+        "5",
+        "--out",
+        str(out),
+        *more,
+    ]
     assert main(command) == 0
 
 
@@ -55,7 +75,7 @@ def test_saved_scores_are_in_the_report_until_the_map_is_replaced(
     assert main(["report", str(out)]) == 0
     assert "The maps were not scored" in (out / "report.html").read_text(encoding="utf-8")
     capsys.readouterr()
-    score = ["eval", str(out / "map.ply"), str(kitchen), "--threads", "1", "--save-scores"]
+    score = ["eval", str(out / "map.ply"), str(kitchen), "--set", "threads=1", "--save-scores"]
     assert main([*score, "--test-every", "5", "--json"]) == 0
     scores = json.loads(capsys.readouterr().out)
     views = {"source": str(kitchen), "frames": ":", "test_every": 5}

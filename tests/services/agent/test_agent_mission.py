@@ -87,7 +87,7 @@ class Wall:
 
 def settings(out: Path | None, *more: str) -> AgentSettings:
     options = ["--agent-id", "robot", "--task", "Pick up the mug", "--max-gaussians", "2000", "--iterations", "2"]
-    options += ["--source", "wall", "--threads", "1", *more]
+    options += ["--source", "wall", "--set", "threads=1", *more]
     return parse_arguments([*options, "--out", str(out)] if out is not None else options)
 
 
@@ -141,7 +141,7 @@ def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: 
 
 
 def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None:
-    options = settings(tmp_path, "--handover", "--fusion", "localhost:1")
+    options = settings(tmp_path, "--set", "handover=true", "--fusion", "localhost:1")
     with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         [agent] = fusion.client.status().agents
@@ -158,7 +158,7 @@ def test_handover_brings_the_whole_map_and_the_keyframes(tmp_path: Path) -> None
 
 
 def test_without_a_fusion_server_nothing_is_sent(tmp_path: Path) -> None:
-    options = settings(tmp_path, "--test-every", "4", "--frames", "0:6")
+    options = settings(tmp_path, "--set", "test-every=4", "--frames", "0:6")
     wall = Wall()
     with agent_mission(options) as (mission, _):
         mission.run(stream_of(wall, options))
@@ -203,27 +203,30 @@ def test_errors_of_task_source_and_disk_are_raised(tmp_path: Path) -> None:
         (["--source", "sim:home?trajectory=9", "--task", "Pick up the mug"], "trajectory"),
         (["--source", "sim:home", "--task", "Pick up the mug", "--frames", "500:"], "500:"),
         (["--source", "sim:home", "--task", "Pick up the mug", "--size", "big"], "size"),
-        (["--source", "sim:home", "--task", "Pick up the mug", "--test-every", "1"], "test every"),
-        (["--threads", "0"], "threads"),
+        (
+            ["--source", "sim:home", "--task", "Pick up the mug", "--set", "test-every=1"],
+            "test-every: expected at least 2",
+        ),
+        (["--set", "threads=0"], "threads"),
         (["--task", "Pick up the mug"], "name an ONNX file with --detector"),
         (["--max-gaussians", "0"], "--max-gaussians: expected at least 1"),
         (["--agent-id", ""], "--agent-id"),
         (["--agent-id", "husky-\udcff"], "--agent-id: expected 1 to 64 letters, digits"),
         (["--mission", "x" * 256], "--mission: expected 1 to 64 letters, digits"),
-        (["--world-frame", "\udcff"], "--world-frame: expected UTF-8 text"),
-        (["--voxel-size", "nan"], "voxel"),
+        (["--set", "world-frame=\udcff"], "world-frame: expected UTF-8 text"),
+        (["--set", "voxel-size=nan"], "voxel"),
         (["--rate", "-1"], "rate"),
         (["--listen", "nowhere"], "HOST:PORT"),
         (["--out", "/dev/null/x"], "/dev/null/x"),
-        (["--uplink-kbps", "0"], "kbps"),
-        (["--drain-timeout", "nan"], "--drain-timeout"),
+        (["--set", "uplink-kbps=0"], "kbps"),
+        (["--set", "drain-timeout=nan"], "drain-timeout"),
         (["--fusion", ""], "--fusion: expected HOST:PORT or unix:PATH"),
         (["--fusion", "10.0.0.7"], "--fusion: expected HOST:PORT or unix:PATH"),
         (["--parser", "localhost:http"], "--parser: expected HOST:PORT or unix:PATH"),
         (["--parser", "localhost:0"], "--parser: expected the port that the service listens on"),
-        (["--up", "0,0,0"], "up axis"),
+        (["--set", "up=0,0,0"], "up axis"),
         (["--task", "!"], "task text"),
-        (["--seed", "-1"], "seed"),
+        (["--set", "seed=-1"], "seed"),
         (["--max-gaussians", "3000000000000"], "max_gaussians"),
         (["--detector", __file__], "expected a readable ONNX model"),
         (["--detector", "/nowhere.onnx"], "/nowhere.onnx"),
@@ -255,7 +258,7 @@ def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> No
 def test_received_frames_give_a_map_and_a_report_on_sigterm(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 30, 30, 0, 0.9)])
     address, out = f"unix:{tmp_path}/agent.sock", tmp_path / "out"
-    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--threads", "1"]
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(out), "--set", "threads=1"]
     command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as p:
         assert p.stderr is not None
@@ -293,7 +296,7 @@ def test_a_corrupt_frame_is_skipped_and_counted(tmp_path: Path, caplog: pytest.L
 
 
 def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_written(tmp_path: Path) -> None:
-    options = settings(tmp_path, "--strict")
+    options = settings(tmp_path, "--set", "strict=true")
     with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
         with pytest.raises(DatasetError, match="frame-3"):
             mission.run(stream_of(Wall(broken_at=3), options))
@@ -305,7 +308,7 @@ def test_with_strict_a_corrupt_frame_ends_the_mission_after_its_map_is_sent_and_
 
 
 def test_a_corrupt_first_frame_overwrites_nothing_with_strict(tmp_path: Path) -> None:
-    options = settings(tmp_path, "--strict")
+    options = settings(tmp_path, "--set", "strict=true")
     (tmp_path / "map.ply").write_text("of an earlier mission")
     with agent_mission(options) as (mission, _), pytest.raises(DatasetError, match="frame-0"):
         mission.run(stream_of(Wall(broken_at=0), options))

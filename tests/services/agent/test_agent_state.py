@@ -40,7 +40,7 @@ MUG, TASK, LATER = BallRegion((0.0, 0.0, 1.2), 0.2), "Pick up the mug", "Find th
 
 def settings(state: Path, *more: str) -> AgentSettings:
     options = ["--agent-id", "robot", "--task", TASK, "--max-gaussians", "2000", "--iterations", "2"]
-    return parse_arguments([*options, "--threads", "1", "--state", str(state), *more])
+    return parse_arguments([*options, "--set", "threads=1", "--state", str(state), *more])
 
 
 @contextmanager
@@ -221,7 +221,7 @@ def test_the_state_of_another_agent_or_program_is_refused(tmp_path: Path) -> Non
         mission.finish()
     state = read_state(tmp_path / "robot.state")
     other = options.mission, AgentIdentity("other", 0.2)
-    with pytest.raises(MismatchError, match=r"--agent-id 'robot' \(got 'other'\), --voxel-size '0.1' \(got '0.2'\)"):
+    with pytest.raises(MismatchError, match=r"agent-id 'robot' \(got 'other'\), voxel-size '0.1' \(got '0.2'\)"):
         SavedMission.read(tmp_path / "robot.state", *other)
     for name, data in (("graph", b"\xff\xff"), ("graph", b""), ("requested_task", b"\xff")):
         write_state(tmp_path / "bad.state", {**state, f"extra/{name}": np.frombuffer(data, np.uint8)})
@@ -237,7 +237,7 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
     (tmp_path / "notes").write_text("remember the milk")
     listen = ["--listen", "127.0.0.1:0", "--agent-id", "robot", "--iterations", "2"]
     for arguments, expected in (
-        (["--state", str(tmp_path / "robot.state")], "--max-gaussians '2000' (got '150000')"),
+        (["--state", str(tmp_path / "robot.state")], "max-gaussians '2000' (got '150000')"),
         (["--state", str(tmp_path / "notes")], "notes: expected the file of a saved run"),
         (["--state", str(tmp_path)], "expected the name of a file, got a folder"),
         (["--state", "/dev/null/x"], "/dev/null"),
@@ -250,9 +250,19 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
 def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
     address, store = f"unix:{tmp_path}/agent.sock", MemoryStore()
-    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--out", str(tmp_path), "--threads", "1"]
+    command = [
+        sys.executable,
+        "-m",
+        "gausslite_agent",
+        "--listen",
+        address,
+        "--out",
+        str(tmp_path),
+        "--set",
+        "threads=1",
+    ]
     command += ["--detector", str(model), "--task", "Pick up the cup", "--max-gaussians", "2000", "--iterations", "1"]
-    command += ["--state", str(tmp_path / "a.state"), "--spool", str(tmp_path / "a.spool"), "--agent-id", "robot"]
+    command += ["--state", str(tmp_path / "a.state"), "--set", f"spool={tmp_path / 'a.spool'}", "--agent-id", "robot"]
     kappas, revisions = [], []
     with fusion_server(store) as fusion:
         for indices in (range(3), range(3, 6)):

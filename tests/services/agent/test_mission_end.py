@@ -122,8 +122,18 @@ def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subpr
     """Start an agent whose detector finds a cup in every frame."""
     model = write_tiny_yolo(folder / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
     address = f"unix:{folder}/agent.sock"
-    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--threads", "1", "--agent-id", "robot"]
-    command += ["--detector", str(model), "--max-gaussians", "2000", "--iterations", "1", "--queue", "100"]
+    command = [
+        sys.executable,
+        "-m",
+        "gausslite_agent",
+        "--listen",
+        address,
+        "--set",
+        "threads=1",
+        "--agent-id",
+        "robot",
+    ]
+    command += ["--detector", str(model), "--max-gaussians", "2000", "--iterations", "1", "--set", "queue=100"]
     command += ["--fusion", fusion, *more]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
@@ -136,7 +146,16 @@ def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subpr
 
 
 def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
-    options = ("--handover", "--grace-period", "60", "--uplink-interval", "0", "--out", str(tmp_path))
+    options = (
+        "--set",
+        "handover=true",
+        "--set",
+        "grace-period=60",
+        "--set",
+        "uplink-interval=0",
+        "--out",
+        str(tmp_path),
+    )
     with fusion_server() as fusion:
         with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
             client.assign_task("Pick up the cup")
@@ -154,8 +173,8 @@ def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
 
 
 def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> None:
-    options = ("--spool", str(tmp_path / "x.spool"), "--state", str(tmp_path / "x.state"), "--handover")
-    with agent_process(tmp_path, "127.0.0.1:1", *options, "--grace-period", "0.1") as (process, client):
+    options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(tmp_path / "x.state"), "--set", "handover=true")
+    with agent_process(tmp_path, "127.0.0.1:1", *options, "--set", "grace-period=0.1") as (process, client):
         client.assign_task("Pick up the cup")
         list(client.ingest([red_frame(index) for index in range(6)]))
         process.send_signal(signal.SIGTERM)
@@ -174,7 +193,7 @@ def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> Non
 
 
 def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> None:
-    with agent_process(tmp_path, "127.0.0.1:1", "--grace-period", "0.1") as (process, client):
+    with agent_process(tmp_path, "127.0.0.1:1", "--set", "grace-period=0.1") as (process, client):
         client.assign_task("Pick up the cup")
         list(client.ingest([red_frame(index) for index in range(6)]))
         process.send_signal(signal.SIGTERM)
@@ -187,7 +206,7 @@ def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> 
 
 def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:
     state = tmp_path / "x.state"
-    options = ("--spool", str(tmp_path / "x.spool"), "--state", str(state), "--save-interval", "0.05")
+    options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(state), "--set", "save-interval=0.05")
     with fusion_server() as fusion:
         with agent_process(tmp_path, fusion.client.address, *options) as (process, client):
             client.assign_task("Pick up the cup")
@@ -213,7 +232,7 @@ def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:
 
 def test_an_agent_without_a_detector_says_so_at_the_start_and_to_assign_task(tmp_path: Path) -> None:
     address = f"unix:{tmp_path}/agent.sock"
-    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--threads", "1"]
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--set", "threads=1"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         lines = [process.stderr.readline() for _ in range(2)]

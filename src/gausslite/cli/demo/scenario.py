@@ -66,9 +66,9 @@ class Scenario:
 def simulated_scenario(options: argparse.Namespace) -> Scenario:
     """Return two trajectories through one home; the held-out views are of a third one. Raises InvalidInputError."""
     if options.register_depth is not None:
-        raise InvalidInputError("--register-depth: expected a recorded sequence, --source SOURCE; got none")
+        raise InvalidInputError("register-depth: expected a recorded sequence, --source SOURCE; got none")
     if options.camera_correction is not None:
-        raise InvalidInputError("--camera-correction: expected a recorded sequence, --source SOURCE; got none")
+        raise InvalidInputError("camera-correction: expected a recorded sequence, --source SOURCE; got none")
     specs = [
         _HOME.format(seed=options.seed, trajectory=number, frames=_HOME_VIEWS if number == 2 else _HOME_FRAMES)
         for number in range(3)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
-from gausslite.config.environment import without_options
+from gausslite.config.program import without_options
 from gausslite.domain.errors import UnavailableError
 
 _TERMINATION_TIMEOUT_S = 10.0

@@ -15,7 +15,7 @@ from gausslite.cli.demo.scenario import AgentPlan
 from gausslite.cli.demo.service_processes import ProcessGroup, ServiceProcess
 from gausslite.cli.progress import MappingBar, progress_bar
 from gausslite.codec.files import write_atomic
-from gausslite.config.toml_text import OptionValue, to_toml
+from gausslite.config.plain_values import Plain, to_toml
 from gausslite.domain.errors import UnavailableError
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
 
@@ -30,7 +30,7 @@ class DemoPlan:
     """The agents' missions, and the options that all agents share."""
 
     agents: tuple[AgentPlan, ...]
-    agent_options: Mapping[str, OptionValue]
+    agent_options: Mapping[str, Plain]
     voxel_size_m: float
     refine_iterations: int
     seed: int
@@ -59,7 +59,7 @@ def running_services(plan: DemoPlan, out: Path) -> Iterator[RunningServices]:
     # Unix sockets cannot collide with ports in use
     with tempfile.TemporaryDirectory(prefix="gausslite-") as sockets, ProcessGroup(out / "logs") as group:
 
-        def start(name: str, module: str, options: Mapping[str, OptionValue]) -> RunningService:
+        def start(name: str, module: str, options: Mapping[str, Plain]) -> RunningService:
             address = f"unix:{sockets}/{name}.sock"
             path = out / name / "config.toml"
             write_atomic(path, to_toml({"listen": address, **options}).encode())
@@ -68,9 +68,9 @@ def running_services(plan: DemoPlan, out: Path) -> Iterator[RunningServices]:
         for name in ("parser", "fusion-server", *(agent.agent_id for agent in plan.agents)):
             (out / name).mkdir(exist_ok=True)
         parser = start("parser", "gausslite_parser", {})
-        store: dict[str, OptionValue] = {"store": str(out / STORE), "voxel-size": plan.voxel_size_m}
+        store: dict[str, Plain] = {"store": str(out / STORE), "voxel-size": plan.voxel_size_m}
         fusion = start("fusion-server", "gausslite_fusion_server", store)
-        links: dict[str, OptionValue] = {"parser": parser.address, "fusion": fusion.address, "handover": True}
+        links: dict[str, Plain] = {"parser": parser.address, "fusion": fusion.address, "handover": True}
         agents = {
             agent.agent_id: start(agent.agent_id, "gausslite_agent", {**links, **_agent_options(plan, agent, out)})
             for agent in plan.agents
@@ -134,7 +134,7 @@ def _failure_from_log(service: ServiceProcess) -> Iterator[None]:
         raise
 
 
-def _agent_options(plan: DemoPlan, agent: AgentPlan, out: Path) -> dict[str, OptionValue]:
+def _agent_options(plan: DemoPlan, agent: AgentPlan, out: Path) -> dict[str, Plain]:
     return {
         "agent-id": agent.agent_id,
         "source": agent.source,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import gausslite
 from gausslite.cli.doctor.check import Check, Status
-from gausslite.config.default_addresses import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
+from gausslite.wire.address import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
 
 _GIB = 1 << 30
 _MEMORY_LOW_BYTES, _MEMORY_TOO_LOW_BYTES = 2 * _GIB, _GIB // 2

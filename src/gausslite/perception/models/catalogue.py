@@ -30,7 +30,7 @@ CATALOGUE: Final = (
         export=_TRANSFORMERS + "tools/export_model.py grounding-dino IDEA-Research/grounding-dino-tiny models",
     ),
     ModelEntry(
-        "bert-vocabulary", "vocab.txt", "--vocabulary: the vocabulary of grounding-dino", "Apache-2.0",
+        "bert-vocabulary", "vocab.txt", "vocabulary: the vocabulary of grounding-dino", "Apache-2.0",
         project="BERT, Google Research",
         export=_TRANSFORMERS + "tools/export_model.py grounding-dino IDEA-Research/grounding-dino-tiny models",
     ),
@@ -85,7 +85,7 @@ yolo export model=yolov8s-worldv2-classes.pt format=onnx""",
         export="copy lvis_v1_clip_a+cname.npy and lvis_v1_train_cat_info.json from that folder",
     ),
     ModelEntry(
-        "fastsam", "FastSAM-s.onnx", "--segmenter: masks of everything", "AGPL-3.0",
+        "fastsam", "FastSAM-s.onnx", "segmenter: masks of everything", "AGPL-3.0",
         project="FastSAM, CASIA, in Ultralytics",
         export=_ULTRALYTICS + "yolo export model=FastSAM-s.pt format=onnx",
     ),
