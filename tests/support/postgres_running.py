@@ -7,15 +7,25 @@ import os
 import signal
 import subprocess
 import tempfile
+import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 PASSWORD = "kept-secret"
+
+
+@dataclass(frozen=True)
+class Standby:
+    """Another server with a copy. socket_folder: its host in an address. promote: let it take over."""
+
+    socket_folder: Path
+    promote: Callable[[], None]
 
 
 class PostgresServer:
@@ -44,6 +54,41 @@ class PostgresServer:
     def start(self) -> None:
         """Start the server again, on the same data."""
         self._server.ensure_postgres_running()
+
+    @contextmanager
+    def standby(self, is_synchronous: bool) -> Iterator[Standby]:
+        """Run a standby with the content as it is now; it follows this server synchronously, or not at all."""
+        import psycopg
+
+        own = self._server
+        data = own.pgdata.parent / "standby"
+        follow = ["--write-recovery-conf"] if is_synchronous else []
+        self._run("pg_basebackup", "-h", self._socket_folder, "-U", "postgres", "-D", data, "-c", "fast", *follow)
+        # the lock of the first server's socket is part of the copy
+        (data / ".s.PGSQL.5432.lock").unlink(missing_ok=True)
+        (data / "standby.signal").touch()
+        self._run("pg_ctl", "-D", data, "-l", data / "log", "-o", f'-h "" -k {data}', "-w", "start")
+        try:
+            if is_synchronous:
+                with psycopg.connect(own.get_uri(), autocommit=True) as db:
+                    db.execute("ALTER SYSTEM SET synchronous_standby_names = '*'")
+                    db.execute("SELECT pg_reload_conf()")
+                    while db.execute("SELECT sync_state FROM pg_stat_replication").fetchone() != ("sync",):
+                        time.sleep(0.02)
+            yield Standby(data, lambda: self._run("pg_ctl", "-D", data, "-w", "promote"))
+        finally:
+            self._run("pg_ctl", "-D", data, "-m", "immediate", "-w", "stop")
+
+    def _run(self, program: str, *arguments: str | Path) -> None:
+        own = self._server
+        # its output is inherited by the server that it starts
+        subprocess.run(
+            [own.bin_path / program, *arguments],
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            user=own.system_user,
+        )
 
 
 @contextmanager

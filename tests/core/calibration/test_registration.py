@@ -77,7 +77,8 @@ class EnlargedSource:
         self.camera = k.resized(4 * k.width_px, 4 * k.height_px)
         self.name, self.up_axis, self.depth_registered = "enlarged", small.up_axis, False
         self.excluded_frames = ""
-        self.lens = None
+        self.camera_ideal = self.poses_exact = False
+        self.lens, self.world_frame, self.regions_file = None, self.name, None
 
     def __len__(self) -> int:
         return len(self._small)
@@ -122,7 +123,8 @@ class UnregisteredSource:
         self.name, self.camera, self.up_axis = "unregistered", DEPTH_CAMERA, self._home.up_axis
         self.depth_registered = False
         self.excluded_frames = ""
-        self.lens = None
+        self.camera_ideal = self.poses_exact = False
+        self.lens, self.world_frame, self.regions_file = None, self.name, None
         self.damaged: int | None = None
 
     def __len__(self) -> int:

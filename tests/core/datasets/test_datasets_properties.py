@@ -29,6 +29,8 @@ class Numbered:
     camera = Camera(1.0, 1.0, 1.0, 1.0, 2, 2)
     up_axis = (0.0, 0.0, 1.0)
     depth_registered = True
+    camera_ideal = poses_exact = True
+    world_frame, regions_file = "numbered", None
     excluded_frames = ""
     lens = None
 

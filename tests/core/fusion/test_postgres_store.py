@@ -7,7 +7,7 @@ from collections.abc import Callable
 from threading import Thread
 
 import pytest
-from support.postgres_running import PASSWORD, PostgresServer
+from support.postgres_running import PASSWORD, PostgresServer, postgres_server
 from test_fusion_stores import make_subset
 
 from gausslite.domain.errors import InvalidInputError, StorageError
@@ -108,6 +108,31 @@ def test_a_killed_database_loses_nothing_acknowledged(postgres: PostgresServer) 
     assert {1000 + update_seq for update_seq in acknowledged} <= set(again.batch("ant").keys.tolist())
     assert again.totals("ant").highest_update_seq >= acknowledged[-1]
     again.close()
+
+
+@pytest.mark.parametrize("is_synchronous", [True, False])
+def test_a_standby_that_takes_over_is_used_only_if_it_has_all_commits(is_synchronous: bool) -> None:
+    with postgres_server() as primary:
+        url = primary.new_database()
+        PostgresStore(url).close()
+        with primary.standby(is_synchronous) as standby:
+            url = f"{url},{standby.socket_folder}&target_session_attrs=read-write"
+            store = PostgresStore(url)
+            store.put(make_subset("ant", 1, {11: 2}))
+            incarnation_id = store.incarnation_id
+            primary.kill()
+            standby.promote()
+            if is_synchronous:
+                store.put(make_subset("ant", 2, {22: 3}))
+                assert store.batch("ant").counts.tolist() == [2, 3]
+            else:
+                assert "acknowledged data is missing" in one_line(lambda: store.put(make_subset("ant", 2, {22: 3})))
+            store.close()
+            again = PostgresStore(url)
+            assert again.batch("ant").counts.tolist() == ([2, 3] if is_synchronous else [])
+            # so that agents compare digests
+            assert again.incarnation_id != incarnation_id
+            again.close()
 
 
 def test_a_refused_message_changes_nothing_and_later_ones_are_stored(postgres: PostgresServer) -> None:

@@ -57,6 +57,10 @@ class Wall:
     name: str = "wall"
     up_axis: tuple[float, float, float] = (0.0, -1.0, 0.0)
     depth_registered: bool = True
+    camera_ideal: bool = True
+    poses_exact: bool = True
+    world_frame: str = "wall"
+    regions_file: None = None
     excluded_frames: str = ""
     lens: None = None
     camera: Camera = CAMERA
