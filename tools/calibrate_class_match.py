@@ -12,8 +12,8 @@ import json
 import sys
 from pathlib import Path
 
-from gausslite.domain.object_names import head_of, normalised_noun, synonyms
-from gausslite.perception.models.model_file import open_model
+from gausslite.domain.objects import head_of, normalised_noun, synonyms
+from gausslite.perception.model_file import open_model
 from gausslite.perception.text_features import TextEmbeddings
 from gausslite.perception.yolo import load_yolo
 

@@ -11,28 +11,30 @@ from collections.abc import Iterator
 import numpy as np
 from google.protobuf.message import Message
 
-from gausslite.codec.free_space import encode_free_space
-from gausslite.codec.object_report import encode_object_report
+from gausslite.codec.json import encode_object_report
 from gausslite.codec.ply import ply_bytes
-from gausslite.codec.records import to_records
+from gausslite.codec.stored import encode_free_space, to_records
 from gausslite.codec.subset_codec import SubsetCoding, encode_subset
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.frame import Frame
 from gausslite.domain.free_space import BLOCK_VOXELS, FreeSpace
-from gausslite.domain.lens import Lens, LensModel
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
-from gausslite.domain.trajectory import Twist
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels, tombstones
-from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.domain.pose import Twist
+from gausslite.domain.voxels import (
+    AxisAlignedBox,
+    RoiSubset,
+    VoxelBatch,
+    empty_batch,
+    merge_batches,
+    select_voxels,
+    tombstones,
+)
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as agent
 from gausslite.v1 import fusion_service_pb2 as fusion
 from gausslite.v1 import parser_service_pb2 as parser
 from gausslite.wire import convert
-from gausslite.wire.convert_objects import report_to_message
-from gausslite.wire.convert_task import graph_to_message
+from gausslite.wire.convert_task import graph_to_message, report_to_message
 from gausslite_bench.fuzz.corpus import AGENT_ID, CORPUS, SESSION_ID
 from gausslite_bench.server.synthetic_updates import GRID, voxels_batch
 

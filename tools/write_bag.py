@@ -22,11 +22,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gausslite.datasets.images import first_readable_size
-from gausslite.datasets.text_files import read_rows
+from gausslite.datasets.files import first_readable_size, read_rows
 from gausslite.datasets.tum import read_tum_camera
+from gausslite.domain.camera import Lens
 from gausslite.domain.errors import GaussLiteError
-from gausslite.domain.lens import Lens
 
 COLOUR_FRAME, WORLD_FRAME = "camera_color_optical_frame", "odom"
 COLOUR = "/camera/color"

@@ -1,4 +1,4 @@
-"""Install the package for colcon: modules, launch file, parameters, and the package's entry in the ament index."""
+"""Install the package for colcon: launch file, parameters, entry in the ament index; the node is in the wheel."""
 
 from setuptools import setup
 
@@ -7,7 +7,7 @@ NAME = "gausslite_ros"
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME],
+    packages=[],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

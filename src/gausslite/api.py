@@ -18,20 +18,18 @@ from gausslite.calibration.calibrate import calibrate
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
-from gausslite.domain.arguments import describe, require_instance, require_size
 from gausslite.domain.camera import Camera
-from gausslite.domain.depth_registration import DepthRegistration
+from gausslite.domain.checks import describe, require_instance, require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import UpAxis, require_rigid
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import BallRegion, Region
-from gausslite.domain.voxel_operations import empty_batch
+from gausslite.domain.recording import DepthRegistration, PoseExposurePrior
+from gausslite.domain.relevance import BallRegion, Region
+from gausslite.domain.voxels import empty_batch
 from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
-from gausslite.mission.frame_stream import CorruptFrames, FrameStream
-from gausslite.mission.runner import MissionRunner
+from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
@@ -43,7 +41,7 @@ from gausslite.mission.settings import (
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient
-from gausslite.wire.tls import Tls
+from gausslite.wire.security import Tls
 
 __all__ = [
     "AgentClient",

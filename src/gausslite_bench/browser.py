@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.export.packages import import_extra
+from gausslite.process import import_extra
 
 _PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _TIMEOUT_MS = 60_000

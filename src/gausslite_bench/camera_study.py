@@ -7,17 +7,15 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 
 from gausslite.calibration.calibrate import StatedValues, calibrate
-from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.corrected import CorrectedSource
+from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
-from gausslite.datasets.source import Source
-from gausslite.datasets.wrapped_source import WrappedSource
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.datasets.source import Source, WrappedSource
+from gausslite.domain.camera import Lens
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.evaluation.compare import average, score_view
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mission.build import build_mapper

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gausslite.codec.task_json import graph_from_json
+from gausslite.codec.json import graph_from_json
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import TaskGraph
-from gausslite.task.parser import TaskParser
+from gausslite.task.grounding import TaskParser
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")
 

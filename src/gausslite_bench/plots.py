@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gausslite.codec.files import write_atomic
+from gausslite.codec.state_file import write_atomic
 from gausslite.domain.errors import InvalidInputError
 
 _PANEL_SIZE_IN = (6.4, 3.6)

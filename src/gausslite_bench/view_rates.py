@@ -14,13 +14,13 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB
-from gausslite.view.contents import ViewContents
-from gausslite.view.open_page import open_page
 from gausslite_bench.browser import open_browser
 from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
+from gausslite_view.contents import ViewContents
+from gausslite_view.pages import open_page
 
 if TYPE_CHECKING:
-    from gausslite.view.map_page import MapPage
+    from gausslite_view.map_page import MapPage
 
 _OPACITY = 0.9
 _LIMIT_S = 180.0

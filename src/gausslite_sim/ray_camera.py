@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.lens import Lens
+from gausslite.domain.camera import Camera, Lens
 
 
 @dataclass(frozen=True, slots=True, eq=False)

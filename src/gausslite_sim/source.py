@@ -13,16 +13,14 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source, require_position
-from gausslite.domain.arguments import require_size
-from gausslite.domain.camera import Camera
+from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.checks import require_size
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens
-from gausslite.domain.pose import UpAxis, unit_up_axis
-from gausslite.domain.region import Region
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
+from gausslite.domain.relevance import Region
 from gausslite_sim.exposure import camera_gain
 from gausslite_sim.home_catalogue import HOME_COUNT, plan_home
 from gausslite_sim.home_plan import HomePlan

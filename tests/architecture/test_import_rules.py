@@ -16,11 +16,11 @@ SOURCE_FOLDERS = (ROOT / "src", *sorted((ROOT / "services").glob("*")))
 GENERATED = "gausslite.v1"
 STUDIES = ("gausslite_sim", "gausslite_bench")
 BESIDE_THE_CORE = (
-    "gausslite.view",
+    "gausslite_view",
     "gausslite.report",
-    "gausslite.datasets.ros",
-    "gausslite.cli.view_command",
-    "gausslite.cli.report_command",
+    "gausslite_ros",
+    "gausslite_view.view_command",
+    "gausslite_view.report_command",
 )
 SERVICES = ("gausslite_agent", "gausslite_fusion_server", "gausslite_parser")
 MAY_USE_ARGPARSE = (

@@ -20,7 +20,7 @@ SUPPORT = ROOT / "tests" / "support"
 NEED_AN_EXTRA = {
     "torch": ("gausslite.render.reference", "gausslite.render.cuda"),
     "ray": ("gausslite.cluster",),
-    "viser": ("gausslite.view",),
+    "viser": ("gausslite_view",),
 }
 """Modules that are imported where an option chooses them, by the package that they need."""
 

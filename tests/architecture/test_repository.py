@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 MAX_POSITIONAL = 6
 INTRINSICS = {"fx_px", "fy_px", "cx_px", "cy_px"}
-MAY_COMPUTE_WITH_INTRINSICS = ("domain/camera.py", "domain/camera_motion.py", "render/")
+MAY_COMPUTE_WITH_INTRINSICS = ("domain/camera.py", "domain/camera.py", "render/")
 
 
 def _tracked(*patterns: str) -> list[Path]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.lens import Lens
+from gausslite.domain.camera import Lens
+from gausslite.domain.recording import CameraCorrection
 from gausslite_bench.camera_study import CameraCondition, CameraScore, camera_table, read_truth
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")

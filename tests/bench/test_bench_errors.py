@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.recording import CameraCorrection
 from gausslite.mission.settings import MissionSettings
 from gausslite_bench.camera_study import CameraStudy
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages

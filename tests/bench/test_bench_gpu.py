@@ -23,8 +23,7 @@ import torch
 
 from gausslite.render.cuda import CudaRasterizer
 from gausslite.render.cuda.gsplat_baseline import GsplatBaseline
-from gausslite.render.cuda.kernels import TorchKernels
-from gausslite.render.cuda.projection import DeviceCamera, project
+from gausslite.render.cuda.kernels import DeviceCamera, TorchKernels, project
 
 torch.set_num_threads(1)
 SIZE = (48, 32)

@@ -8,7 +8,7 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import DatasetError
-from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mission.frame_scheduler import FrameTiming
 from gausslite_bench.loop.frame_costs import CostLog, FrameCost, LoopTiming
 

@@ -8,7 +8,7 @@ import json
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.codec.task_json import graph_from_json
+from gausslite.codec.json import graph_from_json
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import TaskGraph
 from gausslite.task.rules import RuleParser

@@ -14,9 +14,8 @@ from gausslite.cli.main import main
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import Detection
+from gausslite.domain.objects import NounMatch
+from gausslite.domain.relevance import BallRegion, Detection
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detector import RegionDetector
 from gausslite_bench.perception.absent_nouns import choose_absent_nouns

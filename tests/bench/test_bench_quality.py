@@ -16,8 +16,8 @@ from quality_results import CONDITIONS, PLAN, TASK, UNIFORM, finished
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.object_names import same_kind
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.objects import same_kind
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.task.rules import RuleParser
 from gausslite_bench.quality.ablation import cumulative_variants
 from gausslite_bench.quality.home_scenes import HomeScenePlan

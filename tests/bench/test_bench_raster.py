@@ -20,8 +20,7 @@ from gausslite_bench.raster.repeated_step import LOSSES
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
-from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.cpu_kernels import usable_simd
+from gausslite.render.cpu import CpuRasterizer, usable_simd
 
 KEYS = [
     "gaussians",

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from gausslite.cli.main import main
+from gausslite.mission.schedule import TaskSchedule, TaskSwitch
 from gausslite.mission.settings import MissionSettings
-from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
 from gausslite.task.rules import RuleParser
 from gausslite_bench.plots import write_curves
 from gausslite_bench.task_change import (

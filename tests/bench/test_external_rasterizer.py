@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.splat_table import SplatTable
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
 from gausslite_bench.raster.procedural_room import held_out_view, seed_rows
 

@@ -9,12 +9,10 @@ from functools import cache, cached_property
 import numpy as np
 import torch
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB, Rasterizer, Rendering, TrainingView
-from gausslite.render.reference.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
-from gausslite.render.reference.motion import ImageMotion
-from gausslite.render.reference.projection import MIN_ALPHA, Ellipses, project
+from gausslite.render.reference import MAX_ALPHA, MIN_TRANSMITTANCE
+from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, ImageMotion, project
 
 GROUPS = {
     "means": MEAN,

@@ -21,12 +21,11 @@ from step_training import ADAM, LOSS, tables, target_for
 from test_rasterizer_gradients import assert_same_gradients
 from test_reference_oracle import STEP, exp_twist
 
-from gausslite.domain.camera_motion import CameraMotion
-from gausslite.domain.trajectory import Twist
+from gausslite.domain.camera import CameraMotion
+from gausslite.domain.pose import Twist
 from gausslite.render.rasterizer import Rasterizer, Rendering, SplatGradients, Subset
-from gausslite.render.reference.compositing import render_images
-from gausslite.render.reference.motion import ImageMotion
-from gausslite.render.reference.projection import project
+from gausslite.render.reference import render_images
+from gausslite.render.reference_projection import ImageMotion, project
 
 _TWIST = Twist(np.array([0.7, -0.4, 0.5]), np.array([-0.8, 1.6, 0.9]))
 MOTIONS = {

@@ -21,7 +21,7 @@ from gausslite.render.rasterizer import (
     Rasterizer,
     Subset,
 )
-from gausslite.render.reference.loss import training_loss
+from gausslite.render.reference import training_loss
 
 TOLERANCE = 1e-4
 SATURATED_TOLERANCE = {"cuda": 0.1}

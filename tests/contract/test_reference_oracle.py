@@ -8,9 +8,8 @@ import torch
 from splat_scenes import CAMERA, GROUPS, Scene, named_scene, random_image_gradients, relative_error, rotated_pose
 
 from gausslite.render.rasterizer import LossWeights, Rasterizer
-from gausslite.render.reference.compositing import render_images
-from gausslite.render.reference.loss import ReferenceView, ssim_map, training_loss
-from gausslite.render.reference.projection import project
+from gausslite.render.reference import ReferenceView, render_images, ssim_map, training_loss
+from gausslite.render.reference_projection import project
 
 STEP = 5e-8
 """Step of finite differences: small enough that no alpha crosses a threshold, large against float64 rounding."""

@@ -13,8 +13,8 @@ from agent_running import TASK, agent
 from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset, request
 
 from gausslite.codec.ply import read_ply
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.wire.images import encode_colour, encode_depth
+from gausslite.domain.voxels import group_by_voxel
+from gausslite.wire.convert import encode_colour, encode_depth
 
 ROOT = Path(__file__).resolve().parents[2]
 

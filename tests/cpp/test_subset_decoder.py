@@ -12,9 +12,7 @@ import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.codec.subset_codec import SubsetCoding, decode_subset, encode_subset
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tombstones
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
 
 ROOT = Path(__file__).resolve().parents[2]
 GRID = VoxelGrid(0.1)

@@ -17,8 +17,8 @@ import pytest
 from gausslite.codec.ply import read_ply
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import back_project
-from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose import transform_points
+from gausslite.domain.recording import DepthRegistration
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from gausslite.process.interrupts import raise_interrupts
+from gausslite.process import raise_interrupts
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_started_program_keeps_its_own_handlers() -> None:
 def test_after_the_start_both_signals_raise() -> None:
     code = (
         "import signal\n"
-        "from gausslite.process.interrupts import Terminated, end_quietly_while_starting, raise_interrupts\n"
+        "from gausslite.process import Terminated, end_quietly_while_starting, raise_interrupts\n"
         "end_quietly_while_starting('x')\nraise_interrupts()\n"
         "for number, expected in ((signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)):\n"
         "    try:\n        signal.raise_signal(number)\n"

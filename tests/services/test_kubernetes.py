@@ -9,7 +9,7 @@ import yaml
 
 from gausslite_agent.settings import parse_arguments as parse_agent
 from gausslite_fusion_server.settings import parse_arguments as parse_fusion_server
-from gausslite_parser.settings import parse_arguments as parse_parser
+from gausslite_parser.program import parse_arguments as parse_parser
 
 MANIFEST = Path(__file__).resolve().parents[2] / "deploy/kubernetes/team.yaml"
 PARSERS = {"parser": parse_parser, "fusion-server": parse_fusion_server, "agent": parse_agent}

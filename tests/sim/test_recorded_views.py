@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Camera
-from gausslite.domain.lens import Lens
+from gausslite.domain.camera import Camera, Lens
 from gausslite_sim.home_catalogue import plan_home
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import select_frames
-from gausslite.datasets.source import Source
+from gausslite.datasets.source import Source, select_frames
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid, transform_points

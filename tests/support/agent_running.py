@@ -14,23 +14,21 @@ from fusion_running import GRID
 from serving import serving
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.relevance import BallRegion, RelevanceMap
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.settings import MissionSettings
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate, RelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
-from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.server import Service
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.agent_mission import AgentMission
-from gausslite_agent.keyframe_upload import KeyframeUpload
-from gausslite_agent.load import LoadSettings
+from gausslite.wire.views import ChangeNotifier
+from gausslite_agent.background import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mission import AgentMission
 from gausslite_agent.servicer import AgentServicer
-from gausslite_agent.settings import parse_arguments
+from gausslite_agent.settings import LoadSettings, parse_arguments
 
 SETTINGS = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
 TASK = "Pick up the mug on the table"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.wire.tls import Tls
+from gausslite.wire.security import Tls
 
 SCRIPT = Path(__file__).resolve().parents[2] / "deploy" / "make_certificates.sh"
 

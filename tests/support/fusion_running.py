@@ -20,20 +20,18 @@ from serving import serving
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tombstones
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.store import FusionStore
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import decode_frame
-from gausslite.wire.tls import Tls
+from gausslite.wire.security import Tls
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 

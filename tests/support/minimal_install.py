@@ -77,7 +77,7 @@ def default_paths(out: Path) -> list[dict[str, object]]:
         ("models", "list"),
         ("doctor", "--json"),
         ("demo", *halves, "--size", "160x120", "--refine-iterations", "5", "--out", str(out / "demo")),
-        *((command, "--help") for command in importlib.import_module("gausslite.cli.commands").SUMMARIES),
+        *((command, "--help") for command in importlib.import_module("gausslite.cli.main").SUMMARIES),
     )
     results = [run("gausslite", arguments) for arguments in commands]
     return results + [run(program, ("--help",)) for program in PROGRAMS]

@@ -13,10 +13,9 @@ import pytest
 from exported_recordings import home_frames, quaternion_row
 from tool_modules import load_tool
 
-from gausslite.datasets.ros.address import BagOptions
-from gausslite.datasets.ros.bag_file import BagFile
-from gausslite.datasets.ros.live_frames import LiveFrames
-from gausslite.datasets.ros.messages import stamp_ns
+from gausslite_ros.bag_file import BagFile, BagOptions
+from gausslite_ros.live_frames import LiveFrames
+from gausslite_ros.messages import stamp_ns
 
 START_NS = 1_700_000_000_000_000_000
 FRAME_NS = 33_333_333

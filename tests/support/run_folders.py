@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from sample_gaussians import plain_gaussians
 
-from gausslite.codec.keyframe_views import KeyframeView, write_keyframe_views
 from gausslite.codec.ply import write_ply
-from gausslite.codec.view_images import ViewImage, write_view_images
-from gausslite.datasets.pose_file import format_pose_rows
+from gausslite.codec.run_files import KeyframeView, ViewImage, write_keyframe_views, write_view_images
+from gausslite.datasets.folder import format_pose_rows
 from gausslite.domain.camera import Camera
 
 WIDTH, HEIGHT = 64, 48

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 
 
 def make_batch(seed: int, n: int, grid: VoxelGrid, spread_m: float = 1.0, centre_m: float = 0.0) -> VoxelBatch:

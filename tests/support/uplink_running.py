@@ -15,16 +15,15 @@ from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import (
     GaussLiteError,
 )
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.server import Service
 from gausslite.wire.spool import Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
 
 EAGER = UplinkSettings(interval_s=0.0, resend_threshold=0.0, first_backoff_s=0.01)
 WAIT_S = 20.0

@@ -8,12 +8,17 @@ map, so the mapper needs no lock.
 from __future__ import annotations
 
 import logging
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
+
+import numpy as np
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
@@ -21,30 +26,90 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
 from gausslite.domain.relevance import DetectedImage
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, group_by_voxel, replace_voxels
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.free_space import FreeSpaceMap
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mapping.team_voxels import InsertedVoxels
+from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
-from gausslite.mission.map_recorder import MapRecorder
+from gausslite.mission.schedule import MapRecorder, Timeline
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.mission.timeline import Timeline
-from gausslite.wire.camera_view import CameraView
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.camera_view import newest_camera_view
-from gausslite_agent.frame_queue import FrameQueue, QueuedFrame
-from gausslite_agent.idle_training import IdleTraining
-from gausslite_agent.keyframe_upload import KeyframeUpload
-from gausslite_agent.load import LoadSettings
-from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedMission
-from gausslite_agent.status import FrameReport, Outcome, StatusHolder, WorkerStatus
+from gausslite.wire.views import CameraView
+from gausslite_agent.background import IdleTraining, KeyframeUpload
+from gausslite_agent.settings import LoadSettings, QueuePolicy
+from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
+
+
+def _running_future() -> Future[FrameReport]:
+    """Return a future that its receiver cannot cancel."""
+    future: Future[FrameReport] = Future()
+    future.set_running_or_notify_cancel()
+    return future
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QueuedFrame:
+    """A frame, the time of its arrival, and the future of its report."""
+
+    frame: Frame
+    arrival_s: float
+    report: Future[FrameReport] = field(default_factory=_running_future)
+
+
+class FrameQueue:
+    """Frames in order of arrival. Thread-safe."""
+
+    def __init__(self, max_frames: int, policy: QueuePolicy) -> None:
+        self._max_frames = max_frames
+        self._policy = policy
+        self._frames: deque[QueuedFrame] = deque()
+        self._lock = threading.Lock()
+
+    def put(self, frame: QueuedFrame) -> QueuedFrame | None:
+        """Add a frame. Return the frame that is dropped if the queue was full."""
+        with self._lock:
+            self._frames.append(frame)
+            if len(self._frames) <= self._max_frames:
+                return None
+            return self._frames.popleft() if self._policy is QueuePolicy.OLDEST else self._frames.pop()
+
+    def get(self) -> QueuedFrame | None:
+        """Remove and return the oldest frame; None if the queue is empty."""
+        with self._lock:
+            return self._frames.popleft() if self._frames else None
+
+    @property
+    def is_empty(self) -> bool:
+        """True if no frame waits."""
+        with self._lock:
+            return not self._frames
+
+
+_NS_PER_S = 1e9
+
+
+def newest_camera_view(mapper: GaussianMapper, detected: DetectedImage | None) -> CameraView | None:
+    """Return the newest keyframe, the camera's path and the newest detection; None before the first keyframe."""
+    keyframes = mapper.keyframes()
+    if not keyframes:
+        return None
+    newest, trajectory = keyframes[-1], mapper.poses.trajectory()
+    return CameraView(
+        rgb=newest.as_recorded.rgb,
+        roi=newest.relevance.roi,
+        camera=newest.frame.camera,
+        frame_index=newest.frame.index,
+        T_world_camera=newest.frame.T_world_camera,
+        times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
+        path=trajectory.T_world_camera,
+        keyframes=np.stack([each.frame.T_world_camera for each in keyframes]),
+        detected=detected,
+    )
+
 
 _log = logging.getLogger(__name__)
 _Result = TypeVar("_Result")

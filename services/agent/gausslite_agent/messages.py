@@ -10,15 +10,11 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.convert import transform_to_message
-from gausslite.wire.convert_objects import object_to_message
-from gausslite.wire.convert_task import graph_to_message
-from gausslite.wire.images import encode_colour, encode_depth
-from gausslite.wire.uplink_values import UplinkCounters
-from gausslite_agent.agent_mission import AgentMission
-from gausslite_agent.mission_end import MissionSummary
-from gausslite_agent.mission_state import MissionState
-from gausslite_agent.status import FrameReport, Outcome, WorkerStatus
+from gausslite.wire.convert import encode_colour, encode_depth, transform_to_message
+from gausslite.wire.convert_task import graph_to_message, object_to_message
+from gausslite.wire.update_sender import UplinkCounters
+from gausslite_agent.mission import AgentMission
+from gausslite_agent.state import FrameReport, MissionState, MissionSummary, Outcome, WorkerStatus
 
 _STATES = {
     MissionState.WAITING_FOR_TASK: pb.AGENT_STATE_WAITING_FOR_TASK,

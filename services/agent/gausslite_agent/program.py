@@ -5,36 +5,111 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
 from gausslite.config.values import NONE
+from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
+from gausslite.domain.task import TaskGraph
 from gausslite.mission.build import EstimatorFactory
-from gausslite.mission.frame_stream import FrameStream, region_file_note
 from gausslite.mission.results import prepare_file, prepare_folder
+from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo
-from gausslite.process.siblings import Sibling, sibling
-from gausslite.task.parser import TaskParser
+from gausslite.process import Sibling, sibling
+from gausslite.task.grounding import TaskParser
 from gausslite.task.rules import RuleParser
-from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.process import run_service
-from gausslite.wire.server import serve_until_stopped
+from gausslite.wire.server import run_service, serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.agent_mission import NO_DETECTOR, AgentMission
-from gausslite_agent.keyframe_upload import KeyframeUpload
+from gausslite.wire.views import ChangeNotifier
+from gausslite_agent.background import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.mission_checkpoint import SavedMission
-from gausslite_agent.parser_wait import WaitingParser
-from gausslite_agent.periodic_save import PeriodicSave
+from gausslite_agent.mission import NO_DETECTOR, AgentMission
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_arguments
+from gausslite_agent.state import SavedMission
 from gausslite_agent.team_map import TeamMapFollower
 
 _log = logging.getLogger(__name__)
+_TIMEOUT_S = 30.0
+_RETRY_S = 0.5
+
+
+class WaitingParser:
+    """A TaskParser that retries while its service is unavailable, up to 30 seconds."""
+
+    def __init__(
+        self, parser: TaskParser, timeout_s: float = _TIMEOUT_S, cancel: Callable[[], None] = lambda: None
+    ) -> None:
+        """cancel: ends the parser's open calls with UnavailableError; a service may accept a call and not answer."""
+        self._parser = parser
+        self._timeout_s = timeout_s
+        self._cancel = cancel
+        self._stopping = threading.Event()
+
+    def stop(self) -> None:
+        """End the wait: an open call is cancelled, and `parse` raises UnavailableError with the last error before."""
+        self._stopping.set()
+        self._cancel()
+
+    def parse(self, text: str) -> TaskGraph:
+        """Return the graph of a task. Raises TaskError; UnavailableError after the timeout or `stop`."""
+        deadline_s = time.monotonic() + self._timeout_s
+        last_error: UnavailableError | None = None
+        while True:
+            try:
+                return self._parser.parse(text)
+            except UnavailableError as error:
+                if not self._stopping.is_set():
+                    if time.monotonic() >= deadline_s:
+                        raise
+                    if last_error is None:
+                        _log.warning("%s; retrying for %.0f s", error, self._timeout_s)
+                    last_error = error
+                # the error of a call that `stop` cancels says nothing about the service
+                if self._stopping.wait(_RETRY_S):
+                    waited = "stopped while waiting for the parser service"
+                    raise UnavailableError(waited if last_error is None else f"{waited}: {last_error}") from None
+
+
+_MIN_INTERVAL_PER_SAVE = 20.0
+"""Saving takes at most a twentieth of the time."""
+
+
+class PeriodicSave:
+    """A context that calls `save` on a thread of its own; with an interval of 0 it does nothing."""
+
+    def __init__(self, save: Callable[[], float], interval_s: float) -> None:
+        """`save` returns the seconds that it took. interval_s: between two saves; slow ones are rarer."""
+        self._save, self._interval_s = save, interval_s
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="periodic save", daemon=True)
+
+    def __enter__(self) -> PeriodicSave:
+        if self._interval_s > 0:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """End the thread without waiting for a save that has begun; the mission's own save follows it."""
+        self._ended.set()
+
+    def _run(self) -> None:
+        wait_s, failed = self._interval_s, False
+        while not self._ended.wait(wait_s):
+            wait_s = self._interval_s
+            try:
+                wait_s = max(wait_s, _MIN_INTERVAL_PER_SAVE * self._save())
+                failed = False
+            except GaussLiteError as error:
+                if not failed:
+                    _log.warning("the mission is not saved: %s", error)
+                failed = True
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -102,7 +177,7 @@ async def _serve(settings: AgentSettings) -> int:
         mission = AgentMission(settings, worker, first_parser, resumed, can_detect)
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
         if settings.view is not None:
-            live = sibling(Sibling.LIVE_PAGE)
+            live = sibling(Sibling.PAGES)
             stack.enter_context(live.own_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
         run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)

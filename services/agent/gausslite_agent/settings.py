@@ -5,25 +5,57 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import build, option
+from gausslite.config.option import build, check_options, option
 from gausslite.config.program import Program, parse_options
 from gausslite.config.values import NONE, VOXEL_SIZE
+from gausslite.domain.checks import require_identifier, require_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.names import require_identifier, require_name
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.task_limits import require_task_text
+from gausslite.domain.task import require_task_text
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings, PoseMode, SourceSettings
-from gausslite.process.messages import print_message
-from gausslite.wire.address import AGENT_ADDRESS, MAX_PORT, require_callable
-from gausslite.wire.tls import Tls, TlsFiles
-from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.load import LoadSettings
-from gausslite_agent.mission_end import MAX_DRAIN_S
+from gausslite.process import print_message
+from gausslite.wire.channel import AGENT_ADDRESS, MAX_PORT, require_callable
+from gausslite.wire.security import Tls, TlsFiles
+from gausslite.wire.update_sender import UplinkSettings
+from gausslite_agent.state import MAX_DRAIN_S
+
+
+class QueuePolicy(StrEnum):
+    """Which waiting frame a full queue drops."""
+
+    OLDEST = "oldest"
+    NEWEST = "newest"
+
+
+@dataclass(frozen=True, slots=True)
+class LoadSettings:
+    """Length and policy of the frame queue, and training while it is empty.
+
+    idle_iterations: the most iterations after each frame while no other frame waits. Maps then depend on the clock.
+    free_space: observe the free space of every fifth frame, for the fusion server.
+    """
+
+    queue_frames: int = option(4, "length of the frame queue", key="queue", low=1, high=1000)
+    queue_policy: QueuePolicy = option(QueuePolicy.OLDEST, "frame that a full queue drops")
+    idle_iterations: int = option(
+        0,
+        "training iterations while the queue is empty (default: 64 at a rate, else 0)",
+        low=0,
+        high=10_000,
+    )
+    free_space: bool = option(
+        False, "send what the camera has observed as free: it shows frames that do not fit (default: true)"
+    )
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
 
 _KEYFRAMES = 64
 _MAX_KEYFRAMES = 10_000

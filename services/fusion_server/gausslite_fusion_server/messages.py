@@ -2,19 +2,179 @@
 
 from __future__ import annotations
 
+import asyncio
+import tempfile
+from concurrent.futures import Future
+from dataclasses import dataclass
+from types import TracebackType
+
+import google_crc32c
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.codec.stored import decode_free_space
+from gausslite.codec.subset_codec import decode_subset
+from gausslite.domain.errors import (
+    GaussLiteError,
+    InvalidInputError,
+    MismatchError,
+    SessionUnknownError,
+    StorageError,
+    UnavailableError,
+)
 from gausslite.domain.frame import MAX_COORDINATE_M
-from gausslite.fusion.frame_alignment import AlignmentState, FrameAlignment
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
-from gausslite.fusion.map_renderer import LayerView
-from gausslite.fusion.traffic import AgentContribution
+from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
+from gausslite.fusion.refinement import LayerView
+from gausslite.fusion.store import PutOutcome
+from gausslite.fusion.traffic import AgentContribution, TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.convert import transform_from_message, transform_to_message
-from gausslite.wire.images import encode_colour, encode_depth
+from gausslite.v1.geometry_pb2 import EncodedFrame
+from gausslite.wire.convert import (
+    decode_frame,
+    encode_colour,
+    encode_depth,
+    frame_from_message,
+    transform_from_message,
+    transform_to_message,
+)
+from gausslite.wire.security import Caller
+from gausslite.wire.status import code_and_reason
+from gausslite.wire.views import region_from_png
+
+_MAX_SELECTED_KEYFRAMES = 10_000
+_STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)
+"""Errors that every later message would raise too, so they end the stream; other errors reject one message."""
+_ACCEPTED, _STALE, _REJECTED = (
+    pb.SUBSET_STATUS_ACCEPTED,
+    pb.SUBSET_STATUS_STALE,
+    pb.SUBSET_STATUS_REJECTED,
+)
+
+
+def agent_of_session(engine: FusionEngine, session_id: str, caller: Caller) -> str:
+    """Return the agent of a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
+    agent_id = engine.session(session_id).agent_id
+    caller.require_agent(agent_id)
+    return agent_id
+
+
+@dataclass(frozen=True, slots=True)
+class QueuedSubset:
+    """A message of an agent that waits for its commit."""
+
+    agent_id: str
+    sequence: int
+    traffic: TrafficCounters
+    put: Future[PutOutcome]
+
+
+def enqueue_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, caller: Caller) -> QueuedSubset:
+    """Decode one message and queue it. An invalid one is rejected by `put`; errors of the whole stream are raised."""
+    agent_id = agent_of_session(engine, request.session_id, caller)
+    size = len(request.subset)
+    is_handover = request.purpose == pb.PURPOSE_HANDOVER
+    traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
+    put: Future[PutOutcome] = Future()
+    try:
+        subset, grid = decode_subset(request.subset)
+        put = engine.enqueue_update(request.session_id, subset, grid)
+    except GaussLiteError as error:
+        put.set_exception(error)
+    return QueuedSubset(agent_id, request.sequence, traffic, put)
+
+
+async def outcome_of(engine: FusionEngine, queued: QueuedSubset) -> pb.SubsetOutcome:
+    """Wait for the commit. A rejected message gives a REJECTED outcome; errors of the whole stream are raised."""
+    outcome = pb.SubsetOutcome(sequence=queued.sequence)
+    try:
+        put = await asyncio.wrap_future(queued.put)
+    except _STREAM_ERRORS:
+        raise
+    except GaussLiteError as error:
+        outcome.status, outcome.reason, outcome.message = _REJECTED, code_and_reason(error)[1], str(error)
+        engine.record_traffic(queued.agent_id, queued.traffic.plus(TrafficCounters(subsets_rejected=1)))
+        return outcome
+    accepted = len(put.accepted) > 0 or len(put.stale) == 0
+    outcome.status = _ACCEPTED if accepted else _STALE
+    outcome.accepted_voxels, outcome.stale_voxels = len(put.accepted), len(put.stale)
+    stored = TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted))
+    engine.record_traffic(queued.agent_id, queued.traffic.plus(stored))
+    return outcome
+
+
+def store_free_space(engine: FusionEngine, request: pb.ContributeFreeSpaceRequest, caller: Caller) -> int:
+    """Store free space; returns the agent's number of free voxels. Raises CodecError, QuotaError and the like."""
+    agent_of_session(engine, request.session_id, caller)
+    blocks, grid = decode_free_space(request.free_space)
+    return engine.contribute_free_space(request.session_id, blocks, grid)
+
+
+def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest, caller: Caller) -> None:
+    """Store a keyframe as it was received. Raises InvalidInputError, QuotaError, SessionUnknownError."""
+    agent_id = agent_of_session(engine, request.session_id, caller)
+    message = request.keyframe
+    # before any image is decoded: its header must then state the camera's size
+    pixels = message.camera.width_px * message.camera.height_px
+    engine.settings.quotas.keyframe_limits.require_within(message.index, pixels, message.ByteSize())
+    # decoded here to refuse invalid images; stored as received, which needs less space
+    frame = frame_from_message(message)
+    region_from_png(message.region_png, frame.camera)
+    data = message.SerializeToString()
+    keyframe = EncodedKeyframe(agent_id, frame.index, frame.depth_m.size, data)
+    engine.add_keyframe(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])
+
+
+_CHUNK_BYTES = 1 << 20
+
+
+class ExportedFile:
+    """Owns a file without a name, which ends with this object. One reader."""
+
+    def __init__(self, data: bytes) -> None:
+        self._size_bytes, self._crc32c = len(data), google_crc32c.value(data)
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
+        self._file.write(data)
+        self._file.seek(0)
+
+    def __enter__(self) -> ExportedFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def next_chunk(self) -> pb.ExportFusedMapResponse | None:
+        """Return the next message; None at the end."""
+        offset = self._file.tell()
+        data = self._file.read(_CHUNK_BYTES)
+        if not data:
+            return None
+        return pb.ExportFusedMapResponse(offset=offset, total_bytes=self._size_bytes, data=data, crc32c=self._crc32c)
+
+
+def read_keyframe(engine: FusionEngine, request: pb.GetKeyframeRequest) -> pb.GetKeyframeResponse:
+    """Return a keyframe without its depth; empty if the agent has none. Raises InvalidInputError, StorageError."""
+    index = request.index if request.HasField("index") else None
+    data, indices = engine.encoded_keyframe(request.agent_id, index)
+    if not data:
+        return pb.GetKeyframeResponse()
+    message = EncodedFrame.FromString(data)
+    in_fused_frame = engine.in_fused_frame([AgentKeyframe(request.agent_id, decode_frame(data))])
+    return pb.GetKeyframeResponse(
+        index=message.index,
+        capture_time_ns=message.capture_time_ns,
+        colour=message.colour,
+        camera=message.camera,
+        t_world_camera=transform_to_message(in_fused_frame[0].frame.T_world_camera) if in_fused_frame else None,
+        indices=indices,
+        region_png=message.region_png,
+    )
+
 
 _STATES = {
     AlignmentState.UNKNOWN: pb.ALIGNMENT_STATE_UNSPECIFIED,

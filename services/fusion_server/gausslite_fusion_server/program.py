@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
+import json
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-from gausslite.domain.errors import InvalidInputError, StorageError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
+from gausslite.fusion import store_maintenance
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.joint_refinement import rasterizer_of_backend
 from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.refinement import rasterizer_of_backend
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.process.siblings import Sibling, sibling
+from gausslite.fusion.store_maintenance import StoreReport
+from gausslite.process import Sibling, print_message, sibling
 from gausslite.wire.convert import decode_frame
-from gausslite.wire.process import LogFormat, log_to_stderr, run_service
-from gausslite.wire.server import serve_until_stopped
-from gausslite_fusion_server.maintenance import run_command
+from gausslite.wire.server import LogFormat, log_to_stderr, run_service, serve_until_stopped
 from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
@@ -26,9 +28,56 @@ from gausslite_fusion_server.settings import (
     MAINTENANCE_COMMANDS,
     POSTGRES_SCHEME,
     PROGRAM,
+    MaintenanceSettings,
     ServerSettings,
     parse_arguments,
+    parse_maintenance,
 )
+
+
+def run_command(arguments: Sequence[str]) -> int:
+    """Run one of MAINTENANCE_COMMANDS and print what it did.
+
+    Returns 0, 1 for damaged rows, or 2 with one line on stderr.
+    """
+    options = parse_maintenance(arguments)
+    try:
+        return _run(options)
+    except (GaussLiteError, OSError) as error:
+        print_message(f"{PROGRAM} {options.command}: {error}")
+        return 2
+
+
+def _run(options: MaintenanceSettings) -> int:
+    match options.command:
+        case "backup":
+            report = store_maintenance.back_up(options.store, options.other)
+            _print(options, f"{options.other}: {_summary(report)}", dataclasses.asdict(report))
+        case "restore":
+            report, replaced = store_maintenance.restore(options.other, options.store)
+            earlier = "" if replaced is None else f"; the earlier file is now {replaced}"
+            text = f"{options.store}: {_summary(report)}; agents will send what is missing{earlier}"
+            _print(options, text, dataclasses.asdict(report) | {"replaced": str(replaced or "")})
+        case "verify":
+            report = store_maintenance.verify(options.store, options.repair)
+            done = " deleted; agents will send what is missing" if options.repair and report.damaged_rows else ""
+            text = f"{options.store}: {_summary(report)}, {report.damaged_rows} damaged rows{done}"
+            _print(options, text, dataclasses.asdict(report))
+            return int(report.damaged_rows > 0 and not options.repair)
+        case _:
+            before, after = store_maintenance.compact(options.store)
+            _print(
+                options, f"{options.store}: {before} bytes before, {after} after", {"before": before, "after": after}
+            )
+    return 0
+
+
+def _summary(report: StoreReport) -> str:
+    return f"{report.agents} agents, {report.voxels} voxels, {report.gaussians} Gaussians, {report.keyframes} keyframes"
+
+
+def _print(options: MaintenanceSettings, text: str, values: dict[str, object]) -> None:
+    sys.stdout.write((json.dumps(values) if options.json else text) + "\n")
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -96,7 +145,7 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
 
     page: AbstractContextManager[None] = nullcontext()
     if settings.view is not None:
-        live = sibling(Sibling.LIVE_PAGE)
+        live = sibling(Sibling.PAGES)
         page = live.own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
     with metrics_server(settings.metrics, engine), page:
         await serve_until_stopped(

@@ -10,10 +10,10 @@ from threading import Event
 
 from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.joint_refinement import CreateRasterizer, RefineProgress, RefineSettings, refine
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
+from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings, refine
 from gausslite.render.rasterizer import Rasterizer
-from gausslite.wire.change_notifier import ChangeNotifier
+from gausslite.wire.views import ChangeNotifier
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,4 @@
 """The methods of FusionService: each one decodes, calls the fusion engine and encodes."""
-# ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
 
 from __future__ import annotations
 
@@ -12,51 +11,104 @@ from typing import Any, TypeVar
 
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
+from gausslite.domain.checks import require_identifier
 from gausslite.domain.errors import (
     InvalidInputError,
     QuotaError,
+    UnavailableError,
 )
-from gausslite.domain.names import require_identifier
 from gausslite.domain.objects import ObjectReport
-from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.map_renderer import MapRenderer
-from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.refinement import MapRenderer
+from gausslite.fusion.store import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
-from gausslite.wire.caller import Caller
-from gausslite.wire.change_notifier import ChangeNotifier
 from gausslite.wire.convert import (
     box_from_message,
     camera_from_message,
+    digests_to_messages,
     grid_from_message,
     grid_to_message,
     transform_from_message,
 )
-from gausslite.wire.convert_objects import object_to_message, report_from_message
-from gausslite.wire.convert_task import graph_from_message
-from gausslite.wire.digest_messages import digests_to_messages
+from gausslite.wire.convert_task import graph_from_message, object_to_message, report_from_message
 from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
-from gausslite.wire.rejection_log import RejectionLog
+from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
-from gausslite_fusion_server.change_blocks import FusedMapReader, WatchedPart
-from gausslite_fusion_server.contributions import (
-    agent_of_session,
-    enqueue_subset,
-    outcome_of,
-    store_free_space,
-    store_keyframe,
-)
-from gausslite_fusion_server.drain_gate import DrainGate
-from gausslite_fusion_server.exported_file import ExportedFile
-from gausslite_fusion_server.keyframe_reader import read_keyframe
+from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.messages import (
+    ExportedFile,
+    agent_of_session,
     contribution_to_message,
     declared_frame_from_message,
+    enqueue_subset,
     layer_from_message,
+    outcome_of,
+    read_keyframe,
+    store_free_space,
+    store_keyframe,
     view_to_message,
 )
 from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
+from gausslite_fusion_server.watch import FusedMapReader, WatchedPart
+
+_Message = TypeVar("_Message")
+
+
+class DrainGate:
+    """Open until `close` is called. Use it on the event loop only."""
+
+    def __init__(self) -> None:
+        self._closed = asyncio.Event()
+
+    @property
+    def is_open(self) -> bool:
+        """False after `close`."""
+        return not self._closed.is_set()
+
+    def close(self) -> None:
+        """Refuse new calls and end the streams read through `admit`."""
+        self._closed.set()
+
+    def require_open(self) -> None:
+        """Raise UnavailableError if the server drains."""
+        if self._closed.is_set():
+            raise UnavailableError("fusion server: draining; try again in a moment")
+
+    async def admit(self, requests: AsyncIterator[_Message]) -> AsyncIterator[_Message]:
+        """Yield the requests of a stream. Raises UnavailableError when the gate closes, even between two requests."""
+        closing = asyncio.ensure_future(self._closed.wait())
+        try:
+            while True:
+                self.require_open()
+                reading = asyncio.ensure_future(_next(requests))
+                # a call that is cancelled during the wait never reads an invalid request's error
+                reading.add_done_callback(_retrieve_error)
+                await asyncio.wait([reading, closing], return_when=asyncio.FIRST_COMPLETED)
+                if not reading.done():
+                    reading.cancel()
+                    await asyncio.wait([reading])
+                    self.require_open()
+                request = reading.result()
+                if request is None:
+                    return
+                yield request
+        finally:
+            closing.cancel()
+
+
+async def _next(requests: AsyncIterator[_Message]) -> _Message | None:
+    return await anext(requests, None)
+
+
+def _retrieve_error(reading: asyncio.Future[_Message | None]) -> None:
+    if not reading.cancelled():
+        reading.exception()
+
+
+# ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
+
 
 _log = logging.getLogger(__name__)
 _MAX_REPORTED_REJECTIONS = 1000

@@ -9,19 +9,17 @@ from pathlib import Path
 
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option
-from gausslite.config.plain_values import without_password
 from gausslite.config.program import Program, parse_options
-from gausslite.config.values import read_path
+from gausslite.config.values import read_path, without_password
 from gausslite.domain.errors import InvalidInputError
-from gausslite.fusion.frame_alignment import AlignmentSettings
-from gausslite.fusion.joint_refinement import RefineSettings
+from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.limits import FusionSettings
-from gausslite.process.messages import print_message
+from gausslite.fusion.refinement import RefineSettings
+from gausslite.process import print_message
 from gausslite.render.choose import BACKENDS
-from gausslite.wire.address import FUSION_ADDRESS, MAX_PORT, host_and_port
-from gausslite.wire.call_limits import CallLimits
-from gausslite.wire.process import LogFormat
-from gausslite.wire.tls import Tls, TlsFiles
+from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port
+from gausslite.wire.security import CallLimits, Tls, TlsFiles
+from gausslite.wire.server import LogFormat
 
 PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"

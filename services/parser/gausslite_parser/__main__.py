@@ -2,7 +2,7 @@
 
 import sys
 
-from gausslite.process.interrupts import end_quietly_while_starting
+from gausslite.process import end_quietly_while_starting
 
 
 def main() -> int:

@@ -20,7 +20,7 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, back_project, lift
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_of, twist_of
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.render.rasterizer import NEAR_M, Rendering
 
 OPAQUE_ALPHA = 0.8

@@ -11,15 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gausslite.calibration.camera_estimate import estimate_camera
-from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
+from gausslite.calibration.errors import estimate_pose_exposure_prior
 from gausslite.calibration.registration import find_registration
-from gausslite.datasets.corrected_source import CorrectedSource
+from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.depth_registration import DepthRegistration
-from gausslite.domain.lens import Lens
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.camera import Lens
+from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 
 _NONE = "none"
 

@@ -17,12 +17,11 @@ from numpy import ndarray
 from gausslite.calibration.exposure_time import estimate_exposure_time
 from gausslite.calibration.joint_camera_fit import CameraFit, fit_camera
 from gausslite.calibration.moving_pairs import MovingPairs, PairError
-from gausslite.datasets.camera_correction import ideal_camera
-from gausslite.datasets.selection import downscaled_size
-from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.datasets.corrected import ideal_camera
+from gausslite.datasets.source import Source, downscaled_size
+from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.lens import Lens, LensModel
+from gausslite.domain.recording import CameraCorrection
 
 _MIN_PAIRS = 4
 _MIN_LENS_PIXELS = 160 * 120

@@ -17,16 +17,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.frame_warp import warp_into
-from gausslite.calibration.moving_pairs import read_frames
-from gausslite.datasets.camera_correction import correct_frame
-from gausslite.datasets.selection import capped_size
-from gausslite.datasets.source import Source
+from gausslite.calibration.moving_pairs import read_frames, warp_into
+from gausslite.datasets.corrected import correct_frame
+from gausslite.datasets.source import Source, capped_size
 from gausslite.domain.camera import Camera
-from gausslite.domain.camera_correction import CameraCorrection
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse
-from gausslite.domain.trajectory import Trajectory, Twist
+from gausslite.domain.pose import Trajectory, Twist, inverse
+from gausslite.domain.recording import CameraCorrection
 
 _MAX_PAIRS, _MIN_PAIRS = 16, 4
 _MAX_TURN_RAD, _MAX_DISTANCE_M = math.radians(25.0), 0.8

@@ -29,15 +29,12 @@ from gausslite.calibration.alignment import (
     robust_weights,
     with_gradients,
 )
-from gausslite.calibration.frame_warp import FrameWarp
-from gausslite.calibration.moving_pairs import MIN_COMPARABLE_SHARE, MovingPairs
-from gausslite.datasets.camera_correction import correct_frame, recorded_pixels
-from gausslite.domain.camera import back_project
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.calibration.moving_pairs import MIN_COMPARABLE_SHARE, FrameWarp, MovingPairs
+from gausslite.datasets.corrected import correct_frame, recorded_pixels
+from gausslite.domain.camera import Lens, LensModel, back_project
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.pose import inverse, transform_of, twist_of
-from gausslite.domain.trajectory import Twist
+from gausslite.domain.pose import Twist, inverse, transform_of, twist_of
+from gausslite.domain.recording import CameraCorrection
 
 _READOUT, _OFFSET = 0, 1
 _STEPS = np.array([0.001, 0.001, 0.01, 0.02])

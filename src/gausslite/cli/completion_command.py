@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-from gausslite.cli.commands import build_parser
+from gausslite.cli.main import build_parser
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError
@@ -19,7 +19,7 @@ _FILE_METAVARS = ("DIR", "FILE", "FILE.npz", "FILE.onnx", "FILE.toml")
 _SERVICES = {
     "gausslite-agent": ("gausslite_agent.settings", "build_parser"),
     "gausslite-fusion-server": ("gausslite_fusion_server.settings", "build_parser_with_commands"),
-    "gausslite-parser": ("gausslite_parser.settings", "build_parser"),
+    "gausslite-parser": ("gausslite_parser.program", "build_parser"),
 }
 """Modules and functions of the service programs; by name, because the services are siblings of the command line."""
 

@@ -6,37 +6,106 @@ import argparse
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
 
-from gausslite.cli.demo.report import agent_reports, demo_report, report_tables
-from gausslite.cli.demo.results_folder import remove_results, require_no_demo
-from gausslite.cli.demo.scenario import HOME_SIZE, Scenario, recorded_scenario, simulated_scenario
-from gausslite.cli.demo.services import DemoPlan, collect_maps, running_services, watch_missions
+from gausslite.cli.demo_services import (
+    HOME_SIZE,
+    AgentPlan,
+    DemoPlan,
+    Scenario,
+    agent_report,
+    collect_maps,
+    recorded_scenario,
+    remove_results,
+    require_no_demo,
+    running_services,
+    simulated_scenario,
+    watch_missions,
+)
 from gausslite.cli.map_inputs import mission_settings
 from gausslite.cli.source_options import RecordingOptions
 from gausslite.codec.ply import read_ply
-from gausslite.codec.png import write_png
+from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option, plain_options
-from gausslite.config.plain_values import Plain
 from gausslite.config.program import Program
-from gausslite.config.values import VOXEL_SIZE, read_text
-from gausslite.datasets.sequence_name import default_world_frame
-from gausslite.domain.names import require_name
+from gausslite.config.values import VOXEL_SIZE, Plain, read_text
+from gausslite.datasets.open import default_world_frame
+from gausslite.domain.checks import require_name
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.evaluation.team import TeamScores, score_team
+from gausslite.evaluation.compare import MapScores, TeamScores, score_team
 from gausslite.evaluation.views import HeldOutView, view_maps
-from gausslite.export.packages import import_extra
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_models
-from gausslite.mission.frame_stream import CorruptFrames
 from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
+from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
-from gausslite.process.messages import print_message
-from gausslite.process.siblings import Sibling, sibling
-from gausslite.wire.address import MAX_PORT
+from gausslite.process import Sibling, import_extra, print_message, sibling
+from gausslite.wire.channel import MAX_PORT
+
+_AGENT_KEYS = ("frames", "hz", "gaussians", "roi_share", "bytes_sent", "map_shared_percent")
+
+
+def demo_report(
+    options: argparse.Namespace,
+    scenario: Scenario,
+    agents: Mapping[str, object],
+    scores: Mapping[str, MapScores],
+    frames_corrupt: int,
+) -> dict[str, object]:
+    """Return report.json of the demo. frames_corrupt: number of held-out frames that cannot be read."""
+    registration, correction, prior = scenario.depth_registration, scenario.camera_correction, scenario.pose_prior
+    return {
+        "source": options.source or scenario.agents[0].source,
+        "colour_camera": None if registration is None else str(registration),
+        "camera_correction": None if correction is None else str(correction),
+        "view_error": None if prior.is_exact else str(prior),
+        "size": list(scenario.size),
+        "seed": options.seed,
+        "agents": dict(agents),
+        "maps": {name: asdict(score) for name, score in scores.items()},
+        "scored": {
+            "objects": sorted(scenario.regions),
+            "views": next(iter(scores.values())).n_views,
+            "frames_corrupt": frames_corrupt,
+            "fitted": scenario.fit_views,
+        },
+    }
+
+
+def agent_reports(agents: tuple[AgentPlan, ...], out: Path) -> dict[str, dict[str, object]]:
+    """Return the reports that the agents have written, with their tasks. Raises UnavailableError."""
+    reports = {}
+    for agent in agents:
+        report = agent_report(out, agent.agent_id)
+        reports[agent.agent_id] = {"task": agent.task, **{key: report[key] for key in _AGENT_KEYS}, **report}
+    return reports
+
+
+def report_tables(
+    agents: Mapping[str, Mapping[str, object]], scores: Mapping[str, MapScores], fitted_views: bool
+) -> str:
+    """Return a table of the agents and a table of the maps' scores, as text."""
+    lines = ["", f"{'agent':<10}{'frames':>8}{'Hz':>8}{'Gaussians':>11}{'ROI':>8}{'sent':>11}{'shared':>9}"]
+    for name, row in agents.items():
+        lines.append(
+            f"{name:<10}{row['frames']:>8}{row['hz']:>8.1f}{row['gaussians']:>11}{row['roi_share']:>8.1%}"
+            f"{_number(row['bytes_sent']) / 1e6:>8.2f} MB{_number(row['map_shared_percent']):>8.1f}%"
+        )
+    lines += ["", f"{'map':<15}{'ROI PSNR':>10}{'ROI SSIM':>10}{'full PSNR':>11}"]
+    for name, score in scores.items():
+        roi_psnr = "-" if score.roi_psnr is None else f"{score.roi_psnr:.2f} dB"
+        roi_ssim = "-" if score.roi_ssim is None else f"{score.roi_ssim:.3f}"
+        lines.append(f"{name:<15}{roi_psnr:>10}{roi_ssim:>10}{score.full_psnr:>8.2f} dB")
+    if fitted_views:
+        lines.append("pose and exposure of each held-out view were fitted, because keyframes were refined")
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +194,7 @@ def _page(options: argparse.Namespace, fusion_address: str) -> Iterator[None]:
     if options.view is None:
         yield
         return
-    with sibling(Sibling.LIVE_PAGE).live_page(options.view, fusion_address, is_agent=False) as url:
+    with sibling(Sibling.PAGES).live_page(options.view, fusion_address, is_agent=False) as url:
         print_message(f"the page is at {url}")
         yield
 

@@ -20,25 +20,20 @@ from gausslite.cli.source_options import (
     stated_values,
 )
 from gausslite.codec.ply import read_ply
-from gausslite.codec.png import write_png
+from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
 from gausslite.config.program import Program
 from gausslite.config.values import NONE, read_correction, read_registration_or_auto
-from gausslite.datasets.held_out import HeldOutSplit
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.datasets.source import Source
+from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose_correction import CorrectionTrack
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import Region
-from gausslite.evaluation.compare import MapScores, ViewScore, average, score_view
-from gausslite.evaluation.corrected import CorrectedScores
-from gausslite.evaluation.fitted import render_fitted
+from gausslite.domain.pose import CorrectionTrack
+from gausslite.domain.recording import PoseExposurePrior
+from gausslite.domain.relevance import Region
+from gausslite.evaluation.compare import CorrectedScores, MapScores, ViewScore, average, score_view
 from gausslite.evaluation.pictures import comparison_sheet
-from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, view_map
-from gausslite.mission.frame_stream import CorruptFrames
+from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, render_fitted, view_map
 from gausslite.mission.results import (
     EVALUATION,
     MAP_TO_ODOM,
@@ -50,9 +45,10 @@ from gausslite.mission.results import (
     read_trajectory,
     write_evaluation,
 )
+from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import PoseMode, SourceSettings, TaskSettings
-from gausslite.process.messages import print_message
-from gausslite.render.cpu_kernels import MAX_THREADS, choose_threads
+from gausslite.process import print_message
+from gausslite.render.cpu import MAX_THREADS, choose_threads
 
 _PICTURES = 8
 

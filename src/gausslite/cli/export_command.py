@@ -7,14 +7,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
-from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.codec.run_files import KeyframeView
 from gausslite.config.command_parser import bounded
 from gausslite.domain.errors import InvalidInputError
 from gausslite.evaluation.views import view_map
 from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map
 from gausslite.export.occupancy import OccupancySettings
 from gausslite.mission.results import as_text, prepare_folder, read_report, require_absent
-from gausslite.process.messages import print_message
+from gausslite.process import print_message
 
 _MESH_VOXEL_M, _OCCUPANCY_VOXEL_M, _MIN_OPACITY, _VIDEO_S = 0.01, 0.05, 0.3, 12.0
 _FORMATS_OF = {"voxel": ("octomap", "nav2", "mesh"), "min_opacity": ("octomap", "nav2"), "seconds": ("video",)}

@@ -12,9 +12,9 @@ from gausslite.config.command_parser import bounded
 from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid
-from gausslite.fusion.offline import fuse_maps
+from gausslite.fusion.vote import fuse_maps
 from gausslite.mission.results import MAP_FILE, as_text, prepare_file
-from gausslite.process.messages import print_message
+from gausslite.process import print_message
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

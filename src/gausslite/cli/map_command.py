@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from gausslite.cli.depth_check import depth_notes, require_mappable_depth
+import numpy as np
+
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
@@ -17,37 +19,38 @@ from gausslite.cli.source_options import (
     selected_regions,
     stated_values,
 )
-from gausslite.cli.trajectory_report import tracking_text, trajectory_report
-from gausslite.codec.object_report import noun_as_json, object_as_json
-from gausslite.codec.png import write_png
+from gausslite.codec.json import noun_as_json, object_as_json
+from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
 from gausslite.config.program import Program
-from gausslite.domain.errors import StorageError
+from gausslite.datasets.open import open_reference
+from gausslite.datasets.source import Source
+from gausslite.domain.checks import require_name
+from gausslite.domain.errors import DatasetError, PoseError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.names import require_name
-from gausslite.domain.region import Region
+from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text
 from gausslite.domain.task import TaskGraph
-from gausslite.evaluation.preview import render_preview
+from gausslite.evaluation.metrics import trajectory_error
+from gausslite.evaluation.pictures import render_preview
 from gausslite.evaluation.views import view_map
-from gausslite.export.packages import import_extra
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
-from gausslite.mission.folder_lock import locked_folder
-from gausslite.mission.frame_stream import CorruptFrames
-from gausslite.mission.keyframe_results import write_keyframes
-from gausslite.mission.map_recorder import MapRecorder
 from gausslite.mission.results import (
     PREVIEW,
+    locked_folder,
     peak_rss_mib,
     prepare_folder,
     require_additional_file,
     require_no_map,
+    write_keyframes,
     write_poses,
     write_results,
 )
-from gausslite.mission.runner import MissionResult, MissionRunner
+from gausslite.mission.runner import CorruptFrames, MissionResult, MissionRunner
+from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, TaskSchedule, Timeline
 from gausslite.mission.settings import (
     REMOVED,
     MissionSettings,
@@ -58,13 +61,65 @@ from gausslite.mission.settings import (
     TaskSettings,
 )
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.mission.task_schedule import ScheduledTaskMapper, TaskSchedule
-from gausslite.mission.timeline import Timeline
-from gausslite.process.interrupts import DeferredInterrupt
-from gausslite.process.messages import print_message
-from gausslite.process.siblings import Sibling, sibling
+from gausslite.process import DeferredInterrupt, Sibling, import_extra, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
-from gausslite.wire.address import MAX_PORT
+from gausslite.wire.channel import MAX_PORT
+
+_LEAST_DEPTH_M = 0.05
+_ADVICE = "check the depth unit, `scale` in cam_params.json"
+
+
+def require_mappable_depth(source: str, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
+    """Raise DatasetError for frames that gave no Gaussian: without depth, or with depth too far away."""
+    if result.totals.frames == 0:
+        raise DatasetError(f"{source}: expected frames with depth, got none in {result.processed}")
+    if result.stopped_by is None:
+        raise DatasetError(
+            f"{source}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
+            f"{_median_depth_m(keyframes):.3g} m; {_ADVICE}"
+        )
+
+
+def depth_notes(keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
+    """Return a note if the median depth is nearer than any depth camera measures."""
+    median_m = _median_depth_m(keyframes)
+    return (f"the median depth is {median_m:.2g} m; {_ADVICE}",) if median_m < _LEAST_DEPTH_M else ()
+
+
+def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:
+    medians = [
+        float(np.median(each.frame.depth_m[each.frame.depth_m > 0])) for each in keyframes if each.frame.has_depth
+    ]
+    return float(np.median(medians)) if medians else np.inf
+
+
+def trajectory_report(settings: SourceSettings, source: Source, mapper: TaskMapper) -> dict[str, object]:
+    """Return the ATE of the map's trajectory and of the given one, if true poses exist, and the tracking counts.
+
+    source: the sequence as it was mapped.
+    """
+    errors: dict[str, object] = {"ate": None, "given_ate": None, "tracking": dict(mapper.tracking_counts)}
+    try:
+        reference = open_reference(settings.spec, settings.depth_registration)
+        true = None if reference is None else reference.trajectory()
+        given = source.trajectory()
+    except (DatasetError, PoseError):  # a frame's damaged pose, reported when the frame was read
+        return errors
+    if true is not None and len(mapper.poses) > 0:
+        for name, estimated in (("ate", mapper.poses.trajectory()), ("given_ate", given)):
+            error = trajectory_error(estimated, true)
+            errors[name] = None if error is None else asdict(error)
+    return errors
+
+
+def tracking_text(report: Mapping[str, Any]) -> str:
+    """Return how frames were tracked, and the trajectory's error if the sequence has poses to compare with."""
+    counts = ", ".join(f"{count} {name}" for name, count in report["tracking"].items() if count)
+    ate = report["ate"]
+    if ate is None:
+        return f"tracking (frames): {counts}; the sequence has no poses to compare with"
+    return f"tracking (frames): {counts}; ATE {1e3 * ate['rmse_m']:.1f} mm RMSE over {ate['poses']} poses"
+
 
 _NOT_RESUMED = -1
 
@@ -300,7 +355,7 @@ def _view(
     if port is None:
         return nullcontext(lambda _outcome: None)
     page: AbstractContextManager[Callable[[FrameOutcome], None]]
-    page = sibling(Sibling.MISSION_PAGE).mission_view(port, mapper, task_at)
+    page = sibling(Sibling.PAGES).mission_view(port, mapper, task_at)
     return page
 
 

@@ -9,20 +9,19 @@ from typing import Any
 
 from gausslite.calibration.calibrate import StatedValues
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
-from gausslite.codec.task_json import graph_as_json
+from gausslite.codec.json import graph_as_json
 from gausslite.config.option import build, option
 from gausslite.config.values import AUTO, NONE
-from gausslite.datasets.selection import frame_step
-from gausslite.datasets.sequence_name import default_world_frame
-from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.datasets.open import default_world_frame
+from gausslite.datasets.source import Source, frame_step
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import Region
+from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
+from gausslite.domain.relevance import Region
 from gausslite.domain.state import get_text
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun
-from gausslite.mission.frame_stream import FrameStream
+from gausslite.mission.runner import FrameStream
+from gausslite.mission.schedule import TaskSchedule, TaskSwitch
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
@@ -31,8 +30,7 @@ from gausslite.mission.settings import (
     TaskSettings,
     default_policy,
 )
-from gausslite.mission.task_schedule import TaskSchedule, TaskSwitch
-from gausslite.process.messages import print_message
+from gausslite.process import print_message
 
 FRAMES_KEY = "frames"
 """Name of the text of --frames among the extra arrays of a saved run."""

@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _list(_: argparse.Namespace) -> int:
-    from gausslite.perception.models.catalogue import CATALOGUE
+    from gausslite.perception.models import CATALOGUE
 
     for entry in CATALOGUE:
         print(f"{entry.name:16} {entry.purpose} ({entry.licence})")
@@ -28,7 +28,7 @@ def _list(_: argparse.Namespace) -> int:
 
 
 def _source(options: argparse.Namespace) -> int:
-    from gausslite.perception.models.catalogue import entry_named
+    from gausslite.perception.models import entry_named
 
     entry = entry_named(options.name)
     print(f"file      {entry.file_name}: {entry.purpose}\nlicence   {entry.licence}\nproject   {entry.project}")
@@ -37,7 +37,7 @@ def _source(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> int:
-    from gausslite.perception.models.inspect import inspect
+    from gausslite.perception.models import inspect
 
     description = inspect(options.file)
     print(f"family    {description.family}\nsize      {description.size_bytes} bytes\nsha256    {description.sha256}")

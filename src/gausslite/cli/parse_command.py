@@ -7,12 +7,12 @@ import json
 import os
 from dataclasses import MISSING, dataclass
 
-from gausslite.codec.task_json import graph_as_json
+from gausslite.codec.json import graph_as_json
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option
 from gausslite.config.program import Program
 from gausslite.domain.task import TargetRole, TaskGraph
-from gausslite.task.backends import BackendSettings, open_parser
+from gausslite.task.rules import BackendSettings, open_parser
 
 
 @dataclass(frozen=True, slots=True)

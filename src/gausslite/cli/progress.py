@@ -10,7 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from gausslite.mission.task_mapper import FrameOutcome
-from gausslite.process.messages import printable
+from gausslite.process import printable
 
 _TERMINAL_INTERVAL_S, _LOG_INTERVAL_S = 0.2, 10.0
 

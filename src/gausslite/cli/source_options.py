@@ -21,15 +21,12 @@ from gausslite.config.values import (
 )
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import Region
-from gausslite.mission.frame_stream import region_file_note
+from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
+from gausslite.domain.relevance import Region
+from gausslite.mission.runner import region_file_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
-from gausslite.process.messages import print_message
-from gausslite.process.siblings import Sibling, sibling
+from gausslite.process import Sibling, print_message, sibling
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,11 @@ from jaxtyping import Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.codec.column_frame import Column
-from gausslite.codec.positions import PositionPrecision
-from gausslite.domain.arrays import require_finite
+from gausslite.codec.columns import Column, PositionPrecision
+from gausslite.domain.checks import require_finite
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelBatch
 
 VOXEL_BYTES = 8 + 8 + 4
 MAX_LABEL_BYTES = 4 + 2 + 1

@@ -12,11 +12,104 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
+import zstandard
 from jaxtyping import Float32, Int64, UInt8
 from numpy import ndarray
+from numpy.typing import NDArray
 
-from gausslite.domain.errors import CodecError
+from gausslite.domain.errors import CodecError, InvalidInputError
+from gausslite.domain.voxels import VoxelGrid
+
+_WINDOW_BYTES = 3
+
+
+def pack_bits(values: Int64[ndarray, " n"], widths: Int64[ndarray, " n"]) -> bytes:
+    """Return the low widths[i] bits of values[i], one value after the other; the last byte is filled with zeros."""
+    bit_indices = np.arange(int(widths.max(initial=0)))
+    bits = (values[:, None] >> bit_indices & 1).astype(np.uint8)
+    return np.packbits(bits[bit_indices < widths[:, None]], bitorder="little").tobytes()
+
+
+def unpack_bits(data: bytes, widths: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
+    """Return the values of these widths, each at most 17 bits.
+
+    Raises CodecError if the data has another size or a bit after the last.
+    """
+    ends = np.cumsum(widths)
+    total = int(ends[-1]) if len(ends) else 0
+    if len(data) != (total + 7) // 8:
+        raise CodecError(f"subset: expected {(total + 7) // 8} bytes of bit fields, got {len(data)}")
+    if total % 8 and data[-1] >> total % 8:
+        raise CodecError("subset: expected zeros after the last bit field, got other bits")
+    starts = ends - widths
+    first, padded = starts >> 3, np.frombuffer(data + bytes(_WINDOW_BYTES), np.uint8).astype(np.int64)
+    # a field of 17 bits that begins at the last bit of a byte ends in the second byte after it
+    window = padded[first] | padded[first + 1] << 8 | padded[first + 2] << 16
+    values: Int64[ndarray, " n"] = window >> (starts & 7) & (np.int64(1) << widths) - 1
+    return values
+
+
+_ZSTD_LEVEL = 3
+_MIN_WINDOW_BYTES = 1 << 10
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Type, such as <u4, and shape of an array in a frame."""
+
+    dtype: str
+    shape: tuple[int, ...]
+
+    @property
+    def byte_count(self) -> int:
+        """Bytes before compression."""
+        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+
+def compress_columns(arrays: Sequence[NDArray[Any]], columns: Sequence[Column]) -> bytes:
+    """Return the frame. The bytes of a column are shuffled: all first bytes, then all second bytes, and so on."""
+    packed = [
+        _shuffle(np.ascontiguousarray(array, column.dtype)) for array, column in zip(arrays, columns, strict=True)
+    ]
+    compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compressobj(size=sum(len(each) for each in packed))
+    parts = []
+    for each in packed:
+        parts += [compressor.compress(each), compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
+    return b"".join([*parts, compressor.flush()])
+
+
+def decompress_columns(frame: bytes, columns: Sequence[Column]) -> list[NDArray[Any]]:
+    """Return the arrays. Raises CodecError, before memory is allocated, if the frame declares another size."""
+    sizes = [column.byte_count for column in columns]
+    size = sum(sizes)
+    try:
+        header = zstandard.get_frame_parameters(frame)
+        if header.content_size != size or header.window_size > max(size, _MIN_WINDOW_BYTES):
+            raise CodecError(f"subset: expected a body of {size} bytes, got {header.content_size}")
+        raw = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise CodecError(f"subset: body is not one zstd frame: {error}") from error
+    arrays, start = [], 0
+    for column, byte_count in zip(columns, sizes, strict=True):
+        arrays.append(_unshuffle(raw[start : start + byte_count], column))
+        start += byte_count
+    return arrays
+
+
+def _shuffle(array: NDArray[Any]) -> bytes:
+    return array.view(np.uint8).reshape(-1, array.itemsize).T.tobytes()
+
+
+def _unshuffle(raw: bytes, column: Column) -> NDArray[Any]:
+    planes = np.frombuffer(raw, np.uint8).reshape(np.dtype(column.dtype).itemsize, -1)
+    return np.ascontiguousarray(planes.T).reshape(-1).view(column.dtype).reshape(column.shape)
+
 
 SCALE_STEPS_PER_OCTAVE = 7
 SCALE_MIN_EXPONENT = -20
@@ -140,3 +233,140 @@ def decode_rgb(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
     middle = luma - lime / 2
     blue = middle - orange / 2
     return np.stack([blue + orange, middle + lime, blue], axis=1).astype(np.float32)
+
+
+MAX_FINE_BITS = 15
+MIN_COARSE_BITS, MAX_COARSE_BITS = 2, 5
+_CELL_SHARE = 0.5
+# the centre of a cell of MAX_FINE_BITS is an odd number of these parts
+_FRACTIONS = 1 << (MAX_FINE_BITS + 1)
+
+
+@dataclass(frozen=True, slots=True)
+class PositionPrecision:
+    """Bits per axis of the positions of a message.
+
+    coarse_bits: those of the Morton code. scale_code: code of the scale that equals two voxels; a Gaussian whose
+    smallest scale has code c gets ceil((scale_code - c) / 7) bits, at least the coarse ones.
+    """
+
+    coarse_bits: int
+    scale_code: int
+
+    @classmethod
+    def of(cls, gaussians: int, voxels: int, grid: VoxelGrid) -> PositionPrecision:
+        """Return the precision for so many Gaussians in so many voxels: more coarse bits in fuller voxels."""
+        mean = max(gaussians, 1) / max(voxels, 1)
+        coarse = min(max(round(1.8 + math.log2(mean) / 2), MIN_COARSE_BITS), MAX_COARSE_BITS)
+        scale_code = math.ceil((math.log2(grid.size_m / _CELL_SHARE) - SCALE_MIN_EXPONENT) * SCALE_STEPS_PER_OCTAVE)
+        return cls(coarse, scale_code)
+
+    def bits(self, scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
+        """Return the bits per axis of each Gaussian's position."""
+        smallest = np.ascontiguousarray(scale_codes.T).min(axis=0).astype(np.int64)
+        bits = -((smallest - self.scale_code) // SCALE_STEPS_PER_OCTAVE)
+        clipped: Int64[ndarray, " n"] = np.clip(bits, self.coarse_bits, MAX_FINE_BITS)
+        return clipped
+
+
+def cells_of(
+    means_m: Float32[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"], grid: VoxelGrid
+) -> Int64[ndarray, "n 3"]:
+    """Return the cell of each mean in its voxel. Raises InvalidInputError if a mean is outside its voxel."""
+    exact = means_m.astype(np.float64)
+    if not np.array_equal(np.floor(exact / grid.size_m), voxel.astype(np.float64)):
+        raise InvalidInputError("voxel batch means_m: expected every mean inside its voxel, got one outside")
+    counts = (np.int64(1) << bits)[:, None]
+    # rounding to even makes the code stable where float32 has only the faces of the cell
+    cells = np.rint((exact - voxel * grid.size_m) * (counts / grid.size_m) - 0.5)
+    clipped: Int64[ndarray, "n 3"] = np.clip(cells, 0, counts - 1).astype(np.int64)
+    return clipped
+
+
+def centres_of(
+    cells: Int64[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"], grid: VoxelGrid
+) -> Float32[ndarray, "n 3"]:
+    """Return the float32 points inside the voxels that are nearest to the cells' centres."""
+    return points_of((2 * cells + 1) << (MAX_FINE_BITS - bits)[:, None], voxel, grid)
+
+
+def fractions_of(
+    means_m: Float32[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
+) -> Int64[ndarray, "n 3"]:
+    """Return the place of each mean in its voxel in 65536ths of the voxel's size; every cell's centre has one."""
+    offsets_m = means_m.astype(np.float64) - voxel * grid.size_m
+    fractions: Int64[ndarray, "n 3"] = np.clip(
+        np.rint(offsets_m * (_FRACTIONS / grid.size_m)), 0, _FRACTIONS - 1
+    ).astype(np.int64)
+    return fractions
+
+
+def points_of(
+    fractions: NDArray[np.integer[Any]], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
+) -> Float32[ndarray, "n 3"]:
+    """Return the float32 points inside the voxels that are nearest to these fractions."""
+    means_m = (voxel * grid.size_m + fractions * (grid.size_m / _FRACTIONS)).astype(np.float32)
+    # rounding to float32 can cross a voxel's face by one float
+    index = np.floor(means_m.astype(np.float64) / grid.size_m)
+    means_m = np.where(index < voxel, np.nextafter(means_m, np.float32(np.inf)), means_m)
+    return np.where(index > voxel, np.nextafter(means_m, np.float32(-np.inf)), means_m)
+
+
+def morton_codes(cells: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"], coarse_bits: int) -> Int64[ndarray, " n"]:
+    """Return the interleaved high bits of the cells' indices; x has the highest of three bits."""
+    coarse = cells >> (bits - coarse_bits)[:, None]
+    codes = np.zeros(len(cells), np.int64)
+    for place in range(coarse_bits):
+        for axis in range(3):
+            codes |= (coarse[:, axis] >> place & 1) << (3 * place + 2 - axis)
+    return codes
+
+
+def encode_positions(
+    cells: Int64[ndarray, "n 3"], codes: Int64[ndarray, " n"], bits: Int64[ndarray, " n"], starts: Int64[ndarray, " v"],
+    coarse_bits: int,
+) -> tuple[UInt8[ndarray, " n"], bytes]:  # fmt: skip
+    """Return the bit length of each difference of Morton codes, and all other bits packed.
+
+    The codes ascend within a voxel; starts are the rows at which the voxels begin.
+    """
+    deltas = np.diff(codes, prepend=0)
+    deltas[starts] = codes[starts]
+    lengths = np.ceil(np.log2(deltas + 1)).astype(np.int64)
+    fine = bits - coarse_bits
+    low = cells & ((np.int64(1) << fine) - 1)[:, None]
+    widths = np.concatenate([np.maximum(lengths - 1, 0), fine, fine, fine])
+    return lengths.astype(np.uint8), pack_bits(np.concatenate([deltas, *low.T]), widths)
+
+
+def decode_positions(
+    lengths: UInt8[ndarray, " n"], packed: bytes, bits: Int64[ndarray, " n"], starts: Int64[ndarray, " v"],
+    coarse_bits: int,
+) -> Int64[ndarray, "n 3"]:  # fmt: skip
+    """Return the cells. Raises CodecError for a Morton code out of range and other sizes of the packed bits."""
+    n, wide = len(lengths), lengths.astype(np.int64)
+    if (wide > 3 * coarse_bits).any():
+        raise CodecError(f"subset positions: expected differences of up to {3 * coarse_bits} bits, got a longer one")
+    fine = bits - coarse_bits
+    values = unpack_bits(packed, np.concatenate([np.maximum(wide - 1, 0), fine, fine, fine]))
+    # the highest bit of a difference is always one, so it is not stored
+    deltas = values[:n] | (np.int64(1) << wide) >> 1
+    totals = np.concatenate([np.zeros(1, np.int64), np.cumsum(deltas)])
+    codes = totals[1:] - np.repeat(totals[starts], np.diff(starts, append=n))
+    if (codes >> 3 * coarse_bits).any():
+        raise CodecError("subset positions: expected cells inside their voxels, got one outside")
+    cells: Int64[ndarray, "n 3"] = values[n:].reshape(3, n).T | _COARSE_CELLS[codes] << fine[:, None]
+    return cells
+
+
+def _coarse_cells() -> Int64[ndarray, "c 3"]:
+    """Return the three indices that each Morton code interleaves."""
+    codes = np.arange(1 << 3 * MAX_COARSE_BITS)
+    cells = np.zeros((len(codes), 3), np.int64)
+    for place in range(MAX_COARSE_BITS):
+        for axis in range(3):
+            cells[:, axis] |= (codes >> (3 * place + 2 - axis) & 1) << place
+    return cells
+
+
+_COARSE_CELLS = _coarse_cells()

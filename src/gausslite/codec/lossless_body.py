@@ -15,11 +15,10 @@ from gausslite.codec.body_layout import (
     encode_voxels,
     require_encodable,
 )
-from gausslite.codec.column_frame import Column, compress_columns, decompress_columns
+from gausslite.codec.columns import Column, compress_columns, decompress_columns
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 
 __all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
 

@@ -19,10 +19,10 @@ from jaxtyping import Float32
 from numpy import ndarray
 from numpy.typing import DTypeLike, NDArray
 
-from gausslite.codec.files import write_atomic
+from gausslite.codec.state_file import write_atomic
+from gausslite.domain.checks import require_name
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.names import require_name
 from gausslite.domain.relevance import NO_TARGET
 
 SH_C0 = 0.28209479177387814

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gausslite.codec import columns, positions
+from gausslite.codec import columns
+from gausslite.codec import columns as positions
 from gausslite.codec.body_layout import (
     MAX_LABEL_BYTES,
     VOXEL_BYTES,
@@ -27,11 +28,10 @@ from gausslite.codec.body_layout import (
     encode_labels,
     encode_voxels,
 )
-from gausslite.codec.column_frame import Column, compress_columns, decompress_columns
+from gausslite.codec.columns import Column, compress_columns, decompress_columns
 from gausslite.domain.errors import CodecError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 
 __all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
 

@@ -7,18 +7,95 @@ format cannot contain code.
 
 from __future__ import annotations
 
+import contextlib
+import os
+import tempfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from gausslite.codec.files import write_atomic_with
 from gausslite.domain.errors import MapFileError, StorageError
 from gausslite.domain.state import State
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write the bytes to a temporary file in the same folder, then rename it to `path`.
+
+    A device or pipe is written to directly. Raises StorageError if the folder is not writable or the disk is full.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            path.write_bytes(data)
+            return
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    write_atomic_with(path, lambda temporary: temporary.write_bytes(data))
+
+
+def write_atomic_with(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file in the same folder, then rename it to `path`.
+
+    Raises StorageError if `path` is not a regular file, the folder is not writable or the disk is full.
+    """
+    temporary: Path | None = None
+    try:
+        if path.exists() and not path.is_file():
+            raise StorageError(f"{path}: expected a regular file or none, got something else")
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        os.close(descriptor)
+        temporary = Path(name)
+        write(temporary)
+        _flush_to_disk(temporary)
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except BaseException as error:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+        if isinstance(error, OSError):
+            raise _cannot_write(path, error) from error
+        raise
+
+
+def _flush_to_disk(path: Path) -> None:
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def _cannot_write(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"{path}: cannot be written: {error.strerror or error}")
+
+
+def write_png(path: Path, image: UInt8[ndarray, "h w 3"]) -> None:
+    """Write an RGB image as PNG. Raises StorageError naming the file."""
+    import cv2
+
+    encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    write_atomic(path, encoded.tobytes())
+
+
+def read_png(path: Path) -> UInt8[ndarray, "h w 3"]:
+    """Read an RGB image. Raises MapFileError naming the file."""
+    import cv2
+
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise MapFileError(f"{path}: expected a PNG file, got {error.strerror}") from error
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if image is None:
+        raise MapFileError(f"{path}: expected a PNG file, got an unreadable one")
+    rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    return rgb
+
 
 FORMAT = "gausslite-state"
 VERSION = "2"

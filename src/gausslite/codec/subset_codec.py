@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from gausslite.codec import lossless_body, quantised_body
 from gausslite.codec.body_layout import BodyLayout, require_encodable
-from gausslite.codec.positions import MAX_COARSE_BITS, PositionPrecision
+from gausslite.codec.columns import MAX_COARSE_BITS, PositionPrecision
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 
 MAX_SUBSET_BYTES = 1 << 20
 VERSION = 2

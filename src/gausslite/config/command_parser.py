@@ -6,10 +6,10 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from gausslite.config.nearest import suggestion
-from gausslite.config.plain_values import describe_range, is_within, read_plain
+from gausslite.config.option import suggestion
+from gausslite.config.values import describe_range, is_within, read_plain
 from gausslite.domain.errors import InvalidInputError
-from gausslite.process.messages import printable
+from gausslite.process import printable
 
 PARSER = "_parser"
 """Name of the chosen command's parser among parsed arguments."""

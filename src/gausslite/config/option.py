@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
 import types
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from gausslite.config.plain_values import Plain, require_plain
-from gausslite.domain.arguments import require_instance
+from gausslite.config.values import Plain, require_plain
+from gausslite.domain.checks import require_instance
 
 _OPTION = "option"
 Settings = TypeVar("Settings")
@@ -163,3 +164,18 @@ def _without_none(kind: Any) -> Any:
         kinds = [part for part in get_args(kind) if part is not type(None)]
         return kinds[0] if len(kinds) == 1 else kind
     return kind
+
+
+_MIN_SIMILARITY = 0.75
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the most similar known name, None if none is similar."""
+    similar = difflib.get_close_matches(name, list(known), n=1, cutoff=_MIN_SIMILARITY)
+    return similar[0] if similar else None
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return "; did you mean NAME?" for the most similar known name, or an empty text if none is similar."""
+    similar = nearest(name, known)
+    return f"; did you mean {similar}?" if similar is not None else ""

@@ -6,18 +6,19 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from gausslite.datasets.corrected import UndistortedColourSource
 from gausslite.datasets.record3d import Record3dSource
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
-from gausslite.datasets.undistorted_colour import UndistortedColourSource
 from gausslite.datasets.zed import ZedSource
-from gausslite.domain.depth_registration import DepthRegistration
-from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.checks import require_name
+from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.pose import UpAxis
-from gausslite.process.siblings import Sibling, sibling
+from gausslite.domain.recording import DepthRegistration
+from gausslite.process import Sibling, sibling
 
 _READERS = (TumSource, SevenScenesSource, ReplicaSource, ZedSource, Record3dSource)
 _LAYOUTS = (
@@ -96,3 +97,12 @@ def _recognised(folder: Path) -> bool:
 
 def _open_folder(folder: Path, up_axis: UpAxis | None, require_poses: bool) -> Source | None:
     return next((reader(folder, up_axis, require_poses) for reader in _READERS if reader.recognises(folder)), None)
+
+
+def default_world_frame(source: Source) -> str:
+    """Return the name of the sequence's world frame; empty if the name cannot stand in a file header."""
+    try:
+        require_name("world frame", source.world_frame)
+    except InvalidInputError:
+        return ""
+    return source.world_frame

@@ -2,25 +2,237 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import re
+import weakref
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
+from numpy.typing import NDArray
 
-from gausslite.datasets.folder_source import FolderSource
-from gausslite.datasets.images import DepthUnits, RgbdImage, decode_image, resize_depth, resize_rgbd
-from gausslite.datasets.intrinsics import FolderCamera
-from gausslite.datasets.poses import estimate_up, is_lost, pose_from_quaternion
-from gausslite.datasets.record3d_files import METADATA, Record3dFiles
-from gausslite.datasets.record3d_metadata import Record3dMetadata
+from gausslite.datasets.files import (
+    DepthUnits,
+    FolderCamera,
+    RgbdImage,
+    decode_image,
+    require_pixel_count,
+    resize_depth,
+    resize_rgbd,
+)
+from gausslite.datasets.folder import FolderSource, estimate_up, is_lost, pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
-from gausslite.domain.errors import DatasetError
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import UpAxis, unit_up_axis
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
+
+METADATA = "metadata"
+_COLOUR_NAME = re.compile(r"rgbd/(\d{1,7})\.jpg")
+_MAX_FILE_BYTES = 1 << 28
+_UNCOMPRESSED, _LZVN, _LZFSE, _END = b"bvx-", b"bvxn", b"bvx2", b"bvx$"
+
+
+class Record3dFiles:
+    """The files by their names in the recording, such as "rgbd/0.jpg". Raises DatasetError."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._zip = path, None
+        if path.is_dir():
+            return
+        try:
+            self._zip = zipfile.ZipFile(path)
+        except (zipfile.BadZipFile, OSError) as error:
+            raise DatasetError(f"{path}: expected an .r3d file, which is a ZIP; {error}") from None
+        weakref.finalize(self, self._zip.close)
+
+    def path_of(self, name: str) -> str:
+        """Return the file's name for messages."""
+        return str(self._path / name)
+
+    def colour_numbers(self) -> list[int]:
+        """Return the numbers of the colour images, ascending."""
+        if self._zip is None:
+            names = [f"rgbd/{path.name}" for path in (self._path / "rgbd").glob("*.jpg")]
+        else:
+            names = self._zip.namelist()
+        return sorted(int(match.group(1)) for match in map(_COLOUR_NAME.fullmatch, names) if match)
+
+    def has(self, name: str) -> bool:
+        """True if the recording has this file."""
+        return (self._path / name).is_file() if self._zip is None else name in self._zip.NameToInfo
+
+    def read(self, name: str) -> bytes:
+        """Return a file's bytes. Raises DatasetError if it is missing, damaged or too large."""
+        if not self.has(name):
+            raise DatasetError(f"{self.path_of(name)}: expected this file of a Record3D recording, got none")
+        try:
+            file = self._path / name
+            size_bytes = file.stat().st_size if self._zip is None else self._zip.getinfo(name).file_size
+            if size_bytes > _MAX_FILE_BYTES:
+                raise DatasetError(f"{file}: expected at most {_MAX_FILE_BYTES} bytes, got {size_bytes}")
+            return file.read_bytes() if self._zip is None else self._zip.read(name)
+        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError) as error:
+            raise DatasetError(f"{self.path_of(name)}: expected a readable file; {error}") from None
+
+    def read_array(self, name: str, dtype: type[np.generic], count: int) -> NDArray[Any]:
+        """Return the `count` little-endian values of an LZFSE file.
+
+        The size that the file declares is checked before it is decompressed. Raises DatasetError, also without the
+        extra `record3d`.
+        """
+        data, location = self.read(name), self.path_of(name)
+        expected_bytes = count * np.dtype(dtype).itemsize
+        declared_bytes = _declared_bytes(data)
+        if declared_bytes != expected_bytes:
+            got = "bytes of another format" if declared_bytes is None else f"{declared_bytes} bytes"
+            raise DatasetError(f"{location}: expected {expected_bytes} bytes, compressed with LZFSE, got {got}")
+        lzfse = _lzfse(location)
+        try:
+            values = lzfse.decompress(data)
+        except lzfse.error as error:
+            raise DatasetError(f"{location}: expected undamaged LZFSE data; {error}") from None
+        if len(values) != expected_bytes:
+            raise DatasetError(f"{location}: expected {expected_bytes} bytes, compressed with LZFSE, got {len(values)}")
+        return np.frombuffer(values, np.dtype(dtype).newbyteorder("<")).astype(dtype)
+
+
+def _lzfse(location: str) -> Any:
+    try:
+        import lzfse
+    except ImportError:
+        raise DatasetError(
+            f"{location}: a Record3D recording needs the extra `record3d`; install it with: pip install "
+            "'gausslite[record3d]'"
+        ) from None
+    return lzfse
+
+
+def _declared_bytes(data: bytes) -> int | None:
+    """Return the sum of the blocks' uncompressed sizes; None for bytes that are no sequence of LZFSE blocks.
+
+    Source: lzfse_internal.h of the reference implementation. A block is a magic number, its uncompressed size, fields
+    by its type, and its payload.
+    """
+    total_bytes = offset = 0
+    while (magic := data[offset : offset + 4]) != _END:
+        raw_bytes = _unsigned(data, offset + 4, 4)
+        if magic == _UNCOMPRESSED:
+            block_bytes = 8 + raw_bytes
+        elif magic == _LZVN:
+            block_bytes = 12 + _unsigned(data, offset + 8, 4)
+        elif magic == _LZFSE:
+            first, second, third = (_unsigned(data, offset + at, 8) for at in (8, 16, 24))
+            block_bytes = (third & 0xFFFFFFFF) + (first >> 20 & 0xFFFFF) + (second >> 40 & 0xFFFFF)
+        else:
+            return None
+        if block_bytes < 8:
+            return None
+        total_bytes, offset = total_bytes + raw_bytes, offset + block_bytes
+    return total_bytes
+
+
+def _unsigned(data: bytes, offset: int, size_bytes: int) -> int:
+    return int.from_bytes(data[offset : offset + size_bytes], "little")
+
+
+_FOCAL_AND_CENTRE = (0, 4, 6, 7)
+"""Places of fx, fy, cx and cy in the 9 numbers of K, which are column-major."""
+_MAX_TIME_S = 9e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Record3dMetadata:
+    """What the metadata states; poses: rows of qx qy qz qw px py pz, camera to world with OpenGL axes.
+
+    camera: of the first frame. intrinsics: fx fy cx cy of each frame, or no row. depth_size: (width, height) of the
+    depth images, or None. times_s: of each frame, or empty; frames then follow each other at rate_hz.
+    """
+
+    camera: Camera
+    intrinsics: Float64[ndarray, "n 4"]
+    poses: Float64[ndarray, "m 7"]
+    times_s: Float64[ndarray, " k"]
+    rate_hz: float
+    depth_size: tuple[int, int] | None
+
+    @classmethod
+    def parse(cls, location: str, data: bytes) -> Record3dMetadata:
+        """Return the content of a metadata file. Raises DatasetError with the location."""
+        try:
+            fields = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise DatasetError(f"{location}: expected JSON; {str(error)[:120]}") from None
+        if not isinstance(fields, dict):
+            raise DatasetError(f"{location}: expected a JSON object, got {type(fields).__name__}")
+        width_px, height_px = _size(location, fields, "w", "h")
+        K = _numbers(location, fields, "K", (9,))
+        times_s = _numbers(location, fields, "frameTimestamps", (-1,), ())
+        if (np.diff(times_s) <= 0).any() or np.abs(times_s).max(initial=0.0) > _MAX_TIME_S:
+            raise DatasetError(f"{location}: frameTimestamps: expected ascending times in seconds")
+        rate_hz = float(_numbers(location, fields, "fps", (), 30))
+        if rate_hz <= 0:
+            raise DatasetError(f"{location}: fps: expected a positive number, got {rate_hz:g}")
+        return cls(
+            _camera(f"{location}: K", K[list(_FOCAL_AND_CENTRE)], width_px, height_px),
+            _numbers(location, fields, "perFrameIntrinsicCoeffs", (-1, 4), ()),
+            _numbers(location, fields, "poses", (-1, 7), ()),
+            times_s,
+            rate_hz,
+            _size(location, fields, "dw", "dh") if "dw" in fields or "dh" in fields else None,
+        )
+
+    def camera_at(self, location: str, number: int) -> Camera:
+        """Return the camera of a frame: the image stabiliser and the focus change it a little. Raises DatasetError."""
+        if number >= len(self.intrinsics):
+            return self.camera
+        return _camera(location, self.intrinsics[number], self.camera.width_px, self.camera.height_px)
+
+    def time_ns(self, number: int) -> int:
+        """Return a frame's time."""
+        seconds = float(self.times_s[number]) if number < len(self.times_s) else number / self.rate_hz
+        return round(seconds * 1e9)
+
+
+def _camera(location: str, intrinsics: Float64[ndarray, "4"], width_px: int, height_px: int) -> Camera:
+    """Return the camera; ARKit counts the principal point from the image's corner, as Camera does."""
+    try:
+        fx_px, fy_px, cx_px, cy_px = intrinsics.tolist()
+        return Camera(fx_px, fy_px, cx_px, cy_px, width_px, height_px)
+    except InvalidInputError as error:
+        raise DatasetError(f"{location}: {error}") from None
+
+
+def _size(location: str, fields: Mapping[str, Any], width_name: str, height_name: str) -> tuple[int, int]:
+    width_px, height_px = (int(_numbers(location, fields, name, ())) for name in (width_name, height_name))
+    require_pixel_count(f"{location}: {width_name}, {height_name}", width_px, height_px)
+    return width_px, height_px
+
+
+def _numbers(
+    location: str, fields: Mapping[str, Any], name: str, shape: tuple[int, ...], default: Any = None
+) -> Float64[ndarray, "..."]:
+    """Return a field as finite numbers of this shape, -1 for any length. Raises DatasetError."""
+    value = fields.get(name, default)
+    expected = f"{location}: {name}: expected finite numbers" + (f" of shape {shape}" if shape else "")
+    try:
+        array = np.array(value, np.float64)
+    except (ValueError, TypeError):
+        raise DatasetError(f"{expected}, got {str(value)[:60]!r}") from None
+    if array.size == 0 and shape:
+        array = array.reshape([max(side, 0) for side in shape])
+    fits = array.ndim == len(shape) and all(side in (-1, got) for side, got in zip(shape, array.shape, strict=True))
+    if not fits or not np.isfinite(array).all():
+        raise DatasetError(f"{expected}, got {'nothing' if value is None else str(value)[:60]}")
+    return array
+
 
 _FILE_ENDING = ".r3d"
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gausslite.domain.errors import DatasetError, InvalidInputError
-from gausslite.domain.region import BallRegion, Region, VoxelRegion
+from gausslite.domain.relevance import BallRegion, Region, VoxelRegion
 
 REGIONS_FILE = "roi_voxels.npz"
 """Name of the file in the folder of the sequence."""

@@ -8,15 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
-from gausslite.datasets.images import RgbdImage, resize_rgbd
-from gausslite.datasets.source import Source
-from gausslite.datasets.wrapped_source import WrappedSource
+from gausslite.datasets.files import RgbdImage, resize_rgbd
+from gausslite.datasets.source import Source, WrappedSource
 from gausslite.domain.camera import Camera
-from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory, inverse
+from gausslite.domain.recording import DepthRegistration
 
 _MAX_ZOOM = 4.0
 _BAND_ROWS = 40

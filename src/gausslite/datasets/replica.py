@@ -9,11 +9,15 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder_source import NumberedFolderSource
-from gausslite.datasets.images import DepthUnits
-from gausslite.datasets.intrinsics import CAMERA_FILE, find_in_or_above, read_json_camera
-from gausslite.datasets.poses import FIRST_VIEW_UP
-from gausslite.datasets.text_files import parse_numbers, read_rows
+from gausslite.datasets.files import (
+    CAMERA_FILE,
+    DepthUnits,
+    find_in_or_above,
+    parse_numbers,
+    read_json_camera,
+    read_rows,
+)
+from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis
 

@@ -9,11 +9,17 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder_source import NumberedFolderSource
-from gausslite.datasets.images import DepthUnits, first_readable_size
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
-from gausslite.datasets.poses import FIRST_VIEW_UP, estimate_up
-from gausslite.datasets.text_files import parse_numbers, read_rows
+from gausslite.datasets.files import (
+    CAMERA_FILE,
+    INTRINSICS_FILE,
+    DepthUnits,
+    FolderCamera,
+    first_readable_size,
+    parse_numbers,
+    read_folder_camera,
+    read_rows,
+)
+from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource, estimate_up
 from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis, unit_up_axis

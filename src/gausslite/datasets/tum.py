@@ -11,19 +11,23 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder_source import FolderSource
-from gausslite.datasets.images import DepthUnits, first_readable_size, load_rgbd
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
-from gausslite.datasets.pose_track import PoseTrack
-from gausslite.datasets.poses import FIRST_VIEW_UP, is_lost, pose_from_quaternion
+from gausslite.datasets.files import (
+    CAMERA_FILE,
+    INTRINSICS_FILE,
+    DepthUnits,
+    FolderCamera,
+    first_readable_size,
+    load_rgbd,
+    parse_numbers,
+    read_folder_camera,
+    read_rows,
+)
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, PoseTrack, is_lost, pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
-from gausslite.datasets.text_files import parse_numbers, read_rows
-from gausslite.domain.camera import FileIntrinsics
+from gausslite.domain.camera import FileIntrinsics, Lens, LensModel
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.pose import UpAxis, unit_up_axis
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 
 _UNITS = DepthUnits(per_metre=5000.0)
 _POSES = "groundtruth.txt"

@@ -6,15 +6,18 @@ centres, its reader adds 0.5 to cx and cy.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.arguments import require_whole
+from gausslite.domain.checks import require_array, require_whole
 from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.pose import Twist
 
 Value = TypeVar("Value", float, ndarray)
 _MAX_SIDE_PX = 16384
@@ -189,3 +192,185 @@ def project(points_camera: Float32[ndarray, "n 3"], camera: Camera) -> Float32[n
     inverse_z = 1.0 / points_camera[:, 2]
     columns, rows = camera.pixels(points_camera[:, 0] * inverse_z, points_camera[:, 1] * inverse_z)
     return np.stack([columns, rows], axis=1).astype(np.float32)
+
+
+MAX_READOUT_S = 0.1
+MAX_EXPOSURE_S = 0.1
+_MAX_READOUT_SHARE, _MIN_READOUT_FACTOR = 0.65, 0.5
+"""Limits as in the rasterizer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraMotion:
+    """How a camera moves while its rows are exposed, one after the other from the first to the last.
+
+    twist: velocity in the camera's axes at the middle row's time, which is the time of the image's pose. readout_s:
+    time from the first row's exposure to the last row's; negative if rows are read from the bottom; 0 for a global
+    shutter. exposure_s: duration of each row's exposure, centred on the row's time. Raises ShapeError,
+    InvalidInputError.
+    """
+
+    twist: Twist
+    readout_s: float = 0.0
+    exposure_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, velocity in (("linear_m_s", self.twist.linear_m_s), ("angular_rad_s", self.twist.angular_rad_s)):
+            require_array(f"camera motion {name}", velocity, (3,), np.float64)
+            if not np.isfinite(velocity).all():
+                raise InvalidInputError(f"camera motion {name}: expected finite values, got {velocity.tolist()}")
+        if not (math.isfinite(self.readout_s) and abs(self.readout_s) <= MAX_READOUT_S):
+            raise InvalidInputError(
+                f"camera motion readout_s: expected -{MAX_READOUT_S:g} to {MAX_READOUT_S:g}, got {self.readout_s}"
+            )
+        if not 0.0 <= self.exposure_s <= MAX_EXPOSURE_S:
+            raise InvalidInputError(
+                f"camera motion exposure_s: expected 0 to {MAX_EXPOSURE_S:g}, got {self.exposure_s}"
+            )
+
+    def to_middle_row(
+        self, points_m: Float64[ndarray, "n 3"], row_shares: Float64[ndarray, " n"]
+    ) -> Float64[ndarray, "n 3"]:
+        """Return points seen by a row of the image, in the frame of the camera at the middle row's time.
+
+        points_m: in the camera frame at the time of their row. row_shares: their rows, from 0 (top) to 1 (bottom).
+        """
+        time_s = (self.readout_s * (row_shares - 0.5))[:, None]
+        turned_m = np.cross(self.twist.angular_rad_s, points_m)
+        second_order_m = np.cross(self.twist.angular_rad_s, turned_m)
+        result: Float64[ndarray, "n 3"] = (
+            points_m + time_s * (self.twist.linear_m_s + turned_m) + 0.5 * time_s**2 * second_order_m
+        )
+        return result
+
+    def at_exposure(self, points_m: Float64[ndarray, "n 3"], camera: Camera) -> Float64[ndarray, "n 3"]:
+        """Return points of the camera frame at the middle row's time at the times when their rows are exposed.
+
+        points_m: in front of the camera. The same first-order model as in the rasterizer (render/rasterizer.py).
+        """
+        velocity = -(self.twist.linear_m_s + np.cross(self.twist.angular_rad_s, points_m))
+        tangent = points_m[:, 1] / points_m[:, 2]
+        rows_per_s = camera.fy_px * (velocity[:, 1] - tangent * velocity[:, 2]) / points_m[:, 2]
+        row_shares = (camera.fy_px * tangent + camera.cy_px) / camera.height_px
+        readout_factor = np.maximum(1.0 - rows_per_s * self.readout_s / camera.height_px, _MIN_READOUT_FACTOR)
+        shares = np.clip((row_shares - 0.5) / readout_factor, -_MAX_READOUT_SHARE, _MAX_READOUT_SHARE)
+        result: Float64[ndarray, "n 3"] = points_m + (self.readout_s * shares)[:, None] * velocity
+        return result
+
+    @property
+    def is_still(self) -> bool:
+        """True if the image is that of a camera at rest: no velocity, or neither readout nor exposure time."""
+        moves = bool(self.twist.linear_m_s.any() or self.twist.angular_rad_s.any())
+        return not moves or (self.readout_s == 0.0 and self.exposure_s == 0.0)
+
+
+_MAX_COEFFICIENT = 1e3
+_NEWTON_STEPS = 20
+_NEWTON_DIFFERENCE = 1e-6
+_UNDISTORT_TOLERANCE = 1e-7
+"""Largest error of an undistorted slope, distorted again: far below a pixel."""
+
+
+class LensModel(StrEnum):
+    """Distortion models, named as ROS camera calibrations name them."""
+
+    RADTAN = "radtan"
+    FISHEYE = "fisheye"
+
+
+_COUNTS = {LensModel.RADTAN: (4, 5, 8), LensModel.FISHEYE: (4,)}
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Distortion coefficients in OpenCV's order, without unit.
+
+    radtan: k1 k2 p1 p2, then k3, then k4 k5 k6 (4, 5 or 8 numbers). fisheye: k1 k2 k3 k4 of the equidistant model.
+    Raises InvalidInputError for another count and for values that are not finite.
+    """
+
+    model: LensModel
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        counts = _COUNTS[self.model]
+        if len(self.coefficients) not in counts:
+            expected = " or ".join(map(str, counts))
+            raise InvalidInputError(f"lens {self.model}: expected {expected} numbers, got {len(self.coefficients)}")
+        if not all(math.isfinite(value) and abs(value) <= _MAX_COEFFICIENT for value in self.coefficients):
+            raise InvalidInputError(
+                f"lens {self.model}: expected finite coefficients up to {_MAX_COEFFICIENT:g}, got {self.coefficients}"
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> Lens:
+        """Return the lens written as "MODEL:K1,K2,...". Raises InvalidInputError."""
+        model, _, numbers = text.partition(":")
+        try:
+            return cls(LensModel(model), tuple(float(number) for number in numbers.split(",")))
+        except ValueError:
+            models = " or ".join(LensModel)
+            raise InvalidInputError(f"lens: expected {models} as in radtan:0.1,-0.2,0,0,0, got {text[:60]!r}") from None
+
+    def __str__(self) -> str:
+        """Return the text that `parse` reads."""
+        return f"{self.model}:" + ",".join(f"{value:.10g}" for value in self.coefficients)
+
+    @property
+    def is_identity(self) -> bool:
+        """True if the image is that of a pinhole camera."""
+        return self.model is LensModel.RADTAN and not any(self.coefficients)
+
+    def distort(
+        self, x: Float64[ndarray, "*s"], y: Float64[ndarray, "*s"]
+    ) -> tuple[Float64[ndarray, "*s"], Float64[ndarray, "*s"]]:
+        """Return where a ray of slopes (x, y) meets the image plane at unit focal length."""
+        r2 = x * x + y * y
+        if self.model is LensModel.FISHEYE:
+            r = np.sqrt(r2)
+            theta = np.arctan(r)
+            t2 = theta * theta
+            k1, k2, k3, k4 = self.coefficients
+            distorted = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+            scale = np.where(r > 0, distorted / np.maximum(r, 1e-12), 1.0)
+            return x * scale, y * scale
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.coefficients, *(0.0,) * (8 - len(self.coefficients)))
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+
+    def undistort(
+        self, x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]
+    ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
+        """Return the slopes of the rays that meet the image plane at (x, y): the inverse of `distort`.
+
+        Raises InvalidInputError for a point that no ray meets, beyond the range in which the model can be inverted.
+        """
+        u, v, h = x, y, _NEWTON_DIFFERENCE
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON_STEPS):
+                error_x, error_y = (at - to for at, to in zip(self.distort(u, v), (x, y), strict=True))
+                if max(np.abs(error_x).max(initial=0.0), np.abs(error_y).max(initial=0.0)) <= _UNDISTORT_TOLERANCE:
+                    return u, v
+                right, left, below, above = (
+                    self.distort(u + du, v + dv) for du, dv in ((h, 0), (-h, 0), (0, h), (0, -h))
+                )
+                xu, yu, xv, yv = right[0] - left[0], right[1] - left[1], below[0] - above[0], below[1] - above[1]
+                scale = 2 * h / (xu * yv - xv * yu)
+                u, v = u - scale * (yv * error_x - xv * error_y), v - scale * (xu * error_y - yu * error_x)
+        worst = int(np.argmax(np.nan_to_num(np.hypot(error_x, error_y), nan=np.inf)))
+        raise InvalidInputError(
+            f"lens {self}: expected a model that can be inverted over the image, "
+            f"got none at the slope ({x[worst]:.2f}, {y[worst]:.2f})"
+        )
+
+
+class MotionModel(StrEnum):
+    """What predicts the motion since the last frame where features do not."""
+
+    VELOCITY = "velocity"
+    """The velocity between the last two frames."""
+    ODOMETRY = "odometry"
+    """The motion between the poses of the frames."""

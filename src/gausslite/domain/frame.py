@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.arguments import require_whole
-from gausslite.domain.arrays import require_array
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.checks import require_array, require_whole
 from gausslite.domain.errors import InvalidInputError, PoseError
 from gausslite.domain.pose import require_rigid
+
+_MIN_RELATIVE_JUMP = 0.04
+_NEIGHBOURS = np.ones((3, 3), np.uint8)
+
+
+def without_depth_edges(depth_m: Float32[ndarray, "h w"], distance_px: int) -> Float32[ndarray, "h w"]:
+    """Return a copy with depth 0 up to distance_px from a jump; with distance 0 the image itself.
+
+    A jump is where measured depths of a pixel and its eight neighbours differ by more than 4 % of the pixel's. Sensors
+    err there by centimetres to metres: the foreground is measured too large, and registration shifts its border.
+    """
+    if distance_px < 1:
+        return depth_m
+    measured = depth_m > 0
+    farthest = cv2.dilate(depth_m, _NEIGHBOURS)
+    nearest = cv2.erode(np.where(measured, depth_m, np.float32(np.inf)), _NEIGHBOURS)
+    jumps = measured & (farthest - nearest > np.float32(_MIN_RELATIVE_JUMP) * depth_m)
+    side = 2 * distance_px - 1
+    near_jumps = cv2.dilate(jumps.view(np.uint8), np.ones((side, side), np.uint8))
+    return np.where(near_jumps > 0, np.float32(0.0), depth_m)
+
 
 MAX_COORDINATE_M = 10_000.0
 """Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
@@ -64,3 +85,42 @@ class Frame:
     def has_depth(self) -> bool:
         """False if no pixel has a depth; such a frame cannot be mapped."""
         return bool((self.depth_m > 0).any())
+
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+# start-of-frame markers contain the size; C4, C8 and CC are tables
+_JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Return the declared (width, height) in pixels of a PNG or JPEG; None for other bytes."""
+    if data.startswith(_PNG) and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return int(width), int(height)
+    if not data.startswith(_JPEG):
+        return None
+    offset = 2
+    while offset + 9 <= len(data) and data[offset] == 0xFF:
+        marker = data[offset + 1]
+        if marker in _JPEG_SIZE_MARKERS:
+            height, width = struct.unpack_from(">HH", data, offset + 5)
+            return int(width), int(height)
+        # repeated FF bytes are padding before a marker
+        offset += 1 if marker == 0xFF else 2 + struct.unpack_from(">H", data, offset + 2)[0]
+    return None
+
+
+def has_whole_chunks(data: bytes) -> bool:
+    """Return False for a PNG with a chunk that ends outside the file: decoders allocate the length that it declares."""
+    offset = len(_PNG)
+    while data.startswith(_PNG) and offset + 8 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, offset)
+        offset += 12 + length
+        if kind == b"IEND":
+            break
+    return offset <= len(data)
+
+
+def linear_light(encoded: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+    """Return sRGB colours in [0, 1] as linear light in [0, 1], in the same precision (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

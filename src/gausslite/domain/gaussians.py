@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int16, UInt32
+from jaxtyping import Bool, Float32, Float64, Int16, Int64, UInt32
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.domain.arrays import require_array
+from gausslite.domain.checks import require_array
+from gausslite.domain.pose import transform_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,3 +69,68 @@ class Gaussians:
         if not parts:
             return cls.empty()
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+
+_ACTIVE_SHARE = 0.5
+
+
+def choose_gaussians(gaussians: Gaussians, limit: int) -> Int64[ndarray, " m"]:
+    """Return the ascending indices of at most `limit` Gaussians, the most important ones.
+
+    Up to half of them belong to the task's region (active); importance within each part is opacity times area.
+    """
+    if len(gaussians) <= limit:
+        return np.arange(len(gaussians))
+    importance = _importance(gaussians)
+    active, background = np.flatnonzero(gaussians.active), np.flatnonzero(~gaussians.active)
+    active_count = min(len(active), max(int(limit * _ACTIVE_SHARE), limit - len(background)))
+    parts = [_top(active, importance, active_count), _top(background, importance, limit - active_count)]
+    return np.sort(np.concatenate(parts))
+
+
+def _importance(gaussians: Gaussians) -> Float32[ndarray, " n"]:
+    ordered = np.sort(gaussians.scales_m, axis=1)
+    area: Float32[ndarray, " n"] = gaussians.opacities * ordered[:, 1] * ordered[:, 2]
+    return area
+
+
+def _top(rows: Int64[ndarray, " k"], importance: Float32[ndarray, " n"], count: int) -> Int64[ndarray, " c"]:
+    if count >= len(rows):
+        return rows
+    if count <= 0:
+        return rows[:0]
+    chosen: Int64[ndarray, " c"] = rows[np.argpartition(importance[rows], -count)[-count:]]
+    return chosen
+
+
+def move_gaussians(gaussians: Gaussians, T: Float64[ndarray, "4 4"]) -> Gaussians:
+    """Return the Gaussians moved by a rigid motion."""
+    if np.array_equal(T, np.eye(4)) or len(gaussians) == 0:
+        return gaussians
+    means = transform_points(T, gaussians.means_m.astype(np.float64)).astype(np.float32)
+    quats = _multiply(_quaternion(T[:3, :3]), gaussians.quats_wxyz.astype(np.float64)).astype(np.float32)
+    return replace(gaussians, means_m=means, quats_wxyz=quats)
+
+
+def _quaternion(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
+    """Return the unit quaternion (w, x, y, z) of a rotation: the main eigenvector of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    K = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    _, vectors = np.linalg.eigh(K)
+    quaternion: Float64[ndarray, "4"] = vectors[:, -1]
+    return quaternion
+
+
+def _multiply(left: Float64[ndarray, "4"], right: Float64[ndarray, "n 4"]) -> Float64[ndarray, "n 4"]:
+    """Return the Hamilton products of one quaternion (w, x, y, z) with many."""
+    w, x, y, z = left
+    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    product: Float64[ndarray, "n 4"] = right @ matrix.T
+    return product

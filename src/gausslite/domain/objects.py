@@ -2,15 +2,173 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib import resources
+from typing import Any
 
+from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.names import quote_name, require_name
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
+
+
+class MatchBasis(StrEnum):
+    """Why a noun is searched as these classes. SIMILAR classes are different things; NONE: there is no class."""
+
+    NAME = "name"
+    SYNONYM = "synonym"
+    TEXT_FEATURES = "text features"
+    GENERIC = "generic noun"
+    PHRASE = "any phrase"
+    REGION = "ground truth"
+    SIMILAR = "similar class"
+    NONE = "no class"
+
+
+@dataclass(frozen=True, slots=True)
+class NounMatch:
+    """The classes that a detector searches for one noun of a task.
+
+    similarity: cosine of the noun's and the class's centred text features, None without a comparison. accepted: False
+    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched. known:
+    the ground truth's regions, for a message.
+    """
+
+    noun: str
+    basis: MatchBasis
+    classes: tuple[str, ...] = ()
+    similarity: float | None = None
+    accepted: bool = True
+    known: tuple[str, ...] = ()
+
+    @property
+    def is_searched(self) -> bool:
+        """Return True if the detector can find the noun."""
+        return self.accepted and (bool(self.classes) or self.basis is MatchBasis.PHRASE)
+
+    @property
+    def warning(self) -> str | None:
+        """Return why the noun cannot be found or may be a different thing; None if it is searched as itself."""
+        if self.basis is MatchBasis.NONE:
+            return f"no class of the detector matches {self.noun!r}"
+        if self.basis is MatchBasis.REGION and not self.classes:
+            return f"no region matches {self.noun!r}; the regions are {', '.join(self.known) or 'none'}"
+        if self.basis is not MatchBasis.SIMILAR:
+            return None
+        similar = f"the class most similar to {self.noun!r} is {self.classes[0]!r} (similarity {self.similarity:.2f})"
+        if self.accepted:
+            return f"{similar}: it counts as {self.noun!r}, because similar classes are accepted"
+        return f"{similar}, a different thing: nothing is searched; accept-similar = true accepts it"
+
+    def describe(self) -> str:
+        """Return one line for the operator."""
+        if self.warning is not None:
+            return self.warning
+        if self.basis is MatchBasis.GENERIC:
+            return f"{self.noun!r} matches {len(self.classes)} classes of the detector ({self.basis})"
+        if self.basis is MatchBasis.PHRASE:
+            return f"{self.noun!r} is searched as a phrase"
+        similarity = "" if self.similarity is None else f", similarity {self.similarity:.2f}"
+        return f"{self.noun!r} is searched as {', '.join(map(repr, self.classes))} ({self.basis}{similarity})"
+
+
+@dataclass(frozen=True, slots=True)
+class NounReport:
+    """A noun's match, and what has been detected of it so far.
+
+    detections: number of detections in all frames. best_score: the highest score, 0 without a detection. objects: the
+    number of confirmed objects. rival: the class that detections of this noun rather show, None without one.
+    """
+
+    match: NounMatch
+    detections: int = 0
+    best_score: float = 0.0
+    objects: int = 0
+    rival: str | None = None
+
+    def describe(self) -> str:
+        """Return one line for the operator."""
+        found = f"{self.detections} detections, best score {self.best_score:.2f}, {self.objects} confirmed"
+        return f"{self.match.describe()}: {found}" if self.match.is_searched else self.match.describe()
+
+
+def match_warnings(matches: Sequence[NounMatch]) -> tuple[str, ...]:
+    """Return one message for each noun that cannot be found or may be a different thing."""
+    return tuple(match.warning for match in matches if match.warning is not None)
+
+
+@functools.cache
+def words() -> dict[str, Any]:
+    """Return the tables of `words.toml`: nouns, sizes, heights and colours. The file is read once."""
+    return tomllib.loads(resources.files("gausslite.domain").joinpath("words.toml").read_text(encoding="utf-8"))
+
+
+@functools.cache
+def synonyms() -> dict[str, str]:
+    """Return the canonical name of each noun that has one."""
+    return {name: row[0] for row in words()["nouns"]["synonyms"] for name in row}
+
+
+def head_of(phrase: str) -> str:
+    """Return the head noun: "lawn chair" → "chair", "mug_2" → "mug"."""
+    return normalised_noun(phrase).rpartition(" ")[2]
+
+
+def normalised_noun(phrase: str) -> str:
+    """Return the phrase without a trailing number and with plain spaces: "dining_table_1" → "dining table"."""
+    parts = phrase.casefold().replace("_", " ").replace("-", " ").split()
+    while len(parts) > 1 and parts[-1].isdigit():
+        parts.pop()
+    return " ".join(parts)
+
+
+def is_generic(phrase: str) -> bool:
+    """Return True if the phrase means any object."""
+    return head_of(phrase) in words()["nouns"]["generic"]
+
+
+def is_structure(phrase: str) -> bool:
+    """Return True for parts of a building or of the ground: walls, floors, doors, rooms, roads."""
+    return head_of(phrase) in words()["nouns"]["structure"]
+
+
+def is_solid(phrase: str) -> bool:
+    """Return True for a kind of object that is never a thin plane, as floors, walls, screens and rugs are."""
+    return head_of(phrase) in words()["nouns"]["solid"]
+
+
+def largest_size(phrase: str) -> tuple[float, float]:
+    """Return the longest plausible side of an object in metres, and its largest share of an image without depth."""
+    head = head_of(phrase)
+    row = next(row for row in words()["sizes"] if head in row.get("nouns", (head,)))
+    return row["longest_m"], row["image_share"]
+
+
+def same_kind(phrase: str, name: str) -> bool:
+    """Return True if a task's phrase means objects of this name: equal heads, or synonyms."""
+    if is_generic(phrase):
+        return not is_structure(name)
+    noun, other = normalised_noun(phrase), normalised_noun(name)
+    if noun == other or head_of(noun) == head_of(other):
+        return True
+    canonical = synonyms().get(noun, synonyms().get(head_of(noun)))
+    return canonical is not None and canonical == synonyms().get(other, synonyms().get(head_of(other)))
+
+
+def meant_by(phrase: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of objects that a task's phrase means: those with its head, or its synonyms if there are none.
+
+    "table" means a coffee table and not the counter, but a counter where there is no table; "chair" includes armchairs.
+    """
+    same = tuple(name for name in names if same_kind(phrase, name))
+    head = head_of(normalised_noun(phrase))
+    return tuple(name for name in same if head_of(normalised_noun(name)).endswith(head)) or same
+
 
 MAX_OBJECTS_PER_AGENT = 200
 NO_TARGET_INDEX = -1

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from gausslite.domain.errors import TaskError
+
 _NUMBER_SUFFIX: Final = re.compile(r"_\d+$")
 
 
@@ -138,3 +140,98 @@ class TaskGraph:
 def noun_of(name: str) -> str:
     """Return the noun of an object's name: "block_2" is a "block"."""
     return _NUMBER_SUFFIX.sub("", name)
+
+
+EXAMPLE = "'Pick up the mug on the table'"
+
+
+@dataclass(frozen=True, slots=True)
+class TaskLimits:
+    """Largest sizes of a task and its graph."""
+
+    max_text_chars: int = 1000
+    max_targets: int = 16
+    max_anchors: int = 16
+    max_phrase_chars: int = 64
+    max_relations: int = 64
+    max_warnings: int = 64
+    max_distance_m: float = 10_000.0
+
+
+LIMITS = TaskLimits()
+
+
+def require_task_text(text: str, limits: TaskLimits = LIMITS) -> None:
+    """Raise TaskError unless the text is UTF-8, contains a letter and is short enough."""
+    if len(text) > limits.max_text_chars:
+        raise TaskError(f"task text: expected at most {limits.max_text_chars} characters, got {len(text)}")
+    # surrogates: Python's form of bytes that are not UTF-8, which neither messages nor files can store
+    if any("\ud800" <= character <= "\udfff" for character in text):
+        raise TaskError(f"task text: expected UTF-8, got bytes of another encoding in {text.strip()!r}")
+    if not any(character.isalpha() for character in text):
+        raise TaskError(f"task text: expected a sentence that names an object, such as {EXAMPLE}, got {text.strip()!r}")
+
+
+def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
+    """Raise TaskError unless the graph is within the limits and its relations join listed nouns.
+
+    The text is empty if the graph was not parsed from a sentence.
+    """
+    if graph.text:
+        require_task_text(graph.text, limits)
+    if not graph.targets:
+        raise TaskError(f"task targets: expected at least one object, such as in {EXAMPLE}, got none")
+    if len(graph.roles) != len(graph.targets):
+        raise TaskError(f"task roles: expected one for each of {len(graph.targets)} targets, got {len(graph.roles)}")
+    for role, names, max_count in (
+        ("targets", graph.targets, limits.max_targets),
+        ("anchors", graph.anchors, limits.max_anchors),
+        ("excluded", graph.excluded, limits.max_targets),
+        ("context", graph.context, limits.max_anchors),
+    ):
+        _require_phrases(role, names, max_count, limits.max_phrase_chars)
+    both = set(graph.excluded) & {*graph.targets, *graph.anchors}
+    if both:
+        raise TaskError(
+            f"task excluded: expected other objects than targets and anchors, got {', '.join(sorted(both))}"
+        )
+    if len(graph.relations) > limits.max_relations or len(graph.warnings) > limits.max_warnings:
+        expected = f"{limits.max_relations} relations and {limits.max_warnings} warnings"
+        raise TaskError(f"task: expected at most {expected}, got {len(graph.relations)} and {len(graph.warnings)}")
+    for relation in graph.relations:
+        _require_relation(relation, graph, limits)
+    _require_attributes(graph, limits)
+
+
+def _require_relation(relation: Relation, graph: TaskGraph, limits: TaskLimits) -> None:
+    if relation.target not in graph.targets:
+        raise TaskError(f"task {relation.predicate}: expected one of the targets first, got {relation.target!r}")
+    if relation.anchor not in graph.anchors:
+        raise TaskError(f"task {relation.predicate}: expected one of the anchors last, got {relation.anchor!r}")
+    low_m, high_m = relation.min_m or 0.0, limits.max_distance_m if relation.max_m is None else relation.max_m
+    if not 0.0 <= low_m <= high_m <= limits.max_distance_m:
+        expected = f"0 <= min_m <= max_m <= {limits.max_distance_m:g}"
+        raise TaskError(f"task {relation.predicate}: expected {expected}, got {relation.min_m} and {relation.max_m}")
+
+
+def _require_attributes(graph: TaskGraph, limits: TaskLimits) -> None:
+    known = {*graph.targets, *graph.anchors, *graph.excluded}
+    names = tuple(each.name for each in graph.attributes)
+    if len(set(names)) != len(names) or not known.issuperset(names):
+        raise TaskError(f"task attributes: expected each object of the graph at most once, got {', '.join(names)}")
+    _require_phrases(
+        "colours", tuple(dict.fromkeys(each.colour for each in graph.attributes if each.colour is not None)),
+        len(names), limits.max_phrase_chars,
+    )  # fmt: skip
+
+
+def _require_phrases(role: str, phrases: tuple[str, ...], max_count: int, max_chars: int) -> None:
+    if len(phrases) > max_count:
+        raise TaskError(f"task {role}: expected at most {max_count} objects, got {len(phrases)}")
+    if len(set(phrases)) != len(phrases):
+        raise TaskError(f"task {role}: expected each object once, got {', '.join(phrases)}")
+    for phrase in phrases:
+        if not phrase.strip() or phrase != phrase.strip() or not phrase.isprintable():
+            raise TaskError(f"task {role}: expected printable phrases without outer spaces, got {phrase!r}")
+        if len(phrase) > max_chars:
+            raise TaskError(f"task {role}: expected phrases of at most {max_chars} characters, got {len(phrase)}")

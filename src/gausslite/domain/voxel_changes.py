@@ -2,16 +2,129 @@
 
 from __future__ import annotations
 
+import itertools
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int64, UInt64
 from numpy import ndarray
+from numpy.typing import NDArray
 
-from gausslite.domain.errors import MapFileError
+from gausslite.domain.errors import MapFileError, RevisionGoneError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array
-from gausslite.domain.voxel_operations import VoxelIndex
+from gausslite.domain.voxels import VoxelIndex, tiles_of
+
+
+def hash_columns(*columns: NDArray[Any]) -> UInt64[ndarray, " n"]:
+    """Return a 64-bit hash of each row of these integer columns; the same in every process and on every machine.
+
+    Each column is mixed in with SplitMix64 (Steele et al., OOPSLA 2014). It is no protection against forgery.
+    """
+    hashed = np.zeros(len(columns[0]), np.uint64)
+    for column in columns:
+        hashed = (hashed ^ column.astype(np.uint64)) + np.uint64(0x9E3779B97F4A7C15)
+        hashed = (hashed ^ (hashed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        hashed = (hashed ^ (hashed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        hashed ^= hashed >> np.uint64(31)
+    return hashed
+
+
+MAX_REMOVED_VOXELS = 100_000
+
+
+class RevisionLog:
+    """Records the last change of every voxel of a map, so that a watcher can get the changes that it has missed.
+
+    The log has one entry for each voxel of the map, plus the latest `max_removed` voxels that became empty. A watcher
+    that misses an older removal has to begin with a snapshot. `first_revision` must exceed all revisions from before a
+    restart.
+    """
+
+    def __init__(self, first_revision: int, max_removed: int = MAX_REMOVED_VOXELS) -> None:
+        self._revision = self._oldest = first_revision
+        self._max_removed = max_removed
+        # both in the order of the revisions, so that changed_since reads only what changed
+        self._changed_at: dict[int, int] = {}
+        self._removed_at: OrderedDict[int, int] = OrderedDict()
+
+    @property
+    def revision(self) -> int:
+        """The map's current revision."""
+        return self._revision
+
+    def record(self, changed: Iterable[int], removed: Iterable[int], revision: int) -> None:
+        """Set the current revision, at which these voxels changed or became empty."""
+        self._revision = revision
+        for key in changed:
+            self._removed_at.pop(key, None)
+            self._changed_at.pop(key, None)
+            self._changed_at[key] = revision
+        for key in removed:
+            del self._changed_at[key]
+            self._removed_at[key] = revision
+            if len(self._removed_at) > self._max_removed:
+                _, dropped_revision = self._removed_at.popitem(last=False)
+                self._oldest = max(self._oldest, dropped_revision)
+
+    def changed_at(self, key: int) -> int:
+        """Return the revision at which a voxel of the map last changed; 0 if it is not in the map."""
+        return self._changed_at.get(key, 0)
+
+    def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
+        """Return the keys of the voxels that changed or became empty after this revision, ascending.
+
+        Raises RevisionGoneError if the revision is from before a restart, or older than a removal no longer recorded.
+        """
+        if not self._oldest <= revision <= self._revision:
+            raise RevisionGoneError(
+                f"since_revision: expected {self._oldest} to {self._revision}, or 0 for a snapshot, got {revision}"
+            )
+        recent = [*_keys_after(self._changed_at, revision), *_keys_after(self._removed_at, revision)]
+        return np.sort(np.array(recent, np.int64))
+
+
+def _keys_after(revisions: dict[int, int], revision: int) -> Iterator[int]:
+    return itertools.takewhile(lambda key: revisions[key] > revision, reversed(revisions))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileDigests:
+    """For each tile of 16 x 16 x 16 voxels the sum, modulo 2^64, of the hashes of its (voxel key, update_seq).
+
+    tiles are ascending; tile_of names them.
+    """
+
+    tiles: Int64[ndarray, " t"]
+    hashes: UInt64[ndarray, " t"]
+
+    @classmethod
+    def of(cls, keys: Int64[ndarray, " k"], update_seqs: Int64[ndarray, " k"]) -> TileDigests:
+        """Return the digests of these updates, in any order."""
+        return _sum_by_tile(tiles_of(keys), hash_columns(keys, update_seqs))
+
+    @classmethod
+    def sum_of(cls, parts: Iterable[TileDigests]) -> TileDigests:
+        """Return the digests of the updates of all parts, which share no voxel."""
+        each = [(part.tiles, part.hashes) for part in parts] or [(np.zeros(0, np.int64), np.zeros(0, np.uint64))]
+        return _sum_by_tile(np.concatenate([tiles for tiles, _ in each]), np.concatenate([own for _, own in each]))
+
+    def differing(self, other: TileDigests) -> Int64[ndarray, " d"]:
+        """Return the tiles of these digests that `other` does not have, or has with another hash."""
+        _, own, theirs = np.intersect1d(self.tiles, other.tiles, assume_unique=True, return_indices=True)
+        differs = np.ones(len(self.tiles), np.bool_)
+        differs[own] = self.hashes[own] != other.hashes[theirs]
+        return self.tiles[differs]
+
+
+def _sum_by_tile(tiles: Int64[ndarray, " k"], hashes: UInt64[ndarray, " k"]) -> TileDigests:
+    names, index = np.unique(tiles, return_inverse=True)
+    sums = np.zeros(len(names), np.uint64)
+    np.add.at(sums, index.reshape(-1), hashes)
+    return TileDigests(names, sums)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

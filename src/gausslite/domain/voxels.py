@@ -3,12 +3,76 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64, UInt32, UInt64
 from numpy import ndarray
+from numpy.typing import NDArray
 
+from gausslite.domain.checks import require_array
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import Gaussians
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelBatch:
+    """The complete content of each listed voxel.
+
+    keys are strictly ascending; gaussians are sorted by voxel, counts[i] of them in keys[i]. A count of 0 is a
+    tombstone (the voxel is empty now). kappa_sums are TOTALS of the voxel, never increments, so that an update may
+    arrive twice or out of order.
+    """
+
+    keys: Int64[ndarray, " v"]
+    kappa_sums: UInt64[ndarray, " v"]
+    counts: UInt32[ndarray, " v"]
+    gaussians: Gaussians
+
+    def __post_init__(self) -> None:
+        v = len(self.keys)
+        require_array("voxel batch keys", self.keys, (v,), np.int64)
+        require_array("voxel batch kappa_sums", self.kappa_sums, (v,), np.uint64)
+        require_array("voxel batch counts", self.counts, (v,), np.uint32)
+        if v > 1 and not (np.diff(self.keys) > 0).all():
+            raise InvalidInputError("voxel batch keys: expected strictly ascending voxel keys")
+        total = int(self.counts.sum(dtype=np.int64))
+        if total != len(self.gaussians):
+            raise InvalidInputError(
+                f"voxel batch counts: expected a sum of {len(self.gaussians)} (the Gaussians present), got {total}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def offsets(self) -> Int64[ndarray, " v1"]:
+        """gaussians[offsets[i] : offsets[i + 1]] belong to keys[i]."""
+        return np.concatenate([np.zeros(1, np.int64), np.cumsum(self.counts, dtype=np.int64)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoiSubset:
+    """One message of an agent: its updates of some voxels.
+
+    update_seq: sequence number of these updates; in each voxel, the update with the highest one is the latest.
+    message_seq: number of the message in its session, for cumulative acknowledgements.
+    """
+
+    agent_id: str
+    session_id: str
+    message_seq: int
+    update_seq: int
+    batch: VoxelBatch
+
+    def __post_init__(self) -> None:
+        if not self.agent_id:
+            raise InvalidInputError("subset agent_id: expected a name, got an empty string")
+        if self.message_seq < 0 or self.update_seq < 0:
+            raise InvalidInputError(
+                f"subset message_seq and update_seq: expected at least 0, got {self.message_seq} and {self.update_seq}"
+            )
+
 
 MIN_VOXEL_M, MAX_VOXEL_M = 0.001, 1000.0
 _BITS_PER_AXIS = 21
@@ -141,3 +205,112 @@ class VoxelVotes:
         """The winner's lead in kappa_sum over the second; its own kappa_sum without a second agent."""
         second = self.scores[1].kappa_sum if len(self.scores) > 1 else 0
         return self.scores[0].kappa_sum - second
+
+
+def empty_batch() -> VoxelBatch:
+    """Return a batch without voxels."""
+    return VoxelBatch(np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint32), Gaussians.empty())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelIndex:
+    """Points grouped by voxel, keys ascending: points rows[starts[i] : starts[i] + counts[i]] are in keys[i].
+
+    Within a voxel, the points keep their order.
+    """
+
+    keys: Int64[ndarray, " v"]
+    starts: Int64[ndarray, " v"]
+    counts: Int64[ndarray, " v"]
+    rows: Int64[ndarray, " n"]
+
+    @classmethod
+    def from_points(cls, points_m: Float32[ndarray, "n 3"], grid: VoxelGrid) -> VoxelIndex:
+        """Group points by voxel. Raises InvalidInputError for points outside the grid's range."""
+        rows, starts = grid.sort_by_voxel(points_m)
+        return cls(grid.keys(points_m[rows[starts]]), starts, np.diff(starts, append=len(rows)), rows)
+
+    def sums(self, values: UInt32[ndarray, " n"] | UInt64[ndarray, " n"]) -> UInt64[ndarray, " v"]:
+        """Return the sum of the points' values in each voxel."""
+        if len(self.starts) == 0:
+            return np.zeros(0, np.uint64)
+        sums: UInt64[ndarray, " v"] = np.add.reduceat(values[self.rows], self.starts, dtype=np.uint64)
+        return sums
+
+    def rows_in(self, selected: Bool[ndarray, " v"]) -> Int64[ndarray, " m"]:
+        """Return the indices of the points in the selected voxels, voxel by voxel."""
+        rows: Int64[ndarray, " m"] = self.rows[np.repeat(selected, self.counts)]
+        return rows
+
+
+def group_by_voxel(gaussians: Gaussians, grid: VoxelGrid) -> VoxelBatch:
+    """Return the batch of all voxels of these Gaussians (Sec. III-E); their order within a voxel is kept.
+
+    Raises InvalidInputError for means outside the grid's range.
+    """
+    voxels = VoxelIndex.from_points(gaussians.means_m, grid)
+    return VoxelBatch(
+        voxels.keys, voxels.sums(gaussians.kappa), voxels.counts.astype(np.uint32), gaussians.take(voxels.rows)
+    )
+
+
+def tombstones(keys: Int64[ndarray, " k"]) -> VoxelBatch:
+    """Return a batch of tombstones for these ascending voxel keys."""
+    return VoxelBatch(keys, np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint32), Gaussians.empty())
+
+
+def merge_batches(*batches: VoxelBatch) -> VoxelBatch:
+    """Return the voxels of all batches, which must be disjoint; empty without batches."""
+    if not batches:
+        return empty_batch()
+    keys = np.concatenate([batch.keys for batch in batches])
+    order = np.argsort(keys, kind="stable")
+    counts = np.concatenate([batch.counts for batch in batches])
+    starts = np.cumsum(counts, dtype=np.int64) - counts
+    rows = gather_rows(starts[order], counts[order])
+    sums = np.concatenate([batch.kappa_sums for batch in batches])
+    gaussians = Gaussians.concatenate([batch.gaussians for batch in batches]).take(rows)
+    return VoxelBatch(keys[order], sums[order], counts[order], gaussians)
+
+
+def replace_voxels(older: VoxelBatch, newer: VoxelBatch) -> VoxelBatch:
+    """Return the voxels of both batches; a voxel of both is the newer one."""
+    return merge_batches(select_voxels(older, ~np.isin(older.keys, newer.keys)), newer)
+
+
+def gather_rows(starts: NDArray[Any], counts: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the indices start, start + 1, … of every run (start, count), concatenated."""
+    ends = np.cumsum(counts, dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    shift = np.repeat(starts.astype(np.int64) - (ends - counts), counts)
+    rows: NDArray[np.int64] = np.arange(total, dtype=np.int64) + shift
+    return rows
+
+
+def select_voxels(batch: VoxelBatch, keep: Bool[ndarray, " v"]) -> VoxelBatch:
+    """Return the voxels where `keep` is True."""
+    counts = batch.counts[keep]
+    rows = gather_rows(batch.offsets[:-1][keep], counts)
+    return VoxelBatch(batch.keys[keep], batch.kappa_sums[keep], counts, batch.gaussians.take(rows))
+
+
+def crop_to_box(batch: VoxelBatch, box: AxisAlignedBox, grid: VoxelGrid) -> VoxelBatch:
+    """Return the voxels whose centre is in the box."""
+    return select_voxels(batch, box.contains(grid.centres_m(batch.keys)))
+
+
+def select_keys(batch: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
+    """Return the voxels of the batch that are in `keys`, which may be unsorted."""
+    wanted = np.unique(keys)
+    rows = np.searchsorted(batch.keys, wanted)
+    rows = rows[np.append(batch.keys, np.int64(-1))[rows] == wanted]
+    counts, starts = batch.counts[rows], batch.offsets[rows]
+    gaussians = batch.gaussians.take(gather_rows(starts, counts))
+    return VoxelBatch(batch.keys[rows], batch.kappa_sums[rows], counts, gaussians)
+
+
+def slice_voxels(batch: VoxelBatch, start: int, stop: int) -> VoxelBatch:
+    """Return the voxels with the indices start to stop - 1, or fewer at the end of the batch."""
+    stop = min(stop, len(batch))
+    gaussians = batch.gaussians.take(np.arange(batch.offsets[start], batch.offsets[stop]))
+    return VoxelBatch(batch.keys[start:stop], batch.kappa_sums[start:stop], batch.counts[start:stop], gaussians)

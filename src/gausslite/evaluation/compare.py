@@ -7,20 +7,21 @@ capped at MAX_PSNR_DB. SSIM is the single-scale variant.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Shaped
+from jaxtyping import Float32, Shaped, UInt8
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.evaluation.metrics import covered_share, depth_l1_m, psnr, ssim_map
-from gausslite.evaluation.sharpness import gradient_deviation, laplacian_ratio
-from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.domain.pose import CorrectionTrack
+from gausslite.evaluation.metrics import covered_share, depth_l1_m, gradient_deviation, laplacian_ratio, psnr, ssim_map
+from gausslite.evaluation.pictures import comparison_sheet
+from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_views, render_fitted
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 MAX_PSNR_DB = 100.0
@@ -161,3 +162,69 @@ def _mean_or_none(scores: Sequence[RoiScore | ViewScore], name: str) -> float | 
     """Return the mean of a field over the scores that have it."""
     listed = [value for score in scores if (value := getattr(score, name)) is not None]
     return fmean(listed) if listed else None
+
+
+@dataclass(slots=True)
+class CorrectedScores:
+    """Scores of held-out views without any fit. corrections: those that the mapper published with the map.
+
+    raw: from the given poses. interpolated: with the corrections of the frames before and after each view. before:
+    with that of the last frame before it, as a live robot.
+    """
+
+    corrections: CorrectionTrack
+    raw: list[ViewScore] = field(default_factory=list)
+    interpolated: list[ViewScore] = field(default_factory=list)
+    before: list[ViewScore] = field(default_factory=list)
+
+    def add(self, viewer: MapViewer, view: HeldOutView) -> None:
+        """Score one view in the three ways."""
+        frame, time_ns = view.frame, view.frame.capture_time_ns
+        self.raw.append(score_view(viewer.render_frame(frame), view))
+        for scores, T_map_odometry in (
+            (self.interpolated, self.corrections.interpolated(time_ns)),
+            (self.before, self.corrections.before(time_ns)),
+        ):
+            corrected = replace(frame, T_world_camera=T_map_odometry @ frame.T_world_camera)
+            scores.append(score_view(viewer.render_frame(corrected), view))
+
+    def summary(self) -> dict[str, dict[str, float | None]]:
+        """Return the mean PSNR (dB) and SSIM of each way, in the region and over the full image."""
+        ways = {"raw": self.raw, "map_to_odom": self.interpolated, "map_to_odom_before": self.before}
+        means = {way: average(scores) for way, scores in ways.items()}
+        return {
+            way: {name: getattr(mean, name) for name in ("roi_psnr", "roi_ssim", "full_psnr", "full_ssim")}
+            for way, mean in means.items()
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TeamScores:
+    """Scores by map name, and a few comparison sheets by frame number."""
+
+    scores: dict[str, MapScores]
+    sheets: dict[str, UInt8[ndarray, "_ _ 3"]]
+
+
+def score_team(
+    viewers: Mapping[str, MapViewer], views: Sequence[HeldOutView], fit_views: bool = False, sheets: int = 4
+) -> TeamScores:
+    """Return the scores of every map over all held-out views, with comparison sheets of `sheets` views.
+
+    The sheets show the views with the largest region, spread over the sequence. With fit_views, each rendering uses
+    the fitted pose and exposure (`render_fitted`). Raises InvalidInputError if there are no views.
+    """
+    if not views:
+        raise InvalidInputError("held-out views: expected at least one frame with depth, got none")
+    scores: dict[str, list[ViewScore]] = {name: [] for name in viewers}
+    shown = largest_roi_views(views, sheets)
+    pictures = {}
+    for i, view in enumerate(views):
+        renderings: dict[str, Float32[ndarray, "h w 3"]] = {}
+        for name, viewer in viewers.items():
+            rendering = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)
+            scores[name].append(score_view(rendering, view))
+            renderings[name] = rendering.rgb
+        if i in shown:
+            pictures[f"{i:03d}-frame-{view.frame.index:06d}"] = comparison_sheet(view, renderings)
+    return TeamScores({name: average(view_scores) for name, view_scores in scores.items()}, pictures)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 from numpy import ndarray
 
-from gausslite.domain.arrays import require_array
+from gausslite.domain.checks import require_array
 from gausslite.domain.errors import InvalidInputError, ShapeError
+from gausslite.domain.pose import Trajectory
 
 SSIM_WINDOW_PX = 11
 SSIM_SIGMA_PX = 1.5
@@ -108,3 +110,105 @@ def _blur(image: Float64[ndarray, "h w 3"]) -> Float64[ndarray, "h w 3"]:
     window = cv2.getGaussianKernel(SSIM_WINDOW_PX, SSIM_SIGMA_PX, cv2.CV_64F)
     blurred: Float64[ndarray, "h w 3"] = cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
     return blurred
+
+
+_RED, _GREEN, _BLUE = (np.float32(weight) for weight in (0.299, 0.587, 0.114))
+_GMS_CONSTANT = 170.0 / 255.0**2
+"""The constant c of Xue et al. 2014 for colours in [0, 1]."""
+
+
+def laplacian_ratio(
+    rendered: Shaped[ndarray, "h w 3"], photograph: Shaped[ndarray, "h w 3"], mask: Bool[ndarray, "h w"] | None = None
+) -> float | None:
+    """Return the standard deviation of the rendering's Laplacian, divided by the photograph's, inside the mask.
+
+    1 means equal sharpness, less means blur. Image noise raises the photograph's deviation. None if the photograph is
+    constant there. Images are uint8, or floating in [0, 1]. Raises ShapeError, and InvalidInputError for an empty mask.
+    """
+    deviations = [_laplacian(image)[_inside(mask, image)].std() for image in (rendered, photograph)]
+    return float(deviations[0] / deviations[1]) if deviations[1] > 0 else None
+
+
+def gradient_deviation(
+    a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"], mask: Bool[ndarray, "h w"] | None = None
+) -> float:
+    """Return the gradient magnitude similarity deviation (GMSD; Xue et al. 2014) inside the mask; 0 for equal images.
+
+    Prewitt gradients of the luminance at full resolution, without the reduction to half size of the paper, because the
+    images are small. Arguments and errors are those of `laplacian_ratio`.
+    """
+    first, second = _gradient_magnitude(a), _gradient_magnitude(b)
+    similarity = (2.0 * first * second + _GMS_CONSTANT) / (first * first + second * second + _GMS_CONSTANT)
+    # in double precision, so that the order of the sum does not show
+    return float(similarity[_inside(mask, a)].std(dtype=np.float64))
+
+
+def _laplacian(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+    import cv2
+
+    return np.asarray(cv2.Laplacian(_luminance(image), cv2.CV_32F))
+
+
+def _gradient_magnitude(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+    import cv2
+
+    prewitt = np.array([[1.0, 0.0, -1.0]] * 3, np.float32) / np.float32(3.0)
+    luminance = _luminance(image)
+    dx, dy = (cv2.filter2D(luminance, cv2.CV_32F, kernel) for kernel in (prewitt, prewitt.T))
+    return np.asarray(np.sqrt(dx * dx + dy * dy))
+
+
+def _luminance(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+    scale = np.float32(1.0 / 255.0 if image.dtype == np.uint8 else 1.0)
+    red, green, blue = np.moveaxis(np.clip(image.astype(np.float32) * scale, 0.0, 1.0), -1, 0)
+    # not a matrix product, whose rounding depends on where the array lies in memory
+    luminance: Float32[ndarray, "h w"] = _RED * red + _GREEN * green + _BLUE * blue
+    return luminance
+
+
+def _inside(mask: Bool[ndarray, "h w"] | None, image: Shaped[ndarray, "h w 3"]) -> Bool[ndarray, "h w"]:
+    if mask is None:
+        return np.ones(image.shape[:2], np.bool_)
+    require_array("mask", mask, image.shape[:2], np.bool_)
+    if not mask.any():
+        raise InvalidInputError("mask: expected at least one pixel inside, got none")
+    return mask
+
+
+_MAX_TIME_GAP_S = 1e-3
+_MIN_POSES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryError:
+    """ATE over the poses at common times (Sturm et al. 2012), aligned in SE(3), without scale."""
+
+    rmse_m: float
+    max_m: float
+    poses: int
+
+
+def trajectory_error(estimated: Trajectory, reference: Trajectory) -> TrajectoryError | None:
+    """Return the ATE of the estimated trajectory; None with fewer than 3 poses at times of the reference (± 1 ms)."""
+    if min(len(estimated.times_s), len(reference.times_s)) == 0:
+        return None
+    after = np.clip(np.searchsorted(reference.times_s, estimated.times_s), 1, max(len(reference.times_s) - 1, 1))
+    candidates = np.stack([after - 1, np.minimum(after, len(reference.times_s) - 1)])
+    gaps_s = np.abs(reference.times_s[candidates] - estimated.times_s)
+    nearest = candidates[np.argmin(gaps_s, axis=0), np.arange(len(estimated.times_s))]
+    matched = gaps_s.min(axis=0) <= _MAX_TIME_GAP_S
+    if np.count_nonzero(matched) < _MIN_POSES:
+        return None
+    positions_m = estimated.T_world_camera[matched][:, :3, 3]
+    true_m = reference.T_world_camera[nearest[matched]][:, :3, 3]
+    errors_m = np.linalg.norm(_aligned(positions_m, true_m) - true_m, axis=1)
+    return TrajectoryError(float(np.sqrt(np.mean(np.square(errors_m)))), float(errors_m.max()), len(errors_m))
+
+
+def _aligned(points: Float64[ndarray, "n 3"], target: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
+    """Return the points after the rotation and translation that minimise their squared distances (Umeyama 1991)."""
+    mean, target_mean = points.mean(axis=0), target.mean(axis=0)
+    U, _, Vt = np.linalg.svd((points - mean).T @ (target - target_mean))
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
+    aligned: Float64[ndarray, "n 3"] = (points - mean) @ (Vt.T @ mirror @ U.T).T + target_mean
+    return aligned

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
-from gausslite.domain.arrays import require_array
-from gausslite.evaluation.views import HeldOutView
+from gausslite.domain.checks import require_array
+from gausslite.domain.frame import Frame
+from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_per_segment
 
 _HEADER_PX = 26
 _GAP_PX = 6
@@ -151,3 +152,23 @@ def arrange_grid(rows: list[list[UInt8[ndarray, "_ _ 3"]]]) -> UInt8[ndarray, "H
             top, left = _GAP_PX + i * (cell_height + _GAP_PX), _GAP_PX + j * (cell_width + _GAP_PX)
             sheet[top : top + cell_height, left : left + cell_width] = cell
     return sheet
+
+
+_ROWS = 3
+
+
+def render_preview(
+    viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]]
+) -> UInt8[ndarray, "H W 3"]:
+    """Return an image with one row per third of the mission, in the keyframes' refined poses and exposures.
+
+    keyframes: frames in temporal order, each with the mask of the task's region. The map was trained on these views,
+    so they do not show its quality from other viewpoints.
+    """
+    roi_pixels = [int(np.count_nonzero(roi)) for _, roi in keyframes]
+    chosen = largest_roi_per_segment(roi_pixels, _ROWS)
+    rows = []
+    for frame, roi in (keyframes[i] for i in sorted(chosen)):
+        rendering = viewer.render_frame(frame)
+        rows.append(comparison_row(frame.rgb, rendering.rgb, roi, f"frame {frame.index}"))
+    return arrange_grid(rows)

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from gausslite.domain.arrays import require_array
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.calibration.alignment import fit_pose
+from gausslite.calibration.errors import fit_exposure
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.checks import require_array
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
-from gausslite.domain.region import Region
+from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
+from gausslite.domain.relevance import Region
 from gausslite.render.choose import choose_rasterizer
-from gausslite.render.rasterizer import Rasterizer, Rendering
-from gausslite.render.row_encoding import gaussians_to_rows
+from gausslite.render.rasterizer import Rasterizer, Rendering, gaussians_to_rows
 
 MIN_ROI_PIXELS = 64
 """Views with fewer region pixels are not scored inside the region."""
@@ -95,3 +97,67 @@ def view_maps(maps: Mapping[str, Gaussians], threads: int | None = None) -> dict
     """Return a viewer of each map; all of them share one rasterizer. Raises KernelError."""
     rasterizer = choose_rasterizer(threads=threads)
     return {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}
+
+
+_ROUNDS = 4
+_REGION_MARGIN_PX = 8
+"""A fit at the region uses the region's pixels and this margin: the outline also fixes the pose."""
+
+
+def render_fitted(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior = HANDHELD_PRIOR) -> Rendering:
+    """Return the rendering with the lowest squared colour error among all fitting rounds.
+
+    The unfitted rendering is a candidate, so the full-image error never exceeds that of `render_frame`.
+    """
+    return _fit_to_image(viewer, frame, prior).rendering
+
+
+def render_fitted_at_region(
+    viewer: MapViewer, view: HeldOutView, prior: PoseExposurePrior = HANDHELD_PRIOR
+) -> Rendering:
+    """Return the rendering with the lowest squared colour error in the region, fitted at the region alone.
+
+    The fit starts at the pose of `render_fitted`, whose rendering is a candidate. It measures the region's sharpness
+    without the pose error that the rest of the map causes.
+    """
+    frame, best = view.frame, _fit_to_image(viewer, view.frame, prior)
+    near = cv2.dilate(view.roi.astype(np.uint8), np.ones((2 * _REGION_MARGIN_PX + 1,) * 2, np.uint8)) > 0
+    # the fits compare pixels with a measured depth
+    near_frame = replace(frame, depth_m=np.where(near, frame.depth_m, np.float32(0.0)))
+    candidates = [best, *_fit(viewer, near_frame, best.T_world_camera, prior)]
+    return min(candidates, key=lambda candidate: candidate.squared_error(frame, view.roi)).rendering
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A rendering and the pose it was rendered from."""
+
+    T_world_camera: Float64[ndarray, "4 4"]
+    rendering: Rendering
+
+    def squared_error(self, frame: Frame, mask: Bool[ndarray, "h w"] | None = None) -> float:
+        """Return the mean squared colour error, inside the mask or over the whole image."""
+        squared = np.square(self.rendering.rgb - frame.rgb / np.float32(255.0))
+        return float(np.mean(squared if mask is None else squared[mask]))
+
+
+def _fit_to_image(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior) -> _Candidate:
+    return min(_fit(viewer, frame, frame.T_world_camera, prior), key=lambda candidate: candidate.squared_error(frame))
+
+
+def _fit(
+    viewer: MapViewer, frame: Frame, T_world_camera: Float64[ndarray, "4 4"], prior: PoseExposurePrior
+) -> Iterator[_Candidate]:
+    """Yield the rendering from the initial pose, and one with fitted exposure for each round's pose."""
+    rendering = viewer.render(frame.camera, T_world_camera, frame.motion)
+    yield _Candidate(T_world_camera, rendering)
+    for _ in range(_ROUNDS):
+        yield _Candidate(T_world_camera, _apply_fitted_exposure(rendering, frame, prior))
+        T_world_camera = fit_pose(rendering, inverse(T_world_camera), frame, prior)
+        rendering = viewer.render(frame.camera, T_world_camera, frame.motion)
+    yield _Candidate(T_world_camera, _apply_fitted_exposure(rendering, frame, prior))
+
+
+def _apply_fitted_exposure(rendering: Rendering, frame: Frame, prior: PoseExposurePrior) -> Rendering:
+    rgb = fit_exposure(rendering, frame, prior).to_photograph(rendering.rgb)
+    return Rendering(rgb, rendering.depth_m, rendering.alpha, None)

@@ -12,16 +12,68 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.codec.files import write_atomic
-from gausslite.codec.keyframe_views import KeyframeView, read_keyframe_views
 from gausslite.codec.ply import read_ply, read_world_frame, write_ply
+from gausslite.codec.run_files import KeyframeView, read_keyframe_views
+from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.export.mesh import Render, write_mesh
 from gausslite.export.occupancy import OccupancySettings, write_nav2, write_octomap
-from gausslite.export.point_formats import write_las, write_pcd
 from gausslite.export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite.export.video import write_video
+from gausslite.process import import_extra
+
+_PCD_ROW = np.dtype(
+    [("mean_m", "<f4", 3), ("bgra", "u1", 4), ("opacity", "<f4"), ("kappa", "<u4"), ("target", "<i2"), ("active", "u1")]
+)
+_LAS_STEP_M = 1e-4
+"""Resolution of LAS coordinates, which are 32-bit integers: 0.1 mm covers the 200 km of `formats.MAX_EXTENT_M`."""
+
+
+def write_pcd(path: Path, gaussians: Gaussians) -> None:
+    """Write a binary PCD file (version 0.7) with position, rgb, opacity, kappa, target and active flag.
+
+    Raises StorageError.
+    """
+    rows = np.zeros(len(gaussians), _PCD_ROW)
+    rows["mean_m"] = gaussians.means_m
+    rows["bgra"][:, :3] = np.clip(np.round(gaussians.rgb[:, ::-1] * 255), 0, 255)
+    for name, column in (("opacity", "opacities"), ("kappa", "kappa"), ("target", "target"), ("active", "active")):
+        rows[name] = getattr(gaussians, column)
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\n"
+        "VERSION 0.7\n"
+        "FIELDS x y z rgb opacity kappa target active\n"
+        "SIZE 4 4 4 4 4 4 2 1\n"
+        "TYPE F F F F F U I U\n"
+        "COUNT 1 1 1 1 1 1 1 1\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
+    )
+    write_atomic(path, header.encode() + rows.tobytes())
+
+
+def write_las(path: Path, gaussians: Gaussians) -> None:
+    """Write a LAS 1.4 file (point format 7) with position, rgb, kappa and target.
+
+    Raises InvalidInputError without the laspy package, StorageError.
+    """
+    laspy = import_extra("laspy", "export", "LAS files")
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.scales = np.full(3, _LAS_STEP_M)
+    header.offsets = np.floor(gaussians.means_m.min(axis=0))
+    header.add_extra_dims([laspy.ExtraBytesParams("kappa", np.uint32), laspy.ExtraBytesParams("target", np.int16)])
+    points = laspy.LasData(header)
+    points.xyz = gaussians.means_m.astype(np.float64)
+    colours = np.clip(np.round(gaussians.rgb * 65535), 0, 65535).astype(np.uint16)
+    points.red, points.green, points.blue = colours.T
+    points.kappa, points.target = gaussians.kappa, gaussians.target
+
+    def write(partial: Path) -> None:
+        with partial.open("wb") as file:
+            points.write(file, do_compress=False)
+
+    write_atomic_with(path, write)
+
 
 Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
 MAX_EXTENT_M = 1e5

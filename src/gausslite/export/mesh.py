@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 
-from gausslite.codec.files import write_atomic
-from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.codec.run_files import KeyframeView
+from gausslite.codec.state_file import write_atomic
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.export.packages import import_extra
+from gausslite.process import import_extra
 
 _TRUNCATION_VOXELS = 4.0
 _MIN_ALPHA = 0.5

@@ -15,10 +15,10 @@ import yaml
 from jaxtyping import Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from gausslite.codec.files import write_atomic, write_atomic_with
+from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.export.packages import import_extra
+from gausslite.process import import_extra
 
 _EXTENT_SIGMAS = 1.5
 _MAX_SAMPLES_PER_AXIS = 33

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.codec.files import write_atomic, write_atomic_with
 from gausslite.codec.ply import SH_C0
+from gausslite.codec.state_file import write_atomic, write_atomic_with
+from gausslite.domain.frame import linear_light
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.srgb import linear_light
-from gausslite.export.packages import import_extra
+from gausslite.process import import_extra
 
 _SPLAT_ROW = np.dtype([("mean_m", "<f4", 3), ("scale_m", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 _OPACITY_EDGE = 1e-6

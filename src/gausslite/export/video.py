@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.export.mesh import Render

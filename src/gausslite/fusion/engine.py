@@ -11,16 +11,15 @@ from typing import NamedTuple
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import MismatchError, NotPermittedError
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.names import quote_name
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.tile_digests import TileDigests
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.fused_map import FusedMapLayers
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import RoiSubset, VoxelGrid
+from gausslite.fusion.fused_map import FusedMapLayers, save_refinement
 from gausslite.fusion.keyframes import (
     AgentKeyframe,
     EncodedKeyframe,
@@ -29,18 +28,44 @@ from gausslite.fusion.keyframes import (
     no_decoder,
 )
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.mission_data import MissionData
-from gausslite.fusion.mission_status import mission_status
-from gausslite.fusion.refined_map import save_refinement
-from gausslite.fusion.storage_probe import StorageProbe
-from gausslite.fusion.store import FusionStore, require_storable
-from gausslite.fusion.store_values import PutOutcome, SessionRecord
-from gausslite.fusion.team_objects import find_objects
-from gausslite.fusion.traffic import MissionStatus, TrafficCounters
-from gausslite.fusion.update_committer import UpdateCommitter
-from gausslite.fusion.update_queue import PendingUpdate
-from gausslite.fusion.usage import require_within_quotas
+from gausslite.fusion.objects import find_objects
+from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome, SessionRecord, require_storable
+from gausslite.fusion.traffic import AgentContribution, MissionStatus, StorageProbe, TrafficCounters
+from gausslite.fusion.updates import PendingUpdate, UpdateCommitter, require_within_quotas
+
+
+def mission_status(store: FusionStore, mission: MissionData) -> MissionStatus:
+    """Return the totals of the mission and of each agent. Call it with the engine's lock."""
+    fused_voxels, fused_gaussians = mission.maps.size()
+    return MissionStatus(
+        mission_config=mission.members.mission_config,
+        revision=mission.maps.revision(),
+        fused_gaussians=fused_gaussians,
+        fused_voxels=fused_voxels,
+        keyframes=len(mission.keyframes),
+        refined=mission.maps.is_refined,
+        agents=tuple(_contribution(store, mission, agent_id) for agent_id in sorted(mission.members.sources)),
+        banned_agents=mission.members.banned,
+    )
+
+
+def _contribution(store: FusionStore, mission: MissionData, agent_id: str) -> AgentContribution:
+    totals = store.totals(agent_id)
+    return AgentContribution(
+        agent_id,
+        joined=agent_id in mission.members.joined,
+        voxels=totals.occupied_voxels,
+        gaussians=totals.gaussians,
+        kappa_sum=totals.kappa_sum,
+        won_voxels=mission.maps.won_voxels(agent_id),
+        last_update_seq=totals.highest_update_seq,
+        keyframes=mission.keyframes.count(agent_id),
+        targets=mission.objects.targets(agent_id),
+        free_voxels=mission.free_space.free_voxels(agent_id),
+        alignment=mission.alignments.get(agent_id),
+        traffic=mission.traffic.of(agent_id),
+    )
 
 
 class JoinResult(NamedTuple):

@@ -6,16 +6,16 @@ from dataclasses import dataclass, field, fields
 
 from gausslite.config.option import option
 from gausslite.config.values import VOXEL_SIZE
+from gausslite.domain.checks import require_identifier, require_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.names import require_identifier, require_name
-from gausslite.domain.revision_log import MAX_REMOVED_VOXELS
+from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.frame_alignment import AlignmentSettings
+from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.keyframes import KeyframeLimits
-from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.store import MissionConfig
 
 DEFAULT_LEASE_S = 60.0
-"""Longer than a robot needs to notice a lost server and to reconnect, see wire/connection.py."""
+"""Longer than a robot needs to notice a lost server and to reconnect, see wire/channel.py."""
 MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
 

@@ -11,14 +11,19 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import from_stored, to_stored
-from gausslite.domain.tile_digests import TileDigests
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.mission_config import MissionConfig
+from gausslite.codec.stored import from_stored, to_stored
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
-from gausslite.fusion.store import require_storable
-from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
+from gausslite.fusion.store import (
+    AgentTotals,
+    MissionConfig,
+    PutOutcome,
+    SessionRecord,
+    StoredScores,
+    VoxelScoreTable,
+    require_storable,
+)
 
 
 class MemoryStore:

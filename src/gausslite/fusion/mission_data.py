@@ -5,20 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from threading import RLock
 
-from gausslite.fusion.agent_data import AgentData
-from gausslite.fusion.frame_aligner import FrameAligner
-from gausslite.fusion.frame_alignment import FrameAlignments
-from gausslite.fusion.free_space import FreeSpaceRecords
-from gausslite.fusion.fused_map import FusedMapLayers
+from gausslite.fusion.agent_data import AgentData, FrameAligner
+from gausslite.fusion.frames import FrameAlignments
+from gausslite.fusion.fused_map import FusedMapLayers, load_refinement
 from gausslite.fusion.keyframes import FrameDecoder, KeyframePool
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.membership import Membership
-from gausslite.fusion.refined_map import load_refinement
+from gausslite.fusion.objects import TeamObjects
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.team_objects import TeamObjects
 from gausslite.fusion.traffic import TrafficLog
-from gausslite.fusion.update_checks import UpdateChecks
-from gausslite.fusion.vote_input import VoteInput
+from gausslite.fusion.updates import UpdateChecks
+from gausslite.fusion.vote_input import FreeSpaceRecords, VoteInput
 
 
 @dataclass(frozen=True, slots=True, eq=False)

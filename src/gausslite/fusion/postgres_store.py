@@ -13,18 +13,22 @@ import psycopg
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import to_stored
+from gausslite.codec.stored import to_stored
 from gausslite.domain.errors import StorageError
-from gausslite.domain.tile_digests import TileDigests
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.mission_config import MissionConfig
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batch
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
-from gausslite.fusion.store import require_storable
+from gausslite.fusion.store import (
+    AgentTotals,
+    MissionConfig,
+    PutOutcome,
+    SessionRecord,
+    StoredScores,
+    VoxelScoreTable,
+    require_storable,
+)
 from gausslite.fusion.store_rows import UpdateRow, batch_of_rows, data_checksum, index_rows, is_intact, update_rows
-from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
 
 SCHEMA_VERSION = 1
 _LOADED_ROWS = 10_000

@@ -17,11 +17,10 @@ from jaxtyping import Bool, Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.codec.records import RECORD, to_records
-from gausslite.domain.tile_digests import TileDigests
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import select_voxels
-from gausslite.fusion.store_values import AgentTotals, StoredScores, VoxelScoreTable
+from gausslite.codec.stored import RECORD, to_records
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, select_voxels
+from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
 
 _FIRST_CAPACITY = 64
 ReadBatch = Callable[[str, Int64[ndarray, " k"]], VoxelBatch]

@@ -9,17 +9,132 @@ still arrive.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Int32, Int64, UInt32, UInt64
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.tile_digests import TileDigests
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store_values import AgentTotals, PutOutcome, SessionRecord, StoredScores, VoxelScoreTable
+from gausslite.domain.checks import quote_name, require_identifier, require_name
+from gausslite.domain.errors import InvalidInputError, MismatchError
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import RoiSubset, VoxelBatch
+
+_DEFAULT_MISSION_ID, _DEFAULT_WORLD_FRAME = "mission", "world"
+
+
+@dataclass(frozen=True, slots=True)
+class MissionConfig:
+    """Common to all voxel updates of one store; the first agent that joins fixes it. Names may be empty until then."""
+
+    mission_id: str
+    world_frame: str
+    voxel_size_m: float
+
+    def with_default_names(self) -> MissionConfig:
+        """Return the configuration with "mission" and "world" in place of empty names."""
+        mission_id, world_frame = self.mission_id or _DEFAULT_MISSION_ID, self.world_frame or _DEFAULT_WORLD_FRAME
+        return MissionConfig(mission_id, world_frame, self.voxel_size_m)
+
+    @property
+    def given_world_frame(self) -> str:
+        """The world frame's name; empty if it is the default, because maps of different frames share that name."""
+        return "" if self.world_frame == _DEFAULT_WORLD_FRAME else self.world_frame
+
+
+def reconcile(own: MissionConfig, requested: MissionConfig) -> MissionConfig:
+    """Return the configuration that satisfies both sides; an empty name accepts the other side's.
+
+    Raises InvalidInputError if a requested name is not permitted, MismatchError if the sides differ.
+    """
+    if requested.mission_id:
+        require_identifier("mission_id", requested.mission_id)
+    require_name("world_frame", requested.world_frame)
+    if requested.voxel_size_m != own.voxel_size_m:
+        raise MismatchError(
+            f"voxel size: this mission votes on {own.voxel_size_m:g} m, got {requested.voxel_size_m:g} m"
+        )
+    for field, expected, received in (
+        ("world frame", own.world_frame, requested.world_frame),
+        ("mission", own.mission_id, requested.mission_id),
+    ):
+        if expected and received and expected != received:
+            raise MismatchError(f"{field}: expected {quote_name(expected)} as agreed here, got {quote_name(received)}")
+    return MissionConfig(
+        own.mission_id or requested.mission_id, own.world_frame or requested.world_frame, own.voxel_size_m
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRecord:
+    """An agent's permission to contribute, from joining until it leaves or joins again."""
+
+    session_id: str
+    agent_id: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PutOutcome:
+    """The voxels of a message that were stored, and those that were stale; keys in ascending order."""
+
+    accepted: Int64[ndarray, " a"]
+    stale: Int64[ndarray, " s"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelScoreTable:
+    """The totals of every update (tombstones included) without the Gaussians: the input of the vote.
+
+    agent_index holds indices into `agents`, which is sorted; rows are sorted by (agent, key).
+    """
+
+    agents: tuple[str, ...]
+    agent_index: Int32[ndarray, " w"]
+    keys: Int64[ndarray, " w"]
+    update_seqs: Int64[ndarray, " w"]
+    kappa_sums: UInt64[ndarray, " w"]
+    counts: UInt32[ndarray, " w"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredScores:
+    """The totals of an agent's updates of some voxels; update_seq is -1 where it has no update."""
+
+    update_seqs: Int64[ndarray, " k"]
+    kappa_sums: UInt64[ndarray, " k"]
+    counts: UInt32[ndarray, " k"]
+
+    @classmethod
+    def missing(cls, voxels: int) -> StoredScores:
+        """Return the totals of an agent without updates."""
+        return cls(np.full(voxels, -1, np.int64), np.zeros(voxels, np.uint64), np.zeros(voxels, np.uint32))
+
+
+@dataclass(frozen=True, slots=True)
+class AgentTotals:
+    """Sums over an agent's updates: voxels with and without tombstones, Gaussians, Σkappa; the highest update_seq."""
+
+    voxels: int = 0
+    occupied_voxels: int = 0
+    gaussians: int = 0
+    kappa_sum: int = 0
+    highest_update_seq: int = 0
+
+    def replace_part(self, removed: StoredScores, added: StoredScores) -> AgentTotals:
+        """Return the totals after `added` replaced `removed`."""
+        return AgentTotals(
+            self.voxels + len(added.counts) - int(np.count_nonzero(removed.update_seqs >= 0)),
+            self.occupied_voxels + int(np.count_nonzero(added.counts)) - int(np.count_nonzero(removed.counts)),
+            self.gaussians + int(added.counts.sum(dtype=np.int64)) - int(removed.counts.sum(dtype=np.int64)),
+            self.kappa_sum + _exact_sum(added.kappa_sums) - _exact_sum(removed.kappa_sums),
+            max(self.highest_update_seq, int(added.update_seqs.max(initial=0))),
+        )
+
+
+def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
+    """Return a sum that cannot wrap around."""
+    return (int((values >> np.uint64(32)).sum()) << 32) + int((values & np.uint64(0xFFFFFFFF)).sum())
 
 
 @runtime_checkable

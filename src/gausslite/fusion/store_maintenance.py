@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.domain.errors import StorageError
-from gausslite.fusion.sqlite_file import (
+from gausslite.fusion.sqlite_store import (
     RESTORE_ADVICE,
+    SELECT_UPDATES,
     StoreLock,
     open_existing,
     renew_incarnation,
     storage_errors,
 )
-from gausslite.fusion.sqlite_store import SELECT_UPDATES
 from gausslite.fusion.store_rows import data_checksum, is_intact
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import from_stored, is_stored
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
+from gausslite.codec.stored import from_stored, is_stored
+from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.score_index import ScoreIndex
-from gausslite.fusion.store_values import StoredScores
+from gausslite.fusion.store import StoredScores
 
 UpdateRow = tuple[str, int, int, int, int, int, bytes]
 """agent_id, voxel, update_seq, Σkappa, count, checksum, Gaussians."""

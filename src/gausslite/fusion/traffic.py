@@ -9,13 +9,41 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 
 from gausslite.domain.errors import CodecError, StorageError
-from gausslite.fusion.frame_alignment import FrameAlignment
-from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store import FusionStore
+from gausslite.fusion.frames import FrameAlignment
+from gausslite.fusion.store import FusionStore, MissionConfig
+
+_PROBE_BYTES = 256 << 10
+# no agent can have an empty id
+_STORAGE_PROBE_OWNER, PROBE_RECORD = "", "storage-probe"
+
+
+class StorageProbe:
+    """Writes and deletes a record of the size of a large message. Thread-safe."""
+
+    def __init__(self, store: FusionStore) -> None:
+        self._store = store
+        self._is_writable = True
+
+    @property
+    def is_writable(self) -> bool:
+        """The result of the latest check; True before the first."""
+        return self._is_writable
+
+    def check(self) -> None:
+        """Raise StorageError if the store does not take 256 KiB."""
+        try:
+            self._store.save_record(_STORAGE_PROBE_OWNER, PROBE_RECORD, bytes(_PROBE_BYTES))
+            # its pages are free again, so that the next check needs new ones if messages have taken them
+            self._store.save_record(_STORAGE_PROBE_OWNER, PROBE_RECORD, b"")
+        except StorageError:
+            self._is_writable = False
+            raise
+        self._is_writable = True
+
 
 _SAVE_INTERVAL_S = 10.0
 # no agent can have an empty id
-_OWNER, RECORD = "", "traffic"
+_OWNER, TRAFFIC_RECORD = "", "traffic"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +75,7 @@ class TrafficLog:
     def __init__(self, store: FusionStore, clock_s: Callable[[], float] = time.monotonic) -> None:
         """Raises CodecError if the stored counters are damaged."""
         self._store, self._clock_s = store, clock_s
-        self._by_agent = _decode(store.records(RECORD).get(_OWNER, b"{}"))
+        self._by_agent = _decode(store.records(TRAFFIC_RECORD).get(_OWNER, b"{}"))
         self._is_saved, self._next_save_s = True, clock_s() + _SAVE_INTERVAL_S
 
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
@@ -67,7 +95,7 @@ class TrafficLog:
     def save(self) -> None:
         """Save the counters. Raises StorageError."""
         if not self._is_saved:
-            self._store.save_record(_OWNER, RECORD, _encode(self._by_agent))
+            self._store.save_record(_OWNER, TRAFFIC_RECORD, _encode(self._by_agent))
             self._is_saved = True
 
     def of(self, agent_id: str) -> TrafficCounters:

@@ -14,10 +14,8 @@ from jaxtyping import Bool, Int32, Int64, UInt32, UInt64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import gather_rows
-from gausslite.domain.voxels import VoxelScore, VoxelVotes
-from gausslite.fusion.store_values import VoxelScoreTable
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelScore, VoxelVotes, gather_rows, group_by_voxel
+from gausslite.fusion.store import VoxelScoreTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,3 +151,12 @@ def _stack(batch_by_agent: Mapping[str, VoxelBatch]) -> tuple[VoxelScoreTable, G
     )
     starts = np.cumsum(counts, dtype=np.int64) - counts
     return scores, Gaussians.concatenate([batch.gaussians for batch in batches]), starts
+
+
+def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:
+    """Return the fused map: each voxel holds the Gaussians of the agent with the highest Σkappa there (Sec. III-E).
+
+    maps: the complete map of each agent id.
+    Raises InvalidInputError if a mean is outside the grid.
+    """
+    return fuse({agent_id: group_by_voxel(gaussians, grid) for agent_id, gaussians in maps.items()})

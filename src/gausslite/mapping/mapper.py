@@ -8,30 +8,29 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.arrays import require_array
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.checks import require_array
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.checkpoint import generator_state, restore_generator
-from gausslite.mapping.coverage import RenderedView
-from gausslite.mapping.eviction import insert_seeds
-from gausslite.mapping.keyframe_store import KeyframeStore
-from gausslite.mapping.keyframes import Keyframe, WindowView, window_view
-from gausslite.mapping.pose_history import PoseHistory
-from gausslite.mapping.seeding import Seeder, SeedingContext, Seeds
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
+from gausslite.mapping.keyframes import (
+    Keyframe,
+    KeyframeStore,
+    WindowView,
+    generator_state,
+    restore_generator,
+    window_view,
+)
+from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
+from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
-from gausslite.mapping.stages import CountedScheduler, SkippableStage, Stage, StageScheduler
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.mapping.task_change import add_roi_evidence, clear_roi, update_roi_evidence
-from gausslite.mapping.team_voxels import InsertedVoxels, insert_team_voxels
-from gausslite.mapping.training import Trainer
-from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.training import CountedScheduler, SkippableStage, Stage, StageScheduler, Trainer
+from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 _EXTENT_PER_DEPTH = 1.0 / 3.0

@@ -7,17 +7,66 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.mapping.baselines import gaussian_slam_policy, monogs_policy, splatam_policy, uniform_policy
-from gausslite.mapping.saturation import SaturationSettings
 from gausslite.mapping.settings import (
     ActivePhase,
+    Components,
+    DensitySettings,
     KeyframeSettings,
     MapperSettings,
     OptimizationSettings,
+    SaturationSettings,
     SeedingSettings,
 )
-from gausslite.optimize.density import DensitySettings
 from gausslite.render.rasterizer import AdamSettings, LossWeights
+
+_NO_TASK = Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
+_NO_DENSIFICATION = DensitySettings(min_mean_gradient=math.inf)
+
+
+def uniform_policy() -> MapperSettings:
+    """Return uniform seeding and full-image training with this engine's density control."""
+    return MapperSettings(components=_NO_TASK)
+
+
+def gaussian_slam_policy() -> MapperSettings:
+    """Return Gaussian-SLAM (Yugay et al. 2023).
+
+    Uniform seeds where alpha < 0.6, scale = neighbour distance, 7 iterations, prune only.
+    """
+    return MapperSettings(
+        components=_NO_TASK,
+        optimization=OptimizationSettings(warmup_iterations=7, active_iterations=0),
+        density=_NO_DENSIFICATION,
+    )
+
+
+def splatam_policy() -> MapperSettings:
+    """Return SplaTAM (Keetha et al. 2024).
+
+    Isotropic Gaussians of one pixel's width: every fourth pixel of the first frame, then at most 2000 per frame of
+    320x240, where alpha < 0.5 or depth errs by 50 times its median; no clone, no split.
+    """
+    return MapperSettings(
+        components=_NO_TASK,
+        seeding=SeedingSettings(
+            first_frame_seeds=76_800, later_seeds=8_000, min_alpha=0.5, depth_error_factor=50.0, init_scale=0.5
+        ),
+        optimization=OptimizationSettings(loss=LossWeights(colour=0.4, depth=1.0, ssim=0.1), isotropic=True),
+        density=_NO_DENSIFICATION,
+    )
+
+
+def monogs_policy() -> MapperSettings:
+    """Return MonoGS with RGB-D input (Matsuki et al. 2024).
+
+    Small sparse seeds everywhere (one pixel in 32, later in 64; point size 0.05 scales the squared neighbour distance),
+    no SSIM term, clone and split by gradient.
+    """
+    return MapperSettings(
+        components=_NO_TASK,
+        seeding=SeedingSettings(first_frame_seeds=9_600, later_seeds=4_800, min_alpha=1.0, init_scale=math.sqrt(0.05)),
+        optimization=OptimizationSettings(loss=LossWeights(colour=0.95, depth=0.05, ssim=0.0)),
+    )
 
 
 def task_policy() -> MapperSettings:

@@ -4,19 +4,200 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float32, Int64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.camera import lift
+from gausslite.domain.camera import Camera, lift, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import transform_points
+from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.coverage import RenderedView, rendered_behind, undersampled_roi
-from gausslite.mapping.sampling import edge_magnitude, sample_pixels, sample_stratified
 from gausslite.mapping.settings import Components, SeedingSettings
-from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
+from gausslite.mapping.splat_table import SplatTable
+from gausslite.render.rasterizer import NEAR_M, Rendering
+
+_CELL_PX = 8
+_MAX_RELATIVE_DEPTH_ERROR = 0.05
+"""A Gaussian within this fraction of the measured depth lies on the visible surface."""
+_MEDIAN_STEP_PX = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedView:
+    """The map rendered from a frame's pose: alpha in [0, 1], and expected depth in metres (0 where alpha is low)."""
+
+    alpha: Float32[ndarray, "h w"]
+    depth_m: Float32[ndarray, "h w"]
+
+    @classmethod
+    def from_rendering(cls, rendering: Rendering) -> RenderedView:
+        """Return alpha and expected depth of a rendering."""
+        return cls(rendering.alpha, rendering.expected_depth_m())
+
+
+def rendered_behind(frame: Frame, rendered: RenderedView, depth_error_factor: float) -> Bool[ndarray, "h w"]:
+    """Return the pixels rendered behind the measured depth by more than depth_error_factor times the median error.
+
+    The median of the absolute depth error is taken over every fourth row and column.
+    """
+    comparable = (frame.depth_m > 0) & (rendered.depth_m > 0)
+    behind_m = rendered.depth_m - frame.depth_m
+    sample = (slice(None, None, _MEDIAN_STEP_PX), slice(None, None, _MEDIAN_STEP_PX))
+    errors_m = np.abs(behind_m[sample][comparable[sample]])
+    median_m = float(np.median(errors_m)) if len(errors_m) else 0.0
+    result: Bool[ndarray, "h w"] = comparable & (behind_m > depth_error_factor * median_m)
+    return result
+
+
+def undersampled_roi(
+    frame: Frame, roi: Bool[ndarray, "h w"], active_means_m: Float32[ndarray, "n 3"], pixels_per_gaussian: float
+) -> Bool[ndarray, "h w"]:
+    """Return ROI pixels in 8x8 cells with less than one active Gaussian per `pixels_per_gaussian` ROI pixels.
+
+    These are mapped as background so far, for example because the detector found the object late.
+    """
+    if not roi.any():
+        return np.zeros_like(roi)
+    height, width = roi.shape
+    shape = (-(-height // _CELL_PX), -(-width // _CELL_PX))
+    rows, columns = np.nonzero(roi & (frame.depth_m > 0))
+    min_count = _count_per_cell(rows, columns, shape) / pixels_per_gaussian
+    _, active_rows, active_columns = visible_means(frame, active_means_m)
+    count = _count_per_cell(active_rows, active_columns, shape)
+    sparse = np.repeat(np.repeat(count < min_count, _CELL_PX, axis=0), _CELL_PX, axis=1)[:height, :width]
+    result: Bool[ndarray, "h w"] = sparse & roi & (frame.depth_m > 0)
+    return result
+
+
+def visible_means(
+    frame: Frame, means_m: Float32[ndarray, "n 3"]
+) -> tuple[Int64[ndarray, " s"], Int64[ndarray, " s"], Int64[ndarray, " s"]]:
+    """Return ids (ascending), pixel rows and pixel columns of the means that lie on the frame's visible surface."""
+    points = transform_points(inverse(frame.T_world_camera), means_m)
+    ids = np.flatnonzero(points[:, 2] > NEAR_M)
+    points = points.take(ids, axis=0)
+    if frame.motion is not None:
+        points = frame.motion.at_exposure(points.astype(np.float64), frame.camera).astype(np.float32)
+    x_px, y_px = np.ascontiguousarray(project(points, frame.camera).T)
+    height, width = frame.depth_m.shape
+    inside = np.flatnonzero((y_px >= 0) & (y_px < height) & (x_px >= 0) & (x_px < width))
+    ids, z_m = ids[inside], points[inside, 2]
+    rows, columns = y_px[inside].astype(np.int64), x_px[inside].astype(np.int64)
+    depth_m = frame.depth_m[rows, columns]
+    on_surface = np.abs(z_m - depth_m) < _MAX_RELATIVE_DEPTH_ERROR * depth_m
+    return ids[on_surface], rows[on_surface], columns[on_surface]
+
+
+def _count_per_cell(rows: ndarray, columns: ndarray, shape: tuple[int, int]) -> ndarray:
+    cells = (rows // _CELL_PX) * shape[1] + columns // _CELL_PX
+    return np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
+
+
+_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32) / 255.0
+
+
+def edge_magnitude(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+    """Return E(u, v) = ‖∇I(u, v)‖, the Sobel gradient magnitude of the luminance in [0, 1] (Sec. III-C.3)."""
+    luminance = rgb @ _LUMINANCE
+    # the Sobel kernel returns 8 times the derivative
+    dx = cv2.Sobel(luminance, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    dy = cv2.Sobel(luminance, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
+    return np.asarray(cv2.magnitude(dx, dy))
+
+
+def sample_pixels(
+    pool: Bool[ndarray, "h w"], count: int, pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
+) -> Int64[ndarray, " n"]:
+    """Return up to `count` pixels of the pool (flat indices, ascending), drawn by weight without replacement."""
+    pixels = np.flatnonzero(pool)
+    if len(pixels) <= count:
+        return pixels
+    arrival = _arrival_times(pixels, pixel_weights, rng)
+    return np.sort(pixels[np.argpartition(arrival, count)[:count]]) if count > 0 else pixels[:0]
+
+
+def sample_stratified(
+    pool: Bool[ndarray, "h w"], count: int, pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
+) -> Int64[ndarray, " n"]:
+    """Return up to `count` pixels of the pool (flat indices, ascending), at most one per cell of a square grid.
+
+    If the pool is the whole image, the grid has √count x √count cells (Sec. III-C.2). For a smaller pool the cells are
+    smaller, so that about `count` of them contain pool pixels. Within a cell, the pixel is drawn by weight.
+    """
+    pixels = np.flatnonzero(pool)
+    if len(pixels) <= count:
+        return pixels
+    if count == 0:
+        return pixels[:0]
+    height, width = pool.shape
+    side = int(np.ceil(np.sqrt(count * pool.size / len(pixels))))
+    rows, columns = np.divmod(pixels, width)
+    cells = (rows * side // height) * side + columns * side // width
+    arrival = _arrival_times(pixels, pixel_weights, rng)
+    first_in_cell = np.full(side * side, -1, np.int64)
+    # NumPy keeps the last assignment to a cell: the pixel of the earliest arrival
+    latest_first = np.argsort(-arrival, kind="stable")
+    first_in_cell[cells[latest_first]] = pixels[latest_first]
+    chosen = first_in_cell[first_in_cell >= 0]
+    if len(chosen) > count:
+        chosen = rng.choice(chosen, count, replace=False)
+    return np.sort(chosen)
+
+
+def _arrival_times(
+    pixels: Int64[ndarray, " n"], pixel_weights: Float32[ndarray, "h w"], rng: np.random.Generator
+) -> Float32[ndarray, " n"]:
+    """Return exponential arrival times with the rates `pixel_weights`.
+
+    The earliest arrivals are a sample by weight without replacement.
+    """
+    arrival: Float32[ndarray, " n"] = rng.standard_exponential(len(pixels), np.float32) / pixel_weights.ravel()[pixels]
+    return arrival
+
+
+_BLOCK_PX = 16
+_MEDIAN_POISSON = float(np.sqrt(1.6783 / np.pi))
+_MEDIAN_STRATIFIED = 0.89
+_MIN_SQUARED_M = 1e-7
+
+
+def neighbour_distance_px(
+    pixels: Int64[ndarray, " n"], pool: Bool[ndarray, "h w"], stratified: bool
+) -> Float32[ndarray, " n"]:
+    """Return the median distance of each seed to its three nearest neighbours in pixels, at least 1.
+
+    pixels: flat indices of seeds drawn from `pool`. stratified: True if they were drawn one per grid cell.
+    """
+    width = pool.shape[1]
+    seeds = np.zeros(pool.shape, np.bool_)
+    seeds.ravel()[pixels] = True
+    density = _count_around(seeds) / np.maximum(_count_around(pool), 1.0)
+    rows, columns = np.divmod(pixels, width)
+    local = density[rows // _BLOCK_PX, columns // _BLOCK_PX]
+    factor = _MEDIAN_STRATIFIED if stratified else _MEDIAN_POISSON
+    distance: Float32[ndarray, " n"] = np.maximum(factor / np.sqrt(local), 1.0).astype(np.float32)
+    return distance
+
+
+def initial_spacing_m(
+    distance_px: Float32[ndarray, " n"], depth_m: Float32[ndarray, " n"], camera: Camera
+) -> Float32[ndarray, " n"]:
+    """Return s0 in metres at each seed's depth; its square is at least 1e-7."""
+    squared = np.square(camera.length_m(distance_px, depth_m))
+    spacing: Float32[ndarray, " n"] = np.sqrt(np.maximum(squared, np.float32(_MIN_SQUARED_M)))
+    return spacing
+
+
+def _count_around(mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
+    """Return the number of mask pixels in each 16x16 block and its eight neighbours."""
+    height, width = mask.shape
+    padded = np.pad(mask, ((0, -height % _BLOCK_PX), (0, -width % _BLOCK_PX)))
+    by_rows = padded.reshape(-1, _BLOCK_PX, padded.shape[1]).sum(axis=1, dtype=np.uint16)
+    blocks = by_rows.reshape(len(by_rows), -1, _BLOCK_PX).sum(axis=2, dtype=np.uint16).astype(np.float32)
+    return np.asarray(cv2.boxFilter(blocks, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
+
 
 _REFERENCE_PIXELS = 640 * 480
 """Image size of the seed counts in SeedingSettings."""
@@ -174,3 +355,61 @@ class Seeder:
             kappa=np.zeros(count, np.uint32),
             target=relevance.target.ravel()[pixels],
         )
+
+
+def insert_seeds(
+    table: SplatTable, seeds: Seeds, seed_opacity: float, rng: np.random.Generator, min_background: int = 0
+) -> int:
+    """Insert the ROI seeds, then the background seeds, and return how many; the table never exceeds its capacity.
+
+    ROI seeds evict background Gaussians first (those active in an earlier task before the others), then active ones,
+    each in the order of opacity. At least min_background inactive Gaussians stay, so that an ROI as large as the image
+    does not fill the map. Background seeds evict only inactive Gaussians less opaque than seed_opacity. Seeds beyond
+    the remaining capacity are dropped at random. Seeds reuse the evicted rows, so that few rows move.
+    """
+    evicted = _evict_for_roi(table, len(seeds.roi) - table.free_slots, min_background)
+    roi = seeds.roi.take(_random_subset(len(seeds.roi), table.free_slots + len(evicted), rng))
+    _write(table, roi, evicted)
+    evicted = _evict_for_background(table, len(seeds.background) - table.free_slots, seed_opacity)
+    capacity = table.free_slots + len(evicted)
+    background = seeds.background.take(_random_subset(len(seeds.background), capacity, rng))
+    _write(table, background, evicted)
+    return len(roi) + len(background)
+
+
+def _write(table: SplatTable, seeds: Gaussians, evicted: Int64[ndarray, " m"]) -> None:
+    """Write the first seeds to the evicted rows and the others to free slots."""
+    table.replace(evicted, seeds.take(np.arange(len(evicted))))
+    table.append(seeds.take(np.arange(len(evicted), len(seeds))))
+
+
+def _evict_for_roi(table: SplatTable, count: int, min_background: int) -> Int64[ndarray, " k"]:
+    """Return up to `count` rows: inactive ones, except min_background of them, then active ones."""
+    if count <= 0:
+        return np.zeros(0, np.int64)
+    evictable = max(0, int(np.count_nonzero(~table.active)) - min_background)
+    background = _least_opaque_inactive(table, min(count, evictable), ~table.active)
+    roi = table.most_transparent(np.flatnonzero(table.active), count - len(background))
+    return np.concatenate([background, roi])
+
+
+def _evict_for_background(table: SplatTable, count: int, max_opacity: float) -> Int64[ndarray, " k"]:
+    """Return up to `count` rows of inactive Gaussians less opaque than max_opacity."""
+    if count <= 0:
+        return np.zeros(0, np.int64)
+    return _least_opaque_inactive(table, count, ~table.active & table.has_lower_opacity(max_opacity))
+
+
+def _least_opaque_inactive(table: SplatTable, count: int, candidates: Bool[ndarray, " n"]) -> Int64[ndarray, " k"]:
+    """Return up to `count` candidates, the least opaque; those active in an earlier task (kappa > 0) come first."""
+    was_active = table.kappa > 0
+    earlier_roi = table.most_transparent(np.flatnonzero(candidates & was_active), count)
+    others = table.most_transparent(np.flatnonzero(candidates & ~was_active), count - len(earlier_roi))
+    return np.concatenate([earlier_roi, others])
+
+
+def _random_subset(count: int, capacity: int, rng: np.random.Generator) -> Int64[ndarray, " n"]:
+    """Return the indices 0 .. count - 1, or a random subset of `capacity` of them, ascending."""
+    if count <= capacity:
+        return np.arange(count)
+    return np.sort(rng.choice(count, capacity, replace=False))

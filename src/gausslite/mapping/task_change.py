@@ -12,29 +12,12 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import NO_TARGET, RelevanceMap
-from gausslite.mapping.coverage import visible_means
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.seeding import visible_means
+from gausslite.mapping.splat_table import SplatTable
 
 _MAX_EVIDENCE = 100
-
-
-@dataclass(frozen=True, slots=True)
-class TaskChangeSettings:
-    """keyframes_per_frame: maximum number of earlier keyframes to evaluate again with each frame.
-
-    They are evaluated after a task change, and when an object becomes known.
-    """
-
-    keyframes_per_frame: int = 3
-
-    def __post_init__(self) -> None:
-        if self.keyframes_per_frame < 1:
-            raise InvalidInputError(
-                f"task change keyframes_per_frame: expected at least 1, got {self.keyframes_per_frame}"
-            )
 
 
 @dataclass(frozen=True, slots=True)

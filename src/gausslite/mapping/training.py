@@ -2,22 +2,193 @@
 
 from __future__ import annotations
 
+import math
+import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TypeAlias
+from enum import StrEnum
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
-from gausslite.domain.state import State, add_prefix, get_counts, int_array, select_prefix
+from gausslite.domain.errors import MapFileError
+from gausslite.domain.frame import Frame
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
+from gausslite.mapping.density import densify, prune
 from gausslite.mapping.keyframes import WindowView
-from gausslite.mapping.saturation import RegionSaturation
-from gausslite.mapping.settings import ActivePhase, MapperSettings
-from gausslite.mapping.stages import CountedScheduler, Stage, StageScheduler
-from gausslite.optimize.density import densify, prune
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.settings import ActivePhase, MapperSettings, SaturationSettings
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.rasterizer import Rasterizer, Subset, UpdateCounter
+
+_HORIZON_VISITS = 32
+"""Visits behind the running mean; before that many, the region counts as improving."""
+_MAX_CHANGE = 0.3
+"""Bound of one visit's change of the log loss: a refined pose may change the loss of a view at once."""
+_MAX_VIEWS = 256
+"""Views whose last loss is kept, those visited last."""
+
+
+class RegionSaturation:
+    """Running mean of the region's improvement per visit of a view. Deterministic: it draws no random numbers."""
+
+    def __init__(self, settings: SaturationSettings) -> None:
+        self._settings = settings
+        self.reset()
+
+    @property
+    def enabled(self) -> bool:
+        """False if no iteration is ever released; then reading the loss, which may wait for a device, is not needed."""
+        return self._settings.max_released > 0
+
+    def reset(self) -> None:
+        """Forget all measurements: a new task has another region."""
+        self._last_loss: dict[int, float] = {}
+        self._improvement, self._visits, self._credit = 0.0, 0, 0.0
+
+    @property
+    def released_share(self) -> float:
+        """Share of the active iterations to run on whole images instead, in [0, max_released]."""
+        settings = self._settings
+        if self._visits < _HORIZON_VISITS:
+            return 0.0
+        share = (settings.improving - self._improvement) / (settings.improving - settings.saturated)
+        return min(max(share, 0.0), 1.0) * settings.max_released
+
+    def observe(self, recorded: Frame, loss: float) -> None:
+        """Compare the loss of an active iteration with the previous one on the view of this recorded frame."""
+        if not 0.0 < loss < math.inf:
+            return
+        view = _view_id(recorded)
+        previous = self._last_loss.pop(view, None)
+        self._last_loss[view] = loss
+        if len(self._last_loss) > _MAX_VIEWS:
+            del self._last_loss[next(iter(self._last_loss))]
+        if previous is not None:
+            change = min(max(math.log(previous / loss), -_MAX_CHANGE), _MAX_CHANGE)
+            self._visits = min(self._visits + 1, _HORIZON_VISITS)
+            self._improvement += (change - self._improvement) / self._visits
+
+    def releases_next(self) -> bool:
+        """True if the next active iteration is released. Call it once per active iteration; shares add up exactly."""
+        self._credit += self.released_share
+        released = self._credit >= 1.0
+        self._credit -= float(released)
+        return released
+
+    def state(self) -> State:
+        """Return the last losses, in the order of the visits, and the running mean."""
+        return {
+            "views": int_array(*self._last_loss),
+            "losses": np.array(list(self._last_loss.values()), np.float64),
+            "mean": np.array([self._improvement, self._credit]),
+            "visits": int_array(self._visits),
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from another measurement's state. Raises MapFileError."""
+        views = get_array(state, "views", (None,), np.int64)
+        losses = get_floats(state, "losses", len(views))
+        if len(views) > _MAX_VIEWS or not all(loss > 0 for loss in losses):
+            raise MapFileError(f"state saturation: expected at most {_MAX_VIEWS} losses above 0, got others")
+        self._last_loss = dict(zip(views.tolist(), losses, strict=True))
+        self._improvement, self._credit = get_floats(state, "mean", 2)
+        [self._visits] = get_counts(state, "visits", 1)
+
+
+def _view_id(recorded: Frame) -> int:
+    """Return a number that identifies a recorded frame also after a restart, without its time: clocks may restart."""
+    pose = zlib.crc32(np.ascontiguousarray(recorded.T_world_camera).tobytes())
+    return (recorded.index & 0x7FFFFFFF) << 32 | pose
+
+
+class Stage(StrEnum):
+    """One measured part of processing a frame, in the order of the loop."""
+
+    TRACKING = "tracking"
+    """Find the camera's pose by aligning the frame to the map."""
+    RENDERING = "rendering"
+    """Render the map from the frame's pose."""
+    RELEVANCE = "relevance"
+    """Detect, track and decide which pixels are relevant to the task."""
+    REEVALUATION = "reevaluation"
+    """Evaluate earlier keyframes for a new task."""
+    VIEW_PREPARATION = "view_preparation"
+    """Refine the frame's pose and exposure and prepare the frame for training."""
+    SEEDING = "seeding"
+    WARM_UP = "warm_up"
+    """Iterations over full images."""
+    ACTIVE = "active"
+    """Iterations over the task's region."""
+    PRUNING = "pruning"
+    DENSIFICATION = "densification"
+    FINALISATION = "finalisation"
+    """Clamp colours and update the EMA after the iterations."""
+    PUBLISHING = "publishing"
+    """Find the changed voxels of the region and pass them to the uplink."""
+
+
+class SkippableStage(StrEnum):
+    """A part of processing that a frame may skip if its time is short."""
+
+    PUBLISHING = "publishing"
+    """The next frame publishes the changes of this one too, because updates state totals."""
+    SEEDING = "seeding"
+    """The frame neither renders the map first nor adds Gaussians; it only trains."""
+
+
+ITERATION_STAGES = frozenset((Stage.WARM_UP, Stage.ACTIVE))
+
+
+@runtime_checkable
+class StageScheduler(Protocol):
+    """Decides which stages of a frame run and for how many iterations."""
+
+    def timing(self, stage: Stage) -> AbstractContextManager[None]:
+        """Return a context that surrounds one execution of the stage."""
+        ...
+
+    def skips(self, stage: SkippableStage) -> bool:
+        """Return True if the current frame skips this stage."""
+        ...
+
+    def has_time_for(self, stage: Stage) -> bool:
+        """Return True if the frame is expected to meet its deadline with this optional stage."""
+        ...
+
+    def trains_on(self, stage: Stage, iterations_per_frame: int) -> bool:
+        """Return True if another iteration of this stage should run."""
+        ...
+
+
+class CountedScheduler:
+    """A StageScheduler for one frame without a deadline: nothing is skipped and iterations are counted."""
+
+    def __init__(self) -> None:
+        self._iterations = 0
+
+    def timing(self, stage: Stage) -> AbstractContextManager[None]:
+        """Count the stage if it is an iteration."""
+        self._iterations += stage in ITERATION_STAGES
+        return nullcontext()
+
+    def skips(self, stage: SkippableStage) -> bool:
+        """Return False."""
+        del stage
+        return False
+
+    def has_time_for(self, stage: Stage) -> bool:
+        """Return True."""
+        del stage
+        return True
+
+    def trains_on(self, stage: Stage, iterations_per_frame: int) -> bool:
+        """Return True until the number of iterations is reached."""
+        del stage
+        return self._iterations < iterations_per_frame
+
 
 _COLOUR_RANGE = (-0.25, 1.25)
 """Wider than [0, 1], so that blended colours still reach black and white."""

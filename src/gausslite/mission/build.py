@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.region import Region
+from gausslite.domain.objects import NounMatch
+from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.tracking.tracker import CameraTracker
+from gausslite.mapping.tracking import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
@@ -29,7 +29,7 @@ from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
     from gausslite.perception.detector import Detector
-    from gausslite.perception.models.model_registry import ModelRegistry
+    from gausslite.perception.models import ModelRegistry
 
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
@@ -51,7 +51,7 @@ def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
     """Open the user's model files and run each once; None without any. Raises ModelFileError, InvalidInputError."""
     if perception.model is None:
         return None
-    from gausslite.perception.models.model_registry import ModelRegistry
+    from gausslite.perception.models import ModelRegistry
 
     tiling = Tiling(perception.tiles, perception.detection_time_s)
     return ModelRegistry(

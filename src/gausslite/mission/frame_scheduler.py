@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.mapping.stages import ITERATION_STAGES, SkippableStage, Stage
+from gausslite.mapping.training import ITERATION_STAGES, SkippableStage, Stage
 
 Clock = Callable[[], float]
 """Monotonic seconds from an arbitrary start."""

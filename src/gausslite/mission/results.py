@@ -3,26 +3,56 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import math
+import os
 import resource
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.files import write_atomic
 from gausslite.codec.ply import write_ply
+from gausslite.codec.run_files import KeyframeView, ViewImage, write_keyframe_views, write_view_images
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
-from gausslite.datasets.pose_file import format_pose_rows, read_pose_rows
+from gausslite.codec.state_file import write_atomic
+from gausslite.datasets.folder import format_pose_rows, read_pose_rows
 from gausslite.domain.errors import MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose_correction import CorrectionTrack, pose_at
-from gausslite.mapping.pose_history import PoseHistory
+from gausslite.domain.pose import CorrectionTrack, pose_at
+from gausslite.evaluation.views import largest_roi_per_segment
+from gausslite.mapping.keyframes import Keyframe
+from gausslite.mapping.poses import PoseHistory
+
+_PHOTOGRAPHS = 4
+
+
+def write_keyframes(folder: Path, keyframes: Sequence[Keyframe]) -> None:
+    """Write keyframes.json, and in `views` the photographs with the largest region of each quarter of the mission.
+
+    keyframes: oldest first. Raises StorageError.
+    """
+    views = [_view(keyframe) for keyframe in keyframes]
+    write_keyframe_views(folder, views)
+    chosen = sorted(largest_roi_per_segment([view.roi_pixels for view in views], _PHOTOGRAPHS))
+    write_view_images(folder, [_photograph(keyframes[i]) for i in chosen])
+
+
+def _view(keyframe: Keyframe) -> KeyframeView:
+    frame, pixels = keyframe.frame, int(np.count_nonzero(keyframe.relevance.roi))
+    return KeyframeView(frame.index, frame.capture_time_ns, frame.camera, frame.T_world_camera, pixels)
+
+
+def _photograph(keyframe: Keyframe) -> ViewImage:
+    return ViewImage(keyframe.frame.index, keyframe.frame.rgb, keyframe.relevance.roi)
+
 
 _MAP, _REPORT = "map.ply", "report.json"
 _FIRST_BYTES = 512
@@ -201,3 +231,24 @@ def _rounded(value: object) -> object:
     if isinstance(value, list | tuple):
         return [_rounded(item) for item in value]
     return value
+
+
+@contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Hold the folder for this run; it is created, and removed if it is empty at the end.
+
+    Raises StorageError if another run holds it.
+    """
+    prepare_folder(folder)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        raise StorageError(f"{folder}: another run writes its results there; choose another --out") from error
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+        os.close(handle)

@@ -11,21 +11,18 @@ from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.noun_match import NounReport
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import NounReport, ObjectLandmark
 from gausslite.domain.relevance import DetectedImage, RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.coverage import RenderedView
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.pose_history import PoseHistory
-from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mapping.poses import PoseHistory
+from gausslite.mapping.seeding import RenderedView
 from gausslite.mapping.task_change import Reevaluation
-from gausslite.mapping.team_voxels import InsertedVoxels
-from gausslite.mapping.tracking.tracker import CameraTracker
+from gausslite.mapping.tracking import CameraTracker
+from gausslite.mapping.training import SkippableStage, Stage
+from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.object_names import words
-from gausslite.domain.srgb import linear_light
+from gausslite.domain.frame import linear_light
+from gausslite.domain.objects import words
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.settings import ColourSettings
 

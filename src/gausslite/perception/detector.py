@@ -13,10 +13,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import MatchBasis, NounMatch
-from gausslite.domain.object_names import largest_size, meant_by
-from gausslite.domain.region import Region
-from gausslite.domain.relevance import DetectedBox, Detection
+from gausslite.domain.objects import MatchBasis, NounMatch, largest_size, meant_by
+from gausslite.domain.relevance import DetectedBox, Detection, Region
 from gausslite.perception.settings import require_plausible
 
 

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera, back_project, lift
 from gausslite.domain.frame import Frame
-from gausslite.domain.object_names import is_solid
+from gausslite.domain.objects import is_solid
 from gausslite.domain.pose import transform_points, unit_up_axis
 from gausslite.domain.relevance import Detection
 from gausslite.perception.object_map import Observation

@@ -14,10 +14,10 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import MatchBasis, NounMatch
+from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
 from gausslite.perception.detector import BoxSizeLimits
-from gausslite.perception.models.model_file import OpenModel, run_once
+from gausslite.perception.model_file import OpenModel, run_once
 from gausslite.perception.text_features import PhraseInput, PhraseVectors, Tokenizer, encode_phrase
 from gausslite.perception.yolo_network import Letterbox, decode, letterbox, suppress
 

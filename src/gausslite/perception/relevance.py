@@ -13,10 +13,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounReport, match_warnings
-from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.region import Region
-from gausslite.domain.relevance import NO_TARGET, DetectedImage, Detection, RelevanceMap
+from gausslite.domain.objects import NounReport, ObjectLandmark, match_warnings
+from gausslite.domain.relevance import NO_TARGET, DetectedImage, Detection, Region, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detector import Detector

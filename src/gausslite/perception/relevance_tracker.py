@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounMatch, NounReport
-from gausslite.domain.object_names import is_generic
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import NounMatch, NounReport, ObjectLandmark, is_generic
 from gausslite.domain.pose import require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
 from gausslite.domain.state import (

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import MatchBasis, NounMatch
-from gausslite.domain.object_names import head_of, words
+from gausslite.domain.objects import MatchBasis, NounMatch, head_of, words
 from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.object_map import Landmark, Observation

@@ -13,9 +13,8 @@ from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import KernelError, ModelFileError
-from gausslite.domain.noun_match import MatchBasis, NounMatch
-from gausslite.domain.object_names import head_of, is_generic, is_structure, normalised_noun, synonyms
-from gausslite.perception.models.model_file import OpenModel, open_model, run_once
+from gausslite.domain.objects import MatchBasis, NounMatch, head_of, is_generic, is_structure, normalised_noun, synonyms
+from gausslite.perception.model_file import OpenModel, open_model, run_once
 from gausslite.perception.settings import require_plausible
 
 NOUN_VECTORS_FILE: Final = "lvis_v1_clip_a+cname.npy"

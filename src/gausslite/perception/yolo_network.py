@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.perception.models.model_file import OpenModel, run_once
+from gausslite.perception.model_file import OpenModel, run_once
 
 MASK_COEFFICIENTS = 32
 _PAD_VALUE = 114

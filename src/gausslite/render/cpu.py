@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
+from operator import is_
+from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 from weakref import ref
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
-from gausslite.render.checks import (
-    require_image_gradients,
-    require_scene,
-    require_table,
-    require_view,
-)
-from gausslite.render.cpu_arguments import CpuView, TableBinding, contiguous, intrinsics, native_motion
-from gausslite.render.cpu_kernels import choose_simd, choose_threads, load_kernels
 from gausslite.render.rasterizer import (
     FULL_FRAME,
     AdamSettings,
@@ -34,10 +30,204 @@ from gausslite.render.rasterizer import (
     Subset,
     TrainingView,
     UpdateCounter,
+    require_image_gradients,
+    require_row_masks,
+    require_scene,
+    require_table,
+    require_tables,
+    require_view,
 )
 
 if TYPE_CHECKING:
     from gausslite.render import _kernels
+
+
+SIMD_VARIABLE = "GAUSSLITE_SIMD"
+MAX_THREADS = 256
+_CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+"""CPU limit of a control group (version 2): microseconds per period, or `max`."""
+
+
+def usable_simd() -> tuple[str, ...]:
+    """Return the instruction sets of this build that this machine runs, fastest first. Raises KernelError."""
+    return tuple(load_kernels().usable_simd())
+
+
+def core_clock_ghz() -> float:
+    """Measure the clock of the current core, in 1 to 2 ms. Raises KernelError."""
+    clock_ghz: float = load_kernels().core_clock_ghz()
+    return clock_ghz
+
+
+def load_kernels() -> Any:
+    """Return the extension module. Raises KernelError if it is not built for this Python."""
+    try:
+        from gausslite.render import _kernels
+    except ImportError as reason:
+        raise KernelError(
+            f"native kernels: not built for this Python; install the package again ({reason})"
+        ) from reason
+    return _kernels
+
+
+def choose_simd(requested: str | None) -> str:
+    """Return the requested instruction set, else the one of the environment, else the fastest. Raises KernelError."""
+    usable = usable_simd()
+    chosen = requested or os.environ.get(SIMD_VARIABLE) or usable[0]
+    if chosen not in usable:
+        source = "simd" if requested else SIMD_VARIABLE
+        raise KernelError(f"{source}: expected one of {', '.join(usable)} on this machine, got {chosen}")
+    return chosen
+
+
+def cores_allowed(limit: Path = _CPU_LIMIT) -> int:
+    """Return the container's CPU limit in cores (`docker run --cpus`), rounded up; MAX_THREADS without a limit."""
+    try:
+        quota, period = limit.read_text().split()
+        return max(1, math.ceil(int(quota) / int(period)))
+    except (OSError, ValueError, ZeroDivisionError):
+        return MAX_THREADS
+
+
+def choose_threads(requested: int | None) -> int:
+    """Return the requested number of threads, else one per core that the process may use. Raises KernelError.
+
+    More threads than cores slow all stages down: each stage waits for its last thread.
+    """
+    if requested is None:
+        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return min(available, cores_allowed(), MAX_THREADS)
+    if not 1 <= requested <= MAX_THREADS:
+        raise KernelError(f"threads: expected 1 to {MAX_THREADS}, got {requested}")
+    return requested
+
+
+_Table: TypeAlias = Float32[ndarray, "n 16"]
+_Tables: TypeAlias = tuple[_Table, _Table, _Table]
+_Native = TypeVar("_Native")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CachedArguments(Generic[_Native]):
+    """Python arguments and their checked native form.
+
+    Checks cost time between two steps: the kernels have evicted the interpreter's data from the CPU caches.
+    """
+
+    arguments: tuple[object, ...]
+    native: _Native
+
+    def matches(self, arguments: tuple[object, ...]) -> bool:
+        """Return True if these are the same objects; the values of their arrays may have changed."""
+        return all(map(is_, self.arguments, arguments))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CpuView:
+    """A training image in the kernels' layout, with the cached scene of the latest masked and unmasked step."""
+
+    camera: Camera
+    intrinsics: tuple[float, float, float, float, int, int]
+    motion: list[float] | None
+    native: _kernels.View
+    scenes: dict[bool, _CachedArguments[_kernels.StepScene]] = field(default_factory=dict, repr=False)
+
+    def scene(
+        self, n: int, T_camera_world: Float64[ndarray, "4 4"], subset: Subset, masked: bool
+    ) -> _kernels.StepScene:
+        """Return view, pose and subset in native form, for n rows. Raises ShapeError, InvalidInputError."""
+        arguments, cached = (T_camera_world, subset), self.scenes.get(masked)
+        if cached is not None and cached.matches(arguments):
+            return cached.native
+        require_scene(n, self.camera, T_camera_world, subset)
+        arrays = T_camera_world, subset.tiles, subset.ids
+        passed = contiguous(T_camera_world), contiguous(subset.tiles), contiguous(subset.ids)
+        native: _kernels.StepScene = load_kernels().StepScene(self.native, self.intrinsics, *passed, self.motion)
+        # a copy would not follow later changes of its array; the check of ids depends on n
+        if subset.ids is None and all(map(is_, arrays, passed)):
+            self.scenes[masked] = _CachedArguments(arguments, native)
+        return native
+
+
+class TableBinding:
+    """The bound tables, at most one set at a time, and the cached training arguments of steps on them."""
+
+    def __init__(self) -> None:
+        self._tables: _Tables | None = None
+        self._binding_id = 0
+        self._trainings: dict[bool, _CachedArguments[_kernels.StepTraining]] = {}
+
+    @contextmanager
+    def bind(self, tables: _Tables) -> Iterator[None]:
+        """Bind the tables inside this context. Raises ShapeError, InvalidInputError if tables are bound already."""
+        require_tables(*tables)
+        if self._tables is not None:
+            raise InvalidInputError("bind_tables: expected no bound tables, got a second binding")
+        self._binding_id += 1
+        self._tables = tables
+        try:
+            yield
+        finally:
+            self._tables = None
+            self._trainings.clear()
+
+    def training(
+        self,
+        tables: _Tables,
+        settings: tuple[LossWeights, AdamSettings],
+        masked: bool,
+        trainable: Bool[ndarray, " n"] | None,
+        update_counter: UpdateCounter | None,
+    ) -> _kernels.StepTraining:
+        """Return the native form of tables, settings, masks and counter. Raises ShapeError."""
+        arguments, cached = (*tables, *settings, trainable, update_counter), self._trainings.get(masked)
+        if cached is not None and cached.matches(arguments):
+            return cached.native
+        is_bound = self._tables is not None and all(map(is_, tables, self._tables))
+        if not is_bound:
+            require_tables(*tables)
+        require_row_masks(len(tables[0]), trainable, update_counter)
+        loss, adam = settings
+        counts = None if update_counter is None else update_counter.counts
+        mask = None if update_counter is None else update_counter.mask
+        flags, mask_flags = contiguous(trainable), contiguous(mask)
+        native: _kernels.StepTraining = load_kernels().StepTraining(
+            tables=tables,
+            loss=(loss.colour, loss.depth, loss.ssim, loss.normalise_by_image),
+            rates=_row_rates(adam),
+            adam=(adam.beta1, adam.beta2, adam.epsilon, adam.decay_after_updates),
+            masked=masked,
+            trainable=flags,
+            update_counts=counts,
+            count_mask=mask_flags,
+            binding_id=self._binding_id if is_bound else 0,
+        )
+        if is_bound and flags is trainable and mask_flags is mask:
+            self._trainings[masked] = _CachedArguments(arguments, native)
+        return native
+
+
+@lru_cache(maxsize=8)
+def _row_rates(adam: AdamSettings) -> tuple[float, ...]:
+    return tuple(adam.row_rates().tolist())
+
+
+def intrinsics(camera: Camera) -> tuple[float, float, float, float, int, int]:
+    """Return fx, fy, cx, cy, width and height in pixels."""
+    return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
+
+
+def native_motion(motion: CameraMotion | None) -> list[float] | None:
+    """Return linear and angular velocity, readout and exposure time; None for a camera at rest."""
+    if motion is None or motion.is_still:
+        return None
+    velocities = motion.twist.linear_m_s.tolist() + motion.twist.angular_rad_s.tolist()
+    return [*velocities, motion.readout_s, motion.exposure_s]
+
+
+def contiguous(array: ndarray | None) -> ndarray | None:
+    """Return the array itself if it is contiguous, else a contiguous copy."""
+    return None if array is None else np.ascontiguousarray(array)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,17 +33,19 @@ an ellipse that is not finite in the backend's precision. A row is visible if th
 from __future__ import annotations
 
 import math
+import mmap
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
+from jaxtyping import Bool, Float32, Float64, Int16, UInt8, UInt32
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.checks import require_array
+from gausslite.domain.errors import InvalidInputError, ShapeError
+from gausslite.domain.gaussians import Gaussians
 
 ROW_WIDTH = 16
 MEAN, LOG_SCALE, QUAT, OPACITY_LOGIT, RGB = slice(0, 3), slice(3, 6), slice(6, 10), 10, slice(11, 14)
@@ -312,3 +314,135 @@ class Rasterizer(Protocol):
         copies the tables to the device and back. Raises ShapeError, InvalidInputError if tables are bound already.
         """
         ...
+
+
+def require_table(name: str, table: Float32[ndarray, "n 16"], n: int | None = None) -> None:
+    """Raise ShapeError unless the table is contiguous with 16 columns (and n rows, if given)."""
+    require_array(name, table, (n, ROW_WIDTH), np.float32)
+    if not table.flags.c_contiguous:
+        raise ShapeError(f"{name}: expected contiguous rows, got strides {table.strides}")
+
+
+def require_tables(
+    rows: Float32[ndarray, "n 16"], first_moment: Float32[ndarray, "n 16"], second_moment: Float32[ndarray, "n 16"]
+) -> None:
+    """Raise ShapeError unless the three tables have equal shapes and are writeable."""
+    for name, table in (("rows", rows), ("first_moment", first_moment), ("second_moment", second_moment)):
+        require_table(name, table, len(rows))
+        if not table.flags.writeable:
+            raise ShapeError(f"{name}: expected a writeable array, got a read-only one")
+
+
+def require_scene(n: int, camera: Camera, T_camera_world: Float64[ndarray, "4 4"], subset: Subset) -> None:
+    """Raise ShapeError unless pose and subset fit the camera, InvalidInputError unless ids are ascending."""
+    require_array("T_camera_world", T_camera_world, (4, 4), np.float64)
+    if subset.tiles is not None:
+        grid = (-(-camera.height_px // TILE_PX), -(-camera.width_px // TILE_PX))
+        require_array("subset tiles", subset.tiles, grid, np.bool_)
+    if subset.ids is not None:
+        require_array("subset ids", subset.ids, (None,), np.uint32)
+        _require_ascending(subset.ids, n)
+
+
+def require_row_masks(n: int, trainable: Bool[ndarray, " n"] | None, update_counter: UpdateCounter | None) -> None:
+    """Raise ShapeError unless masks and counters have length n and the counters are writeable."""
+    if trainable is not None:
+        require_array("trainable", trainable, (n,), np.bool_)
+    if update_counter is None:
+        return
+    require_array("update_counter counts", update_counter.counts, (n,), np.uint32)
+    if not (update_counter.counts.flags.writeable and update_counter.counts.flags.c_contiguous):
+        raise ShapeError("update_counter counts: expected a contiguous, writeable array, got another")
+    if update_counter.mask is not None:
+        require_array("update_counter mask", update_counter.mask, (n,), np.bool_)
+
+
+def require_image_gradients(
+    rendering: Rendering,
+    d_rgb: Float32[ndarray, "h w 3"],
+    d_depth_m: Float32[ndarray, "h w"],
+    d_alpha: Float32[ndarray, "h w"],
+) -> None:
+    """Raise ShapeError unless the derivatives have the shapes of the rendered images."""
+    size = rendering.alpha.shape
+    require_array("d_rgb", d_rgb, (*size, 3), np.float32)
+    require_array("d_depth_m", d_depth_m, size, np.float32)
+    require_array("d_alpha", d_alpha, size, np.float32)
+
+
+def require_view(
+    rgb: UInt8[ndarray, "h w 3"],
+    depth_m: Float32[ndarray, "h w"],
+    camera: Camera,
+    pixel_weights: Float32[ndarray, "h w"] | None,
+) -> None:
+    """Raise ShapeError unless the images have the camera's size; InvalidInputError if a weight is outside [0, 1]."""
+    size = (camera.height_px, camera.width_px)
+    require_array("view rgb", rgb, (*size, 3), np.uint8)
+    require_array("view depth_m", depth_m, size, np.float32)
+    if pixel_weights is not None:
+        require_array("view pixel_weights", pixel_weights, size, np.float32)
+        if not ((pixel_weights >= 0.0) & (pixel_weights <= 1.0)).all():
+            raise InvalidInputError(
+                f"view pixel_weights: expected values in [0, 1], got {pixel_weights.min()} to {pixel_weights.max()}"
+            )
+
+
+def _require_ascending(ids: UInt32[ndarray, " m"], n: int) -> None:
+    if len(ids) and (ids[-1] >= n or (ids[1:] <= ids[:-1]).any()):
+        raise InvalidInputError(f"subset ids: expected ascending row numbers below {n}, got others")
+
+
+_MIN_SCALE_M = 1e-7
+_MIN_OPACITY = 1e-6
+
+
+def gaussians_to_rows(gaussians: Gaussians) -> Float32[ndarray, "n 16"]:
+    """Encode Gaussians as rows. Scales are at least 1e-7 m; opacities are clipped to [1e-6, 1 - 1e-6]."""
+    opacities = np.clip(gaussians.opacities, _MIN_OPACITY, 1.0 - _MIN_OPACITY).astype(np.float32)
+    rows = np.zeros((len(gaussians), ROW_WIDTH), np.float32)
+    rows[:, MEAN] = gaussians.means_m
+    rows[:, LOG_SCALE] = np.log(np.maximum(gaussians.scales_m, _MIN_SCALE_M))
+    rows[:, QUAT] = gaussians.quats_wxyz
+    rows[:, OPACITY_LOGIT] = np.log(opacities) - np.log1p(-opacities)
+    rows[:, RGB] = gaussians.rgb
+    return rows
+
+
+def rows_to_gaussians(
+    rows: Float32[ndarray, "n 16"],
+    active: Bool[ndarray, " n"],
+    kappa: UInt32[ndarray, " n"],
+    target: Int16[ndarray, " n"],
+) -> Gaussians:
+    """Decode rows to Gaussians with unit quaternions; the other columns are copied."""
+    quats = rows[:, QUAT]
+    length = np.sqrt(np.einsum("ij,ij->i", quats, quats))[:, None]
+    return Gaussians(
+        means_m=rows[:, MEAN].copy(),
+        quats_wxyz=quats / np.maximum(length, np.float32(1e-12)),
+        scales_m=np.exp(rows[:, LOG_SCALE]),
+        opacities=decode_opacities(rows),
+        rgb=rows[:, RGB].copy(),
+        active=active.copy(),
+        kappa=kappa.copy(),
+        target=target.copy(),
+    )
+
+
+def decode_opacities(rows: Float32[ndarray, "n 16"]) -> Float32[ndarray, " n"]:
+    """Return the opacities in (0, 1): the sigmoid of the logits."""
+    # tanh, unlike exp, cannot overflow
+    opacities: Float32[ndarray, " n"] = 0.5 * (np.tanh(0.5 * rows[:, OPACITY_LOGIT]) + 1.0)
+    return opacities
+
+
+def allocate_rows(capacity: int) -> Float32[ndarray, "capacity 16"]:
+    """Return zeroed rows on whole pages (64-byte aligned), in huge pages if the system has them."""
+    size = capacity * ROW_WIDTH * np.dtype(np.float32).itemsize
+    # private: the default, shared memory, seldom gets huge pages
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
+    huge_pages = getattr(mmap, "MADV_HUGEPAGE", None)
+    if huge_pages is not None:
+        memory.madvise(huge_pages)
+    return np.frombuffer(memory, np.float32).reshape(capacity, ROW_WIDTH)

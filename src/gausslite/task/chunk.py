@@ -2,11 +2,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from gausslite.task.distances import Bounds
-from gausslite.task.noun_phrase import NounPhrase
+from gausslite.task import lexicon
+from gausslite.task.lexicon import DISTANCE_SUPERLATIVES, SUPERLATIVES, is_attribute, singular, word_set
+from gausslite.task.tags import Tag
+from gausslite.task.tokens import Bounds
+
+# drinking glasses have a singular, spectacles have none
+_DRINK_WORDS = word_set(
+    "wine beer water champagne drinking cocktail juice whisky whiskey shot pint milk measuring dirty empty"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class NounPhrase:
+    """A noun phrase without its determiner, the head in the singular."""
+
+    words: tuple[str, ...]
+    has_determiner: bool
+
+    @property
+    def head(self) -> str:
+        """The noun without its adjectives."""
+        return self.words[-1]
+
+    @property
+    def distance_superlative(self) -> str | None:
+        """The word "nearest" or "farthest" (or a synonym) of the phrase; None without one."""
+        return next((word for word in self.words[:-1] if SUPERLATIVES.get(word) in DISTANCE_SUPERLATIVES), None)
+
+    @property
+    def text(self) -> str:
+        """The phrase as it is passed to a detector."""
+        return " ".join(self.words)
+
+    @property
+    def is_known(self) -> bool:
+        """True when the head is a noun of the lexicon."""
+        return self.head in lexicon.NOUNS or self.head in lexicon.GENERIC
+
+
+def noun_phrase(words: Sequence[str], has_determiner: bool) -> NounPhrase:
+    """Return the phrase of these words of a sentence."""
+    kept = list(words)
+    last = kept[-1]
+    kept[-1] = "glass" if last == "glasses" and _DRINK_WORDS.intersection(kept) else singular(last)
+    return NounPhrase(tuple(kept), has_determiner)
+
+
+def phrase_from_text(text: str) -> NounPhrase:
+    """Return the phrase of an object that the sentence named before."""
+    return NounPhrase(tuple(text.split()), True)
+
+
+def adjectives_only(words: Sequence[str]) -> bool:
+    """Return True if all words are adjectives, as in "red" or "big old"."""
+    return all((word in lexicon.ADJECTIVES or is_attribute(word)) and word not in lexicon.NOUNS for word in words)
 
 
 class ChunkKind(Enum):
@@ -48,3 +102,63 @@ class Chunk:
     negated: bool = False
     text: str = ""
     bounds: Bounds | None = None
+
+
+class ChunkBuffer:
+    """Collects chunks; `words` are those of the current noun phrase. index: position of the current word."""
+
+    def __init__(self, tagged: Sequence[tuple[str, Tag]]) -> None:
+        self.tagged = tagged
+        self.index = 0
+        self.chunks: list[Chunk] = []
+        self.words: list[str] = []
+        self.has_determiner = False
+        self.determiner_at = 0
+        self.negates_next = False
+
+    def tag(self, offset: int) -> Tag | None:
+        """Return the tag of a word by its offset from the current one; None outside the sentence."""
+        position = self.index + offset
+        return self.tagged[position][1] if 0 <= position < len(self.tagged) else None
+
+    def word(self, offset: int) -> str:
+        """Return a word by its offset from the current one; empty outside the sentence."""
+        position = self.index + offset
+        return self.tagged[position][0] if 0 <= position < len(self.tagged) else ""
+
+    def last_kind(self) -> ChunkKind | None:
+        """Return the kind of the latest complete chunk."""
+        return self.chunks[-1].kind if self.chunks else None
+
+    def last_verb(self) -> str:
+        """Return the latest verb of the sentence so far; empty without one."""
+        return next((chunk.word for chunk in reversed(self.chunks) if chunk.kind is ChunkKind.VERB), "")
+
+    def emit(self, kind: ChunkKind, word: str, gerund: bool = False) -> None:
+        """End the noun phrase and add a chunk."""
+        self.close()
+        self.chunks.append(Chunk(kind, word, gerund=gerund))
+
+    def emit_preposition(
+        self, relation: str, text: str = "", current_place: bool = False, bounds: Bounds | None = None
+    ) -> None:
+        """End the noun phrase and add a preposition, negated if a "not" precedes it."""
+        self.close()
+        negated, self.negates_next = self.negates_next, False
+        self.chunks.append(
+            Chunk(
+                ChunkKind.PREPOSITION,
+                relation,
+                current_place=current_place,
+                negated=negated,
+                text=text or relation,
+                bounds=bounds,
+            )
+        )
+
+    def close(self) -> None:
+        """End the current noun phrase."""
+        if self.words:
+            noun = noun_phrase(self.words, self.has_determiner)
+            self.chunks.append(Chunk(ChunkKind.NOUN, self.words[-1], noun))
+        self.words, self.has_determiner = [], False

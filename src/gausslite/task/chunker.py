@@ -6,20 +6,254 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from gausslite.task import lexicon
-from gausslite.task.attributes import ORDINALS, is_attribute
-from gausslite.task.chunk import Chunk, ChunkKind
-from gausslite.task.chunk_buffer import ChunkBuffer
-from gausslite.task.clause_types import SUBJECT_PRONOUNS, ClauseType, clause_types
-from gausslite.task.negation_chunks import chunk_negation
-from gausslite.task.noun_phrase import adjectives_only
-from gausslite.task.part_of_speech import Tag
-from gausslite.task.prepositions import PREPOSITIONS
-from gausslite.task.tag_candidates import tag_words
-from gausslite.task.tokenizer import lexical_units, split_bounds
-from gausslite.task.verb_chunks import NOUN_PHRASE_TAGS, OBJECT_START_TAGS, VerbChunker
-from gausslite.task.verb_forms import is_particle
-from gausslite.task.verbs import GO_VERBS
-from gausslite.task.word_set import word_set
+from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind, adjectives_only
+from gausslite.task.clause_types import (
+    INABILITIES,
+    SUBJECT_PRONOUNS,
+    SUBJECT_TAGS,
+    WISHES,
+    ClauseType,
+    clause_types,
+    is_command,
+    is_modal,
+)
+from gausslite.task.lexicon import ORDINALS, is_attribute, singular, word_set
+from gausslite.task.tags import Tag, tag_words
+from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
+from gausslite.task.verbs import (
+    ASPECT_VERBS,
+    BELONGING_VERBS,
+    GO_VERBS,
+    HOLDING_VERBS,
+    POSTURE_VERBS,
+    TOOL_VERBS,
+    is_particle,
+    verb_base,
+)
+
+_RELATIVES: Final = word_set("that which who whom")
+_VERB_CHUNKS_HAVE_FORMS: Final = word_set("has have had")
+_BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
+_MODIFIED_TAGS: Final = frozenset({Tag.NOUN, Tag.PARTICIPLE})
+NOUN_PHRASE_TAGS: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE})
+OBJECT_START_TAGS: Final = frozenset({Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE, Tag.INDEFINITE})
+
+
+class VerbChunker:
+    """Handles the verb forms of a sentence; its subject and its modal verb decide what a verb means."""
+
+    def __init__(self, buffer: ChunkBuffer) -> None:
+        self._buffer = buffer
+        self._after_modal = False
+        self._relative_chunk: int | None = None
+
+    def relative(self, word: str) -> None:
+        """Remember where a relative clause starts."""
+        self._buffer.close()
+        if word in _RELATIVES and self._buffer.last_kind() is ChunkKind.NOUN:
+            self._relative_chunk = len(self._buffer.chunks)
+
+    def auxiliary(self, word: str) -> None:
+        """Handle "is", "has" and the like; "has" with an object means near."""
+        buffer = self._buffer
+        self._end_relative_subject(finite=True)
+        if (
+            word in _VERB_CHUNKS_HAVE_FORMS
+            and buffer.last_kind() is ChunkKind.NOUN
+            and buffer.tag(1) in OBJECT_START_TAGS
+        ):
+            buffer.emit_preposition("near")
+        self._after_modal = is_modal(buffer.tagged, buffer.index) and buffer.last_kind() is ChunkKind.NOUN
+
+    def verb(self, word: str) -> None:
+        """Emit an instruction; a verb of a subordinate clause relates its object to its subject."""
+        buffer = self._buffer
+        self._end_relative_subject(finite=True)
+        base = verb_base(word) or word
+        if buffer.negates_next:
+            self._negated_verb(base)
+            return
+        subject, tagged, index = buffer.tag(-1), buffer.tagged, buffer.index
+        is_required = self._after_modal
+        self._after_modal = is_modal(tagged, index) and subject in SUBJECT_TAGS
+        is_wish = subject is Tag.PRONOUN and base in WISHES
+        if subject is Tag.INFINITIVE and buffer.tag(-2) is Tag.INDEFINITE and buffer.tag(1) not in OBJECT_START_TAGS:
+            buffer.close()  # "something to write with"
+        elif is_required and self._subject_is_object():
+            if base in BELONGING_VERBS:
+                buffer.emit(ChunkKind.SUBJECT_VERB, base)
+        elif subject not in SUBJECT_TAGS or is_wish or is_command(tagged, index):
+            buffer.emit(ChunkKind.VERB, base)
+        elif base in BELONGING_VERBS and subject is not Tag.PRONOUN:
+            buffer.emit(ChunkKind.SUBJECT_VERB, base)
+        elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.INDEFINITE) and buffer.tag(1) in OBJECT_START_TAGS | {Tag.PRONOUN}:
+            self._subordinate_verb(base)
+        else:
+            buffer.close()
+
+    def gerund(self, word: str) -> None:
+        """Handle an -ing form: an adjective, an instruction, or a relation of the noun before it."""
+        buffer = self._buffer
+        before, after = buffer.tag(-1), buffer.tag(1)
+        if buffer.negates_next:
+            self._negated_verb(verb_base(word) or word)
+            return
+        can_start = buffer.has_determiner or before not in _BEFORE_GERUND_TAGS
+        can_start = can_start or (
+            before is Tag.VERB and buffer.last_kind() is ChunkKind.VERB and buffer.chunks[-1].word not in ASPECT_VERBS
+        )
+        if can_start and after in NOUN_PHRASE_TAGS and lexicon.ADJECTIVES.issuperset(buffer.words):
+            buffer.words.append(word)  # "the leaking pipe"
+        elif before is Tag.PREPOSITION and buffer.last_kind() is ChunkKind.NOUN and buffer.tag(-2) in _MODIFIED_TAGS:
+            buffer.close()  # "a cloth for wiping the table"
+            if after in OBJECT_START_TAGS:
+                buffer.emit_preposition("purpose")
+        elif buffer.words or before in (Tag.NOUN, Tag.INDEFINITE, Tag.AUXILIARY, Tag.RELATIVE):
+            self._gerund_after_noun(after)
+        else:
+            buffer.emit(ChunkKind.VERB, verb_base(word) or word, gerund=True)
+
+    def participle(self, word: str) -> None:
+        """Handle a participle: an adjective, a required state, or a modifier of the noun before it."""
+        buffer = self._buffer
+        before, after = buffer.tag(-1), buffer.tag(1)
+        if after in NOUN_PHRASE_TAGS and before not in (Tag.NOUN, Tag.INDEFINITE, Tag.PRONOUN):
+            buffer.words.append(word)
+            return
+        self._end_relative_subject(finite=after is Tag.PRONOUN)
+        if self._after_modal and self._subject_is_object():
+            buffer.emit(ChunkKind.SUBJECT_VERB, verb_base(word) or word)
+        elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN:
+            buffer.chunks.pop()  # "the toy my son dropped": the son is irrelevant
+        self._after_modal = False
+
+    def _negated_verb(self, base: str) -> None:
+        """Skip the verb of "that is not standing on"; "who does not wear a helmet" means not near it."""
+        self._buffer.close()
+        if base in HOLDING_VERBS:
+            self._buffer.emit_preposition("near")
+
+    def _end_relative_subject(self, finite: bool) -> None:
+        """Remove the subject of a relative clause: the wife in "the mug (that) my wife uses"."""
+        buffer = self._buffer
+        buffer.close()
+        adjacent = buffer.determiner_at > 0 and buffer.tagged[buffer.determiner_at - 1][1] is Tag.NOUN
+        if finite and adjacent and [chunk.kind for chunk in buffer.chunks[-2:]] == [ChunkKind.NOUN, ChunkKind.NOUN]:
+            buffer.chunks.pop()
+        if self._relative_chunk is not None and self._relative_chunk == len(buffer.chunks) - 1:
+            buffer.chunks.pop()
+        self._relative_chunk = None
+
+    def _subordinate_verb(self, base: str) -> None:
+        """Handle the verb of a subordinate clause: "holds" in "the shelf that holds the cans" means near."""
+        buffer = self._buffer
+        if base in HOLDING_VERBS:
+            buffer.emit_preposition("near")
+        elif buffer.tag(-1) is Tag.INDEFINITE and buffer.last_kind() is ChunkKind.NOUN:
+            buffer.chunks.pop()
+        else:
+            buffer.emit_preposition("purpose")
+
+    def _subject_is_object(self) -> bool:
+        noun = self._buffer.chunks[-1].noun if self._buffer.chunks else None
+        return noun is not None and noun.head not in lexicon.ADDRESSEES
+
+    def _gerund_after_noun(self, after: Tag | None) -> None:
+        """Relate the object of the gerund: "the person holding a cup" is near the cup."""
+        if after in OBJECT_START_TAGS:
+            self._buffer.emit_preposition("near")
+        else:
+            self._buffer.close()
+
+
+_NEGATED_VERBS: Final = WISHES | word_set("care touch mean")
+# "that is not a duck" excludes something, "that is not open" does not
+_EXCLUDING_TAGS: Final = frozenset({Tag.VERB, Tag.DETERMINER, Tag.NOUN})
+_VERB_FORMS: Final = frozenset({Tag.VERB, Tag.GERUND, Tag.PARTICIPLE})
+_NOUN_BEFORE: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.RELATIVE, Tag.AUXILIARY, Tag.ANAPHOR, Tag.CONJUNCTION})
+_NOTS: Final = word_set("not never") | {"but not", "do not", "doesn't", "don't", "dont"}
+_CLAUSE_START_TAGS: Final = frozenset({None, Tag.CLAUSE_BREAK, Tag.CONJUNCTION})
+_HAVE_FORMS: Final = word_set("have has had")
+_QUESTION_WORDS: Final = word_set("is are was were does did has have can could would will")
+
+
+def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
+    """Handle the negation at the current word."""
+    before, after = buffer.tag(-1), buffer.tag(1)
+    if before is Tag.PRONOUN and buffer.word(-1) != "you" and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
+        buffer.close()  # "I can't find my phone"
+    elif word in INABILITIES and before in (Tag.NOUN, Tag.INDEFINITE) and after is Tag.VERB:
+        buffer.close()  # "my son can't find his bear"
+        if buffer.last_kind() is ChunkKind.NOUN:
+            buffer.chunks.pop()
+    elif _opens_question(buffer):
+        buffer.close()  # "isn't there a mug on the table?"
+    elif (word in _NOTS and _negates_place(buffer)) or (
+        word in _NOTS and is_attribute(buffer.word(1)) and _follows_noun_of_state(buffer)
+    ):
+        buffer.close()
+        buffer.negates_next = True
+    elif word == "without" and _modifies_noun(buffer):
+        buffer.close()
+        buffer.negates_next = True
+        buffer.emit_preposition("near", word)
+    elif after is Tag.AUXILIARY and buffer.tag(2) in (Tag.PARTICIPLE, Tag.VERB):
+        _exclude_subject(buffer, word)
+    elif before is Tag.AUXILIARY and buffer.word(-1) != "do" and (after not in _EXCLUDING_TAGS or _is_state(buffer)):
+        buffer.emit(ChunkKind.NOT_UNDERSTOOD, f"{word} {buffer.word(1)}".strip())
+    else:
+        buffer.emit(ChunkKind.NEGATION, word)
+
+
+def _follows_noun_of_state(buffer: ChunkBuffer) -> bool:
+    """Return True for the "not" of "the mug that is not red" and "anything not red"."""
+    is_relative = buffer.tag(-1) is Tag.AUXILIARY and buffer.tag(-2) is Tag.RELATIVE
+    is_bare = buffer.tag(-1) is Tag.INDEFINITE and buffer.tag(2) not in NOUN_PHRASE_TAGS
+    return is_relative or is_bare
+
+
+def _is_state(buffer: ChunkBuffer) -> bool:
+    """Return True for an unknown word in "that is not rotten", unlike "that are not chairs"."""
+    word = buffer.word(1)
+    return buffer.tag(1) is Tag.NOUN and word not in lexicon.NOUNS and singular(word) == word
+
+
+def _opens_question(buffer: ChunkBuffer) -> bool:
+    is_question = buffer.word(-1) in _QUESTION_WORDS and buffer.tag(-2) in _CLAUSE_START_TAGS
+    return is_question and buffer.tag(1) in OBJECT_START_TAGS | {Tag.PREPOSITION, Tag.ANAPHOR}
+
+
+def _negates_place(buffer: ChunkBuffer) -> bool:
+    """Return True for "(that is) not on", "(that do) not hang on", "(who is) not wearing"."""
+    if buffer.tag(-1) not in _NOUN_BEFORE or not (buffer.words or buffer.chunks):
+        return False
+    if buffer.tag(1) is Tag.PREPOSITION:
+        return True
+    base, after = verb_base(buffer.word(1)), buffer.tag(2)
+    if buffer.tag(-1) is Tag.AUXILIARY and buffer.word(1) in _HAVE_FORMS and after in OBJECT_START_TAGS:
+        return True
+    in_clause = buffer.tag(-1) in (Tag.AUXILIARY, Tag.RELATIVE) and buffer.tag(1) in _VERB_FORMS
+    is_place = base in POSTURE_VERBS and after is Tag.PREPOSITION
+    return in_clause and (is_place or (base in HOLDING_VERBS and after in OBJECT_START_TAGS))
+
+
+def _modifies_noun(buffer: ChunkBuffer) -> bool:
+    """Return True for "the worker without a helmet", not for "wipe the table without the sponge"."""
+    is_noun = buffer.tag(-1) in (Tag.NOUN, Tag.INDEFINITE) and buffer.tag(1) in OBJECT_START_TAGS
+    has_action = buffer.last_verb() in TOOL_VERBS
+    part = buffer.word(1) if buffer.tag(1) is not Tag.DETERMINER else buffer.word(2)
+    return is_noun and (not has_action or part in lexicon.PARTS)
+
+
+def _exclude_subject(buffer: ChunkBuffer, word: str) -> None:
+    """Negate the chunks before the verb: "the lamp and the vase must not be touched"."""
+    buffer.close()
+    first = len(buffer.chunks)
+    while first and buffer.chunks[first - 1].kind in (ChunkKind.NOUN, ChunkKind.CONJUNCTION):
+        first -= 1
+    base = verb_base(buffer.word(2)) or buffer.word(2)
+    buffer.chunks[first:first] = [Chunk(ChunkKind.NEGATION, word), Chunk(ChunkKind.VERB, base, gerund=True)]
+
 
 _DEMONSTRATIVES: Final = word_set("this that these those")
 # "go around the table to the sofa": the table is a waypoint, the sofa the goal

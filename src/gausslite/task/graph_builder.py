@@ -6,13 +6,11 @@ from collections.abc import Sequence
 
 from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon
-from gausslite.task.attributes import SUPERLATIVES, is_attribute
-from gausslite.task.chunk import Chunk, ChunkKind
-from gausslite.task.clause import Clause, names_object, with_shared_head
-from gausslite.task.distances import UNBOUNDED
+from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
 from gausslite.task.graph_draft import GraphDraft, RelationTerms
-from gausslite.task.noun_phrase import NounPhrase, adjectives_only, phrase_from_text
-from gausslite.task.role_assignment import RoleAssigner
+from gausslite.task.lexicon import SUPERLATIVES, is_attribute
+from gausslite.task.roles import Clause, RoleAssigner, names_object, with_shared_head
+from gausslite.task.tokens import UNBOUNDED
 from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not

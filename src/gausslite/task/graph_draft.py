@@ -8,7 +8,7 @@ from typing import Final
 
 from gausslite.domain.task import Predicate, Relation, TargetRole
 from gausslite.task import lexicon
-from gausslite.task.distances import UNBOUNDED, Bounds
+from gausslite.task.tokens import UNBOUNDED, Bounds
 
 _PREDICATES: Final = frozenset(predicate.value for predicate in Predicate)
 

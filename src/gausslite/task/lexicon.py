@@ -2,12 +2,207 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
-from gausslite.task.nouns import COMMON_ANCHORS, CONTAINERS, NOUNS, ROOMS
-from gausslite.task.word_set import word_set
+from gausslite.domain.task import Superlative
 
-__all__ = ["COMMON_ANCHORS", "CONTAINERS", "NOUNS", "ROOMS"]
+
+def word_set(text: str) -> frozenset[str]:
+    """Return the set of the words of a text."""
+    return frozenset(text.split())
+
+
+COLOURS: Final = word_set(
+    "red green blue yellow orange black white grey gray brown pink purple beige silver golden gold turquoise violet "
+    "maroon navy crimson scarlet ivory cream tan bronze teal lilac magenta cyan amber khaki indigo"
+)
+_SHADES: Final = word_set("light dark bright pale deep")
+# a colour and a noun that together name another thing
+_COLOUR_COMPOUNDS: Final = frozenset(
+    tuple(pair.split("_"))
+    for pair in [
+        "orange_juice",
+        "orange_tree",
+        "orange_peel",
+        "red_wine",
+        "white_wine",
+        "green_tea",
+        "black_tea",
+        "black_coffee",
+        "black_pepper",
+        "white_bread",
+        "brown_bread",
+        "brown_rice",
+        "brown_sugar",
+        "white_sugar",
+        "red_cross",
+        "blue_cheese",
+        "cream_cheese",
+        "green_bean",
+        "red_onion",
+        "green_onion",
+        "red_cabbage",
+        "black_box",
+        "white_board",
+        "black_board",
+        "ice_cream",
+        "yellow_page",
+        "gold_fish",
+        "silver_foil",
+        "black_hole",
+        "green_house",
+        "red_light_district",
+        "orange_slice",
+        "red_meat",
+        "white_chocolate",
+    ]
+)
+_WORDS_OF_SUPERLATIVE: Final = {
+    Superlative.LARGEST: "largest biggest hugest greatest larger bigger",
+    Superlative.SMALLEST: "smallest tiniest littlest smaller tinier littler",
+    Superlative.TALLEST: "tallest taller",
+    Superlative.SHORTEST: "shortest shorter",
+    Superlative.LONGEST: "longest longer",
+    Superlative.WIDEST: "widest wider broadest broader",
+    Superlative.NARROWEST: "narrowest narrower",
+    Superlative.THICKEST: "thickest thicker fattest fatter",
+    Superlative.THINNEST: "thinnest thinner slimmest slimmer",
+    Superlative.HIGHEST: "highest topmost uppermost higher",
+    Superlative.LOWEST: "lowest bottommost lowermost",
+    Superlative.LEFTMOST: "leftmost left-most",
+    Superlative.RIGHTMOST: "rightmost right-most",
+    Superlative.NEAREST: "nearest closest nearer closer",
+    Superlative.FARTHEST: "farthest furthest farther further remotest",
+}
+SUPERLATIVES: Final = {word: each for each, words in _WORDS_OF_SUPERLATIVE.items() for word in words.split()}
+COMPARATIVES: Final = frozenset(
+    word
+    for word, each in SUPERLATIVES.items()
+    if word.endswith("er") and each not in (Superlative.NEAREST, Superlative.FARTHEST)
+) | word_set("heavier lighter older newer thicker thinner")
+DISTANCE_SUPERLATIVES: Final = frozenset({Superlative.NEAREST, Superlative.FARTHEST})
+# superlatives of properties that geometry does not show
+UNSEEN_SUPERLATIVES: Final = word_set(
+    "oldest newest heaviest lightest cheapest cleanest dirtiest hottest coldest warmest coolest best worst fastest "
+    "slowest freshest strongest weakest hardest softest brightest darkest safest loudest quietest ripest sharpest "
+    "youngest latest earliest nicest prettiest fullest emptiest driest wettest finest poorest richest heavier older "
+    "newer cheaper dirtier hotter colder warmer younger fresher sturdiest busiest simplest easiest fanciest "
+    "darker "
+    "brighter softer harder stronger weaker fuller emptier dirtiest drier wetter safer"
+)
+ORDINALS: Final = word_set("first second third fourth fifth sixth seventh eighth ninth tenth last")
+_JOINED: Final = "-and-"
+
+
+@dataclass(frozen=True, slots=True)
+class DescribedNoun:
+    """A noun phrase without its attributes; unseen: its ordinals, and superlatives that geometry does not show."""
+
+    noun: str
+    colour: str | None = None
+    superlative: Superlative | None = None
+    unseen: tuple[str, ...] = ()
+
+
+def is_attribute(word: str) -> bool:
+    """Return True for words that never stand in a name."""
+    return word in SUPERLATIVES or word in UNSEEN_SUPERLATIVES or word in ORDINALS or _is_colour(word)
+
+
+def split_attributes(phrase: str) -> DescribedNoun:
+    """Return the noun of a phrase, and its attributes; the head noun always stays."""
+    *words, head = phrase.split()
+    kept: list[str] = []
+    colours: list[str] = []
+    unseen: list[str] = []
+    superlative: Superlative | None = None
+    for at, word in enumerate(words):
+        following = words[at + 1] if at + 1 < len(words) else head
+        if word in SUPERLATIVES:
+            superlative = SUPERLATIVES[word]
+        elif word in UNSEEN_SUPERLATIVES or (word in ORDINALS and (word, following) != ("first", "aid")):
+            unseen.append(word)
+        elif (_is_colour(word) and (word, following) not in _COLOUR_COMPOUNDS) or (
+            word in _SHADES and _is_colour(following) and at + 1 < len(words)
+        ):
+            colours.append(word)
+        else:
+            kept.append(word)
+    colour = " ".join(colours).replace(_JOINED, " and ").replace("gray", "grey") or None
+    return DescribedNoun(" ".join((*kept, head)), colour, superlative, tuple(unseen))
+
+
+def _is_colour(word: str) -> bool:
+    return all(each in COLOURS for each in word.split(_JOINED))
+
+
+ROOMS: Final = word_set(
+    "kitchen bedroom bathroom office hallway corridor lobby garage basement attic hall lounge closet pantry laundry "
+    "garden yard backyard lawn patio balcony warehouse workshop lab laboratory classroom store shop hospital street "
+    "sidewalk driveway field park campus courtyard terrace porch entryway foyer study library cafeteria restroom "
+    "toilet-room elevator staircase stairwell aisle"
+)
+COMMON_ANCHORS: Final = word_set(
+    "table desk counter countertop shelf bookshelf cabinet cupboard dresser nightstand bench sofa couch bed chair "
+    "stool armchair sink stove oven fridge refrigerator dishwasher microwave wall floor ceiling door doorway window "
+    "entrance exit gate fence stair stairs ladder fireplace bathtub shower toilet workbench rack sideboard wardrobe "
+    "tree building car truck tv television piano pillar column whiteboard blackboard printer island"
+)
+CONTAINERS: Final = word_set(
+    "drawer box bin basket cabinet cupboard closet fridge refrigerator freezer dishwasher oven microwave bag backpack "
+    "crate bucket bowl jar suitcase locker wardrobe container carton trunk dumpster sink bathtub pot washer dryer "
+    "case pocket purse toolbox chest sack hamper safe mailbox vase envelope package pantry kitchen incubator "
+    "centrifuge autoclave cooler canister tin tub barrel van trailer tank pouch satchel rucksack handbag holdall "
+    "briefcase carrier cage hutch kennel crib cot pram tote pail caddy cellar shed barn greenhouse tent cubby "
+    "cubbyhole glovebox boot cup mug glass bottle can thermos jug pitcher cooker kiln chamber compartment slot hole "
+    "folder binder hopper silo casket coffin wallet quiver holster sheath sleeve wrapper packet sachet pack bundle "
+    "bathroom bedroom office garage room car truck lorry bus ambulance helicopter boat plane taxi train"
+)
+_OBJECTS: Final = word_set(
+    "mug cup glass bottle plate bowl fork knife spoon pan pot kettle teapot jug pitcher can jar lid tray napkin towel "
+    "sponge cloth soap dish toaster blender grill apple banana orange lemon tomato potato carrot bread food fruit "
+    "vegetable sandwich pizza cake cookie egg milk coffee tea juice water snack cereal book notebook magazine "
+    "newspaper paper pen pencil marker stapler folder binder envelope letter document laptop computer monitor "
+    "keyboard mouse phone cellphone telephone tablet charger cable cord remote printer camera speaker headphones "
+    "headset microphone router lamp light bulb clock watch calculator eraser ruler scissors tape pillow cushion "
+    "blanket sheet rug carpet mat curtain blind mirror picture painting poster frame vase candle plant flower "
+    "flowerpot planter tree bush grass leaf branch rock stone dirt mud puddle sand gravel trash garbage rubbish "
+    "litter waste debris dust crumb stain spill recycling cart trolley wheelchair walker stroller bicycle bike "
+    "scooter motorcycle car truck van bus vehicle forklift pallet cone barrier bollard sign hydrant extinguisher pole "
+    "post pipe valve gauge meter switch socket outlet plug button lever handle knob panel fuse thermostat sensor "
+    "detector alarm vent fan heater radiator conditioner boiler tank pump motor engine machine conveyor robot hammer "
+    "screwdriver wrench drill saw pliers nail screw bolt nut toolbox tool glove helmet vest goggles rope chain hose "
+    "ladder broom mop bucket dustpan vacuum brush shovel rake wheelbarrow mower ball toy doll puzzle block brick dice "
+    "card game controller guitar piano drum violin bat racket frisbee kite shoe boot sandal slipper sock shirt "
+    "t-shirt tshirt jacket coat hat cap scarf pants jeans dress skirt clothes clothing laundry hanger bag backpack "
+    "purse wallet suitcase luggage umbrella key keys keychain glasses sunglasses belt ring necklace tie person people "
+    "man woman child baby kid human pedestrian worker patient visitor guest user operator nurse doctor dog cat bird "
+    "pet animal horse cow sheep medicine pill medication syringe bandage thermometer mask kit toothbrush toothpaste "
+    "comb razor shampoo tissue package parcel box crate carton basket bin barrel container shelf rack locker drawer "
+    "hook stand tripod chair table stool bench sofa couch bed crib mattress desk cabinet furniture appliance utensil "
+    "cutlery silverware tableware electronics equipment supply device gadget instrument article belonging valuables "
+    "stairs step ramp railing rail curb hole crack leak window door wall floor ceiling roof beam column pillar "
+    "entrance exit doorway gate fence bridge elevator dock station landmark tag whiteboard coaster saucer straw ladle "
+    "spatula whisk corkscrew opener grater strainer colander mitt apron thermos flask canteen dumbbell treadmill yoga "
+    "barbell skateboard surfboard snowboard ski tent sleeping cooler lantern flashlight torch battery adapter usb "
+    "drive disk disc cd dvd television tv screen projector console antenna modem server mailbox streetlight lamppost "
+    "statue fountain swing slide sandbox manhole crosswalk tire wheel weed hedge log stump root seed fertilizer "
+    "sprinkler nozzle faucet tap drain gutter chimney tile plank board lumber wood scrap metal wire spring gear "
+    "bearing shaft coil circuit breaker transformer inverter seat armrest leg arm edge pad notepad sticker label "
+    "stamp coin money bill cash ticket passport badge shed sled doorstep doormat pool bathrobe awning wiring plumbing "
+    "piping lighting bedding carving flooring siding scaffolding wrap weld cover lift jack clip clamp peg grip splash "
+    "seal strap latch hatch winch hoist crane drop iron polish spray paint oil grease wax trap track guard guide "
+    "print sketch note stock pack file pass switchgear stick mail patch emergency building house apartment head cream "
+    "weight suit eye ear nose mouth hand foot finger knee neck eyewash age"
+)
+NOUNS: Final = (
+    _OBJECTS
+    | ROOMS
+    | COMMON_ANCHORS
+    | CONTAINERS
+    | frozenset({"object", "thing", "item", "stuff", "obstacle", "obstruction", "clutter", "hazard", "target"})
+)
 
 
 DETERMINERS: Final = word_set(
@@ -147,3 +342,36 @@ _EXCLUDING: Final = (
     "forget about|forget|doesn't|can't|cannot|shouldn't|mustn't|omit|neglect|avoid bumping"
 )
 NEGATIONS: Final = frozenset(tuple(negation.split()) for negation in _EXCLUDING.split("|"))
+
+
+_IRREGULAR: Final = {
+    "people": "person", "men": "man", "women": "woman", "children": "child", "feet": "foot", "teeth": "tooth",
+    "mice": "mouse", "geese": "goose", "shelves": "shelf", "bookshelves": "bookshelf", "knives": "knife",
+    "leaves": "leaf", "loaves": "loaf", "scarves": "scarf", "halves": "half", "wolves": "wolf", "lives": "life",
+    "buses": "bus", "lenses": "lens", "viruses": "virus", "cacti": "cactus", "dice": "dice", "dies": "die",
+    "tvs": "tv", "cds": "cd", "dvds": "dvd", "pcs": "pc",
+    "ties": "tie", "pies": "pie", "cookies": "cookie", "brownies": "brownie", "movies": "movie", "hoodies": "hoodie",
+    "selfies": "selfie", "potatoes": "potato", "tomatoes": "tomato", "mangoes": "mango", "heroes": "hero",
+    "caches": "cache", "aches": "ache", "axes": "axe", "persons": "person", "gases": "gas", "calves": "calf",
+    "humans": "human", "rubbish": "rubbish", "quizzes": "quiz", "policemen": "policeman", "workmen": "workman",
+}  # fmt: skip
+# words that singular() returns unchanged: plural in form only, or singular with a final s
+UNCHANGED: Final = word_set(
+    "scissors glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
+    "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species thermos "
+    "asbestos christmas canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls tights "
+    "leggings clippers shears remains goods supplies premises outdoors upstairs downstairs"
+)
+
+
+def singular(word: str) -> str:
+    """Return the singular of a lower-case English word, or the word itself if it has none."""
+    if word in _IRREGULAR:
+        return _IRREGULAR[word]
+    if word in UNCHANGED or len(word) <= 3 or not word.endswith("s") or word.endswith(("ss", "us", "is", "'s")):
+        return word
+    if word.endswith("ies"):
+        return word[:-3] + "y"
+    if word.endswith(("sses", "xes", "ches", "shes", "zzes")):
+        return word[:-2]
+    return word[:-1]

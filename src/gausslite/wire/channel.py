@@ -9,12 +9,63 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import grpc
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from gausslite.domain.errors import UnavailableError
-from gausslite.wire.address import require_callable
-from gausslite.wire.connection import KEEPALIVE_S, connection_options
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, RateLimitError, UnavailableError
+from gausslite.wire.security import Tls, open_channel
 from gausslite.wire.status import from_rpc_error
-from gausslite.wire.tls import Tls, open_channel
+
+PARSER_ADDRESS = "127.0.0.1:50051"
+FUSION_ADDRESS = "127.0.0.1:50052"
+AGENT_ADDRESS = "127.0.0.1:50053"
+"""The addresses on which the services listen by default."""
+UNIX = "unix:"
+MAX_PORT = 65535
+_WEB_SCHEMES = ("http://", "https://")
+
+
+def host_and_port(name: str, address: str) -> tuple[str, int]:
+    """Split HOST:PORT. Raises InvalidInputError; its message begins with the name."""
+    for scheme in _WEB_SCHEMES:
+        if address.startswith(scheme):
+            raise InvalidInputError(f"{name}: expected HOST:PORT without {scheme}, got {address!r}")
+    host, _, port = address.rpartition(":")
+    if not host or not (port.isascii() and port.isdigit() and len(port) <= 5) or int(port) > MAX_PORT:
+        raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH, got {address!r}")
+    return host, int(port)
+
+
+def require_callable(name: str, address: str) -> None:
+    """Raise InvalidInputError unless a service can listen there; gRPC would use port 443 for a missing port."""
+    if not isinstance(address, str):
+        raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH as text, got {type(address).__name__}")
+    if address.startswith(UNIX) and address != UNIX:
+        return
+    _, port = host_and_port(name, address)
+    if port == 0:
+        raise InvalidInputError(f"{name}: expected the port that the service listens on, got {address!r}")
+
+
+MAX_MESSAGE_BYTES = 16 << 20
+"""Both ends refuse larger messages; a frame of two megapixels with PNG depth needs a fraction of it."""
+
+KEEPALIVE_S = 15.0
+"""Either end sends a ping after this time without data, and closes the connection if no answer comes within it."""
+
+
+def connection_options(keepalive_s: float) -> tuple[tuple[str, int], ...]:
+    """Return the gRPC options of either end.
+
+    Without pings, a watcher that only receives would not notice a lost network.
+    """
+    return (
+        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.keepalive_time_ms", round(1000 * keepalive_s)),
+        ("grpc.http2.ping_timeout_ms", round(1000 * keepalive_s)),
+        ("grpc.http2.max_pings_without_data", 0),
+    )
+
 
 DEADLINE_S = 30.0
 _REQUESTS_END_S = 1.0
@@ -133,3 +184,53 @@ class _RequestReader:
         """Wait until the thread ends; it may still wait for the caller's next request."""
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_REQUESTS_END_S)
+
+
+_DEADLINE_S = 3.0
+_SERVING = health_pb2.HealthCheckResponse.SERVING
+
+
+def require_serving(address: str, tls: Tls | None) -> None:
+    """Raise UnavailableError if the service at this address does not answer SERVING within seconds."""
+    if _status(address, "", tls) != _SERVING:
+        raise UnavailableError(f"{address}: not serving")
+
+
+def serves(address: str, service: str, tls: Tls | None) -> bool:
+    """Return whether the service of this full name serves at the address. Raises UnavailableError without an answer."""
+    return _status(address, service, tls) == int(_SERVING)
+
+
+def _status(address: str, service: str, tls: Tls | None) -> int:
+    """Return the health of the service, SERVICE_UNKNOWN if the server does not have it; "" is the whole server."""
+    try:
+        with open_channel(address, tls) as channel:
+            request = health_pb2.HealthCheckRequest(service=service)
+            return int(health_pb2_grpc.HealthStub(channel).Check(request, timeout=_DEADLINE_S).status)
+    except grpc.RpcError as error:
+        if error.code() is grpc.StatusCode.NOT_FOUND:
+            return int(health_pb2.HealthCheckResponse.SERVICE_UNKNOWN)
+        raise UnavailableError(str(from_rpc_error(error, address))) from None
+
+
+_MAX_BACKOFF_S = 5.0
+_MAX_RETRY_HINT_S = 60.0
+
+
+class RetryDelay:
+    """Exponential backoff. Not thread-safe."""
+
+    def __init__(self, first_s: float) -> None:
+        self._first_s, self._delay_s = first_s, 0.0
+
+    def after(self, error: GaussLiteError) -> float:
+        """Return the time until the next attempt in seconds."""
+        self._delay_s = min(max(2 * self._delay_s, self._first_s), _MAX_BACKOFF_S)
+        if isinstance(error, RateLimitError) and error.retry_after_s is not None:
+            # the server states when it accepts the next message
+            return min(max(self._delay_s, error.retry_after_s), _MAX_RETRY_HINT_S)
+        return self._delay_s
+
+    def reset(self) -> None:
+        """Start again with the first delay, after a success."""
+        self._delay_s = 0.0

@@ -8,21 +8,23 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import google_crc32c
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message import Message
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.codec.free_space import encode_free_space
+from gausslite.codec.stored import encode_free_space
 from gausslite.codec.subset_codec import CodecLimits
-from gausslite.domain.camera import Camera
-from gausslite.domain.errors import ChecksumError, CodecError
+from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.free_space import FreeSpace
-from gausslite.domain.lens import Lens
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.tile_digests import TileDigests
+from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.v1 import (
     agent_service_pb2,
@@ -34,14 +36,11 @@ from gausslite.v1 import (
     parser_service_pb2_grpc,
 )
 from gausslite.wire import convert, convert_task
-from gausslite.wire.camera_view import CameraView, camera_view_from_message
-from gausslite.wire.channel import DEADLINE_S, ServiceChannel
-from gausslite.wire.connection import MAX_MESSAGE_BYTES
-from gausslite.wire.convert_objects import report_to_message, team_object_from_message
-from gausslite.wire.digest_messages import digests_from_messages
-from gausslite.wire.images import decode_colour, decode_depth
-from gausslite.wire.stored_keyframe import StoredKeyframe, stored_keyframe_from_message
-from gausslite.wire.tls import Tls
+from gausslite.wire.channel import DEADLINE_S, MAX_MESSAGE_BYTES, ServiceChannel, require_callable, serves
+from gausslite.wire.convert import decode_colour, decode_depth, digests_from_messages
+from gausslite.wire.convert_task import report_to_message, team_object_from_message
+from gausslite.wire.security import Tls
+from gausslite.wire.views import CameraView, StoredKeyframe, camera_view_from_message, stored_keyframe_from_message
 
 MAX_END_S = 90_000.0
 """Longer than any agent takes to end a mission: its drain-timeout is at most a day."""
@@ -381,3 +380,40 @@ class FusionClient(ServiceChannel):
         """Leave the mission; with `forget` the server deletes the agent's updates. Returns the fused revision."""
         request = fusion_service_pb2.LeaveSessionRequest(session_id=session_id, forget=forget)
         return int(self._call(self._stub.LeaveSession, request).fused_revision)
+
+
+_AGENT = agent_service_pb2.DESCRIPTOR.services_by_name["AgentService"].full_name
+_FUSION = fusion_service_pb2.DESCRIPTOR.services_by_name["FusionService"].full_name
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceStatus:
+    """Status of an agent or a fusion server: the fields of its message by name, as in protobuf's JSON.
+
+    So 64-bit integers are texts, and messages without content are absent.
+    """
+
+    is_agent: bool
+    values: dict[str, Any]
+
+
+def query_status(address: str, tls: Tls | None) -> ServiceStatus:
+    """Return the status of the agent or of the fusion server.
+
+    Raises UnavailableError, InvalidInputError if it is neither.
+    """
+    require_callable("address", address)
+    if serves(address, _AGENT, tls):
+        with AgentClient(address, tls=tls) as agent:
+            return ServiceStatus(True, _to_values(agent.status()))
+    if serves(address, _FUSION, tls):
+        with FusionClient(address, tls=tls) as fusion:
+            return ServiceStatus(False, _to_values(fusion.status()))
+    raise InvalidInputError(f"{address}: expected an agent or a fusion server, got another service")
+
+
+def _to_values(message: Message) -> dict[str, Any]:
+    values: dict[str, Any] = MessageToDict(
+        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+    )
+    return values

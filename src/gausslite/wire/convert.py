@@ -2,39 +2,189 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from jaxtyping import Float64
+from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
-from gausslite.domain.camera import Camera
+from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import CodecError, InvalidInputError
-from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens
-from gausslite.domain.pose import require_rigid
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, replace_voxels, select_voxels
-from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
+from gausslite.domain.frame import Frame, has_whole_chunks, image_size
+from gausslite.domain.pose import Twist, require_rigid
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, VoxelGrid, empty_batch, replace_voxels, select_voxels
+from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import gaussians_pb2, geometry_pb2
-from gausslite.wire.camera_messages import (
-    lens_from_message,
-    lens_to_message,
-    motion_from_message,
-    twist_to_message,
-)
-from gausslite.wire.images import (
-    JPEG_QUALITY,
-    KEYFRAME_JPEG_QUALITY,
-    KEYFRAME_PNG_COMPRESSION,
-    PNG_COMPRESSION,
-    decode_colour,
-    decode_depth,
-    encode_colour,
-    encode_depth,
-)
+
+_MAX_VELOCITY = 100.0
+_LENS_MODELS = {
+    geometry_pb2.LENS_MODEL_RADTAN: LensModel.RADTAN,
+    geometry_pb2.LENS_MODEL_FISHEYE: LensModel.FISHEYE,
+}
+_LENS_NUMBERS = {model: number for number, model in _LENS_MODELS.items()}
+
+
+def lens_to_message(lens: Lens) -> geometry_pb2.Lens:
+    """Encode a lens."""
+    return geometry_pb2.Lens(model=_LENS_NUMBERS[lens.model], coefficients=lens.coefficients)
+
+
+def lens_from_message(message: geometry_pb2.EncodedFrame) -> Lens | None:
+    """Return the lens of a frame, None for a pinhole. Raises InvalidInputError."""
+    if not message.HasField("lens"):
+        return None
+    if message.lens.model not in _LENS_MODELS:
+        raise InvalidInputError(f"frame lens: expected the model RADTAN or FISHEYE, got number {message.lens.model}")
+    return Lens(_LENS_MODELS[message.lens.model], tuple(message.lens.coefficients))
+
+
+def twist_to_message(twist: Twist) -> geometry_pb2.Twist:
+    """Encode a velocity."""
+    linear, angular = (
+        geometry_pb2.Point(x=float(v[0]), y=float(v[1]), z=float(v[2])) for v in (twist.linear_m_s, twist.angular_rad_s)
+    )
+    return geometry_pb2.Twist(linear_m_s=linear, angular_rad_s=angular)
+
+
+def motion_from_message(message: geometry_pb2.EncodedFrame) -> CameraMotion | None:
+    """Return the motion of a frame, None if it states no twist. Raises InvalidInputError."""
+    if not message.HasField("twist"):
+        if message.readout_seconds != 0.0 or message.exposure_seconds != 0.0:
+            raise InvalidInputError("frame twist: expected one with readout_seconds or exposure_seconds, got none")
+        return None
+    twist = Twist(
+        _velocity("linear_m_s", message.twist.linear_m_s), _velocity("angular_rad_s", message.twist.angular_rad_s)
+    )
+    return CameraMotion(twist, message.readout_seconds, message.exposure_seconds)
+
+
+def _velocity(name: str, point: geometry_pb2.Point) -> Float64[ndarray, "3"]:
+    velocity = np.array([point.x, point.y, point.z])
+    if not (np.abs(velocity) <= _MAX_VELOCITY).all():
+        raise InvalidInputError(
+            f"frame twist {name}: expected finite values up to {_MAX_VELOCITY:g}, got {velocity.tolist()}"
+        )
+    return velocity
+
+
+_TILES_PER_MESSAGE = 1 << 14
+_MAX_TILES = 1 << 22
+
+
+def digests_to_messages(digests: TileDigests) -> Iterator[pb.GetUpdateDigestsResponse]:
+    """Yield messages of 16 bytes per tile, at most 256 KiB each; none without tiles."""
+    for start in range(0, len(digests.tiles), _TILES_PER_MESSAGE):
+        part = slice(start, start + _TILES_PER_MESSAGE)
+        yield pb.GetUpdateDigestsResponse(tiles=digests.tiles[part].tolist(), hashes=digests.hashes[part].tolist())
+
+
+def digests_from_messages(messages: Iterable[pb.GetUpdateDigestsResponse]) -> TileDigests:
+    """Return the digests of all messages. Raises CodecError for inconsistent lengths or too many tiles."""
+    parts: list[TileDigests] = []
+    count = 0
+    for message in messages:
+        tiles, hashes = np.array(message.tiles, np.int64), np.array(message.hashes, np.uint64)
+        count += len(tiles)
+        if len(tiles) != len(hashes) or count > _MAX_TILES:
+            raise CodecError(
+                f"digests: expected as many hashes as tiles and at most {_MAX_TILES}, got {count} and {len(hashes)}"
+            )
+        parts.append(TileDigests(tiles, hashes))
+    return TileDigests.sum_of(parts)
+
+
+JPEG_QUALITY = 95
+PNG_COMPRESSION = 1
+"""Level 6 takes three times longer and saves a quarter of the bytes; level 9 takes another ten times longer."""
+KEYFRAME_JPEG_QUALITY = 90
+KEYFRAME_PNG_COMPRESSION = 6
+"""Keyframes are sent once, and compete for a robot's bandwidth."""
+_MM_PER_M = 1000.0
+_MAX_DEPTH_MM = 65535
+
+
+def encode_colour(rgb: UInt8[ndarray, "h w 3"], lossless: bool = False, quality: int = JPEG_QUALITY) -> bytes:
+    """Encode as PNG if lossless, otherwise as JPEG of this quality."""
+    import cv2
+
+    kind, options = (".png", []) if lossless else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(cv2.imencode(kind, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes())
+
+
+def encode_depth(depth_m: Float32[ndarray, "h w"], compression: int = PNG_COMPRESSION) -> bytes:
+    """Encode as 16-bit PNG in millimetres; depth beyond 65.5 m becomes 0 (no return)."""
+    import cv2
+
+    depth_mm = np.rint(depth_m.astype(np.float64) * _MM_PER_M)
+    depth_mm[depth_mm > _MAX_DEPTH_MM] = 0
+    options = [cv2.IMWRITE_PNG_COMPRESSION, compression]
+    return bytes(cv2.imencode(".png", depth_mm.astype(np.uint16), options)[1].tobytes())
+
+
+def encode_mask(mask: Bool[ndarray, "h w"], compression: int = PNG_COMPRESSION) -> bytes:
+    """Encode as PNG with one bit a pixel: white where True, otherwise black."""
+    import cv2
+
+    options = [cv2.IMWRITE_PNG_COMPRESSION, compression, cv2.IMWRITE_PNG_BILEVEL, 1]
+    return bytes(cv2.imencode(".png", mask.astype(np.uint8) * np.uint8(255), options)[1].tobytes())
+
+
+def decode_mask(data: bytes, width_px: int, height_px: int) -> Bool[ndarray, "h w"]:
+    """Decode a mask of exactly this size. Raises InvalidInputError."""
+    import cv2
+
+    _require_size("mask", data, width_px, height_px)
+    image = _decode(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.shape != (height_px, width_px) or image.dtype != np.uint8:
+        raise InvalidInputError("mask: expected a one-channel PNG of up to 8 bits, got something else")
+    return image > 0
+
+
+def decode_colour(data: bytes, width_px: int, height_px: int) -> UInt8[ndarray, "h w 3"]:
+    """Decode colour of exactly this size. Raises InvalidInputError."""
+    import cv2
+
+    _require_size("frame colour", data, width_px, height_px)
+    image = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.shape != (height_px, width_px, 3) or image.dtype != np.uint8:
+        raise InvalidInputError("frame colour: expected an 8-bit JPEG or PNG, got damaged bytes")
+    return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def decode_depth(data: bytes, width_px: int, height_px: int) -> Float32[ndarray, "h w"]:
+    """Decode depth in metres of exactly this size. Raises InvalidInputError."""
+    import cv2
+
+    _require_size("frame depth_png", data, width_px, height_px)
+    image = _decode(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.shape != (height_px, width_px) or image.dtype != np.uint16:
+        raise InvalidInputError("frame depth_png: expected a one-channel 16-bit PNG, got something else")
+    return (image.astype(np.float64) / _MM_PER_M).astype(np.float32)
+
+
+def _require_size(name: str, data: bytes, width_px: int, height_px: int) -> None:
+    size = image_size(data)
+    if size is None:
+        raise InvalidInputError(f"{name}: expected a JPEG or PNG, got {len(data)} bytes of something else")
+    if size != (width_px, height_px):
+        raise InvalidInputError(f"{name}: expected the camera's {width_px}x{height_px}, got {size[0]}x{size[1]}")
+    if not has_whole_chunks(data):
+        raise InvalidInputError(f"{name}: expected a whole PNG, got damaged bytes: a chunk ends outside of them")
+
+
+def _decode(data: bytes, flags: int) -> ndarray | None:
+    import cv2
+
+    try:
+        image: ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        return None
+    return image
+
 
 MAX_IMAGE_PX = 1 << 23
 

@@ -11,10 +11,9 @@ from typing import Protocol, runtime_checkable
 
 from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.errors import RevisionGoneError
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.v1.gaussians_pb2 import MapBlock, Provenance
-from gausslite.wire.change_notifier import ChangeNotifier
+from gausslite.wire.views import ChangeNotifier
 
 READ_DEADLINE_S = 60.0
 """For one message of at most a megabyte: 17 kB/s."""

@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import json
 import logging
 import os
 import signal
 import socket
+import sys
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -23,18 +28,139 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
-from gausslite.wire.address import UNIX, host_and_port
-from gausslite.wire.call_limits import CallLimits, CallUsage, limit_stream, wait_for_bandwidth
-from gausslite.wire.caller import Caller
-from gausslite.wire.connection import KEEPALIVE_S, connection_options
-from gausslite.wire.readiness import LIVENESS, Check, ReadinessWatch
-from gausslite.wire.rejection_log import RejectionLog
-from gausslite.wire.roles import require_role
+from gausslite.process import print_message, printable
+from gausslite.wire.channel import KEEPALIVE_S, UNIX, connection_options, host_and_port
+from gausslite.wire.security import (
+    Caller,
+    CallLimits,
+    CallUsage,
+    RejectionLog,
+    Tls,
+    TokenBucket,
+    limit_stream,
+    require_role,
+    wait_for_bandwidth,
+)
 from gausslite.wire.status import code_and_reason, to_status
-from gausslite.wire.tls import Tls
-from gausslite.wire.token_bucket import TokenBucket
+
+
+class LogFormat(StrEnum):
+    """How a service writes its log."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+class _OneLine(logging.Formatter):
+    """Format a record, with its traceback, as one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Join the lines of the formatted record."""
+        return " | ".join(printable(line) for line in super().format(record).splitlines())
+
+
+class _JsonLine(logging.Formatter):
+    """Format a record as one JSON object; JSON escapes control characters."""
+
+    def __init__(self, program: str) -> None:
+        super().__init__()
+        self._program = program
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return time (UTC, ISO 8601), program, level, logger and message, and a traceback as `error`."""
+        values = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "program": self._program,
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            values["error"] = self.formatException(record.exc_info)
+        return json.dumps(values)
+
+
+def log_to_stderr(program: str, log_format: LogFormat = LogFormat.TEXT) -> None:
+    """Log records of level INFO and higher to stderr: `time program level message`, or a JSON object a line."""
+    handler = logging.StreamHandler(sys.stderr)
+    text = _OneLine(f"%(asctime)s {program} %(levelname)s %(message)s")
+    handler.setFormatter(text if log_format is LogFormat.TEXT else _JsonLine(program))
+    # JSON replaces the text that a service starts with
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=log_format is LogFormat.JSON)
+
+
+def run_service(program: str, serve: Callable[[], Awaitable[int]]) -> int:
+    """Run the service and return its exit code; 2 with one line on stderr after a GaussLiteError."""
+    log_to_stderr(program)
+
+    async def body() -> int:
+        return await serve()
+
+    try:
+        return asyncio.run(body())
+    except GaussLiteError as error:
+        print_message(f"{program}: {error}")
+        return 2
+
 
 _log = logging.getLogger(__name__)
+_CHECK_S = 30.0
+_RETRY_S = 1.0
+LIVENESS = "liveness"
+"""A name that health checks answer with SERVING while the process runs, so that a full disk restarts no container."""
+Check = Callable[[], None]
+"""Raises GaussLiteError while the service cannot work. It may block; it runs in a thread."""
+
+
+class ReadinessWatch:
+    """Calls a service's check every 30 s, after `wake`, and every second while it fails. Use it on the event loop."""
+
+    def __init__(self, service: str, check: Check, set_serving: Callable[[bool], Awaitable[None]]) -> None:
+        self._service, self._check, self._set_serving = service, check, set_serving
+        self._woken = asyncio.Event()
+        self._failing_since_s: float | None = None
+
+    def wake(self) -> None:
+        """Check now, because a call has failed."""
+        self._woken.set()
+
+    async def run(self) -> None:
+        """Check until the task is cancelled."""
+        while True:
+            interval_s = _CHECK_S if self._failing_since_s is None else _RETRY_S
+            if self._failing_since_s is not None:
+                # calls that fail meanwhile must not shorten the interval
+                await asyncio.sleep(interval_s)
+            else:
+                await _wait_at_most(self._woken, interval_s)
+            self._woken.clear()
+            try:
+                await asyncio.to_thread(self._check)
+            except GaussLiteError as error:
+                await self._record_failure(error)
+            else:
+                await self._record_success()
+
+    async def _record_failure(self, error: GaussLiteError) -> None:
+        if self._failing_since_s is None:
+            self._failing_since_s = time.monotonic()
+            _log.error("%s is NOT_SERVING: %s", self._service, error)
+            await self._set_serving(False)
+
+    async def _record_success(self) -> None:
+        if self._failing_since_s is not None:
+            _log.info("%s is SERVING again after %.0f s", self._service, time.monotonic() - self._failing_since_s)
+            self._failing_since_s = None
+            await self._set_serving(True)
+
+
+async def _wait_at_most(event: asyncio.Event, timeout_s: float) -> None:
+    try:
+        await asyncio.wait_for(event.wait(), timeout_s)
+    except TimeoutError:
+        return
+
+
 _LAST_CALLS_S = 1.0
 _HEALTH_LIMITS = CallLimits(connections=64, idle_s=10)
 # the longest path of a unix socket that Linux accepts

@@ -27,15 +27,127 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.records import from_bytes, to_records
+from gausslite.codec.stored import from_bytes, to_records
 from gausslite.domain.errors import MismatchError, StorageError
-from gausslite.domain.tile_digests import TileDigests
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.wire.sent_updates import SCHEMA as SENT_SCHEMA
-from gausslite.wire.sent_updates import SentUpdateTable
-from gausslite.wire.spooled_keyframes import SCHEMA as KEYFRAME_SCHEMA
-from gausslite.wire.spooled_keyframes import KeyframeTable, SpooledKeyframe
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of
+
+SENT_UPDATES_SCHEMA = "CREATE TABLE IF NOT EXISTS sent_updates (key INTEGER PRIMARY KEY, update_seq INTEGER NOT NULL);"
+
+
+class SentUpdateTable:
+    """The table in the spool's database. The spool owns the connection, its transactions and its errors."""
+
+    def __init__(self, database: sqlite3.Connection) -> None:
+        self._database = database
+
+    def record(self, keys: Iterable[int], update_seq: int) -> None:
+        """Record that the server has stored the updates of these voxels with this sequence number."""
+        self._database.executemany(
+            "INSERT OR REPLACE INTO sent_updates VALUES (?, ?)", ((key, update_seq) for key in keys)
+        )
+
+    def digests(self) -> TileDigests:
+        """Return the digests of all acknowledged updates."""
+        return TileDigests.of(*self._columns())
+
+    def forget(self, tiles: Int64[ndarray, " t"]) -> list[int]:
+        """Delete the rows of these tiles; returns their voxels."""
+        keys, _ = self._columns()
+        forgotten: list[int] = keys[np.isin(tiles_of(keys), tiles)].tolist()
+        self._database.executemany("DELETE FROM sent_updates WHERE key = ?", ((key,) for key in forgotten))
+        return forgotten
+
+    def _columns(self) -> tuple[Int64[ndarray, " k"], Int64[ndarray, " k"]]:
+        rows = self._database.execute("SELECT key, update_seq FROM sent_updates").fetchall()
+        columns = np.array(rows, np.int64).reshape(-1, 2)
+        return columns[:, 0], columns[:, 1]
+
+
+KEYFRAMES_SCHEMA = """
+CREATE TABLE IF NOT EXISTS keyframes (
+    frame_index INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, value REAL NOT NULL, coverage BLOB NOT NULL,
+    data BLOB NOT NULL, pending INTEGER NOT NULL);
+"""
+_SPOOLED_KEYFRAMES_ENQUEUE = """
+INSERT INTO keyframes VALUES (?, 1, ?, ?, ?, 1)
+ON CONFLICT (frame_index) DO UPDATE SET enqueue_count = enqueue_count + 1, value = excluded.value,
+    coverage = excluded.coverage, data = excluded.data, pending = 1
+"""
+_SELECT_PENDING = """
+SELECT frame_index, enqueue_count, value, coverage, data FROM keyframes WHERE pending = 1
+ORDER BY value / length(data) DESC, frame_index
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class SpooledKeyframe:
+    """A keyframe to send.
+
+    value: what the server gains, in units of kappa. coverage: what the agent needs to know of it after a restart; the
+    spool does not read it. data: the EncodedFrame. enqueue_count: how often this frame was enqueued.
+    """
+
+    frame_index: int
+    value: float
+    coverage: bytes
+    data: bytes
+    enqueue_count: int = 0
+
+    @property
+    def value_per_byte(self) -> float:
+        """The order of sending."""
+        return self.value / len(self.data)
+
+
+class KeyframeTable:
+    """The table in the spool's database. The spool owns the connection, its transactions and its errors."""
+
+    def __init__(self, database: sqlite3.Connection) -> None:
+        self._database = database
+
+    def enqueue(self, keyframe: SpooledKeyframe) -> None:
+        """Store a keyframe as pending; it replaces one of the same index."""
+        row = (keyframe.frame_index, keyframe.value, keyframe.coverage, keyframe.data)
+        self._database.execute(_SPOOLED_KEYFRAMES_ENQUEUE, row)
+
+    def remove(self, frame_index: int) -> None:
+        """Delete a keyframe."""
+        self._database.execute("DELETE FROM keyframes WHERE frame_index = ?", (frame_index,))
+
+    def pending(self) -> Iterator[SpooledKeyframe]:
+        """Yield the pending keyframes, the highest value per byte first."""
+        for index, enqueue_count, value, coverage, data in self._database.execute(_SELECT_PENDING):
+            yield SpooledKeyframe(index, value, coverage, data, enqueue_count)
+
+    def stored(self) -> list[SpooledKeyframe]:
+        """Return all keyframes, in the order of their indices."""
+        query = "SELECT frame_index, value, coverage, data, enqueue_count FROM keyframes ORDER BY frame_index"
+        return [SpooledKeyframe(*row) for row in self._database.execute(query)]
+
+    def indices(self) -> tuple[int, ...]:
+        """Return the indices of all keyframes, ascending."""
+        query = "SELECT frame_index FROM keyframes ORDER BY frame_index"
+        return tuple(index for (index,) in self._database.execute(query))
+
+    def count_pending(self) -> int:
+        """Return the number of pending keyframes."""
+        return int(self._database.execute("SELECT count(*) FROM keyframes WHERE pending = 1").fetchone()[0])
+
+    def mark_done(self, keyframes: Iterable[SpooledKeyframe]) -> None:
+        """Mark these keyframes as no longer pending."""
+        pairs = [(keyframe.enqueue_count, keyframe.frame_index) for keyframe in keyframes]
+        self._database.executemany("UPDATE keyframes SET pending = (enqueue_count != ?) WHERE frame_index = ?", pairs)
+
+    def mark_missing(self, stored: Iterable[int]) -> None:
+        """Mark every keyframe as pending that the server does not store."""
+        self._database.execute("CREATE TEMP TABLE IF NOT EXISTS stored (frame_index INTEGER PRIMARY KEY)")
+        self._database.execute("DELETE FROM stored")
+        self._database.executemany("INSERT OR IGNORE INTO stored VALUES (?)", ((index,) for index in stored))
+        self._database.execute(
+            "UPDATE keyframes SET pending = 1 WHERE frame_index NOT IN (SELECT frame_index FROM stored)"
+        )
+
 
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1
@@ -105,7 +217,7 @@ class Spool:
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
-            self._database.executescript(_SCHEMA + KEYFRAME_SCHEMA + SENT_SCHEMA)
+            self._database.executescript(_SCHEMA + KEYFRAMES_SCHEMA + SENT_UPDATES_SCHEMA)
             self._sent = SentUpdateTable(self._database)
             self._keyframes = KeyframeTable(self._database)
             self.is_new = self._property("agent_id") is None

@@ -4,18 +4,203 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from threading import Lock
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES, encode_subset, split_batch
-from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.config.option import option
+from gausslite.config.values import read_numbers
+from gausslite.datasets.folder import pose_from_quaternion
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, QuotaError, UnavailableError
+from gausslite.domain.free_space import FreeSpace
+from gausslite.domain.objects import ObjectReport
+from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
-from gausslite.wire.uplink_values import SentPart, UplinkCounters
 
 _log = logging.getLogger(__name__)
+
+
+class FreeSpaceOutbox:
+    """Holds all blocks of this agent, and which of them the server does not have. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._all, self._pending = FreeSpace.empty(), FreeSpace.empty()
+
+    def put(self, blocks: FreeSpace) -> None:
+        """Add blocks; they replace earlier ones of the same place."""
+        with self._lock:
+            self._all, self._pending = self._all.replace_blocks(blocks), self._pending.replace_blocks(blocks)
+
+    @property
+    def has_pending(self) -> bool:
+        """Return whether a block has to be sent."""
+        return len(self._pending.keys) > 0
+
+    def send(self, client: FusionClient, session_id: str, grid: VoxelGrid) -> int:
+        """Send the blocks that wait; returns the bytes. Raises GaussLiteError, and then they wait again.
+
+        Rejected blocks are dropped, because the map does not depend on them.
+        """
+        with self._lock:
+            blocks, self._pending = self._pending, FreeSpace.empty()
+        if not len(blocks.keys):
+            return 0
+        try:
+            return client.contribute_free_space(session_id, blocks, grid)
+        except (InvalidInputError, QuotaError) as error:
+            _log.warning("uplink: free space is dropped: %s", error)
+            return 0
+        except GaussLiteError:
+            with self._lock:
+                self._pending = blocks.replace_blocks(self._pending)
+            raise
+
+    def mark_unsent(self) -> None:
+        """Let all blocks wait, because the server has lost them."""
+        with self._lock:
+            self._pending = self._all
+
+
+class ObjectOutbox:
+    """Holds one report; a newer one replaces it. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._latest: ObjectReport | None = None
+        self._sent: ObjectReport | None = None
+
+    def put(self, report: ObjectReport) -> bool:
+        """Replace the report; returns whether it has to be sent."""
+        with self._lock:
+            self._latest = report
+            return self._latest != self._sent
+
+    @property
+    def latest(self) -> ObjectReport | None:
+        """The latest report, sent or not."""
+        return self._latest
+
+    @property
+    def pending(self) -> ObjectReport | None:
+        """The latest report if the server does not have it."""
+        with self._lock:
+            return None if self._latest == self._sent else self._latest
+
+    def send(self, client: FusionClient, session_id: str) -> int:
+        """Send the report if the server does not have it; returns the bytes. Raises GaussLiteError.
+
+        A rejected report is dropped, because the map does not depend on it.
+        """
+        report, sent_bytes = self.pending, 0
+        if report is None:
+            return 0
+        try:
+            sent_bytes = client.report_objects(session_id, report)
+        except InvalidInputError as error:
+            _log.warning("uplink: the report of objects is dropped: %s", error)
+        with self._lock:
+            self._sent = report
+        return sent_bytes
+
+    def mark_unsent(self) -> None:
+        """Note that the server has lost the report."""
+        with self._lock:
+            self._sent = None
+
+
+def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
+    """Return the transform of "x,y,z" in metres, or with a quaternion "x,y,z,qx,qy,qz,qw". Raises InvalidInputError."""
+    values = np.array(read_numbers(text, 3 if text.count(",") < 3 else 7))
+    try:
+        return pose_from_quaternion("", values[:3], values[3:] if len(values) == 7 else np.array([0.0, 0.0, 0.0, 1.0]))
+    except PoseError:
+        raise InvalidInputError(f"expected a quaternion of length 1 as qx,qy,qz,qw, got {text!r}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkSettings:
+    """Limits and intervals of sending.
+
+    interval_s: minimum time between rounds, so that several changes of a voxel are sent as one. resend_threshold:
+    change of a voxel's Σkappa, as a share of the sent value, from which it is sent again; 0 while the uplink drains.
+    round_bytes: size limit of a round. deadline_s: of each call. first_backoff_s: wait before the first retry.
+    check_interval_s: how often an idle uplink asks the server whether it still has everything. T_fused_agent: declared
+    pose of the agent's frame in the fused map's; None: not declared.
+    """
+
+    kbps: float | None = option(
+        None, "bandwidth limit in kilobits per second (default: none)", key="uplink-kbps", unit="kbit/s", low=0.001
+    )
+    interval_s: float = option(1.0, "time between two transmissions", key="uplink-interval", unit="s", low=0)
+    resend_threshold: float = 0.25
+    round_bytes: int = 4 << 20
+    deadline_s: float = 30.0
+    first_backoff_s: float = 0.2
+    check_interval_s: float = 10.0
+    world_frame: str = option("", "name of the frame of all poses (default: the server's)", metavar="NAME")
+    T_fused_agent: Float64[ndarray, "4 4"] | None = option(
+        None,
+        "pose of this agent's world frame in the fused map's frame, if it is known (default: the same frame)",
+        key="fused-from-agent",
+        metavar="X,Y,Z[,QX,QY,QZ,QW]",
+        plain_type=str,
+        convert=read_rigid_transform,
+    )
+
+    def __post_init__(self) -> None:
+        if self.kbps is not None and not self.kbps > 0:
+            raise InvalidInputError(f"uplink kbps: expected a positive number, got {self.kbps}")
+        if not (self.interval_s >= 0 and self.resend_threshold >= 0 and self.deadline_s > 0 and self.round_bytes > 0):
+            raise InvalidInputError(
+                "uplink: expected an interval and resend threshold of at least 0, and a positive deadline and size"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkCounters:
+    """Totals since the start.
+
+    voxels_sent counts each voxel of the task's region once; voxels_waiting: voxels in the spool with a pending update.
+    keyframes_sent counts each acknowledged keyframe once; keyframe_bytes has their bytes, resends included.
+    stopped_because: the error that stopped the uplink, empty while it runs.
+    """
+
+    roi_bytes: int = 0
+    handover_bytes: int = 0
+    gaussians_sent: int = 0
+    voxels_sent: int = 0
+    voxels_waiting: int = 0
+    keyframes_sent: int = 0
+    keyframes_waiting: int = 0
+    keyframe_bytes: int = 0
+    subsets_sent: int = 0
+    subsets_rejected: int = 0
+    joins: int = 0
+    connected: bool = False
+    stopped_because: str = ""
+
+    @property
+    def bytes_sent(self) -> int:
+        """All subset bytes, resends included."""
+        return self.roi_bytes + self.handover_bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SentPart:
+    """A message that waits for its outcome."""
+
+    batch: SpoolBatch
+    size_bytes: int
+    update_seq: int
+
+
 _MIN_SUBSET_BYTES = 1 << 16
 _PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
 Count = Callable[[Callable[[UplinkCounters], UplinkCounters]], None]

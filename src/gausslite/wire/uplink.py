@@ -29,18 +29,13 @@ from gausslite.domain.errors import (
 )
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.objects import ObjectReport
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.v1 import geometry_pb2
+from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import FusionClient, Session
-from gausslite.wire.free_space_outbox import FreeSpaceOutbox
-from gausslite.wire.object_outbox import ObjectOutbox
-from gausslite.wire.retry_delay import RetryDelay
-from gausslite.wire.spool import Purpose, Spool, SpoolBatch
-from gausslite.wire.spooled_keyframes import SpooledKeyframe
-from gausslite.wire.token_bucket import TokenBucket
-from gausslite.wire.update_sender import UpdateSender
-from gausslite.wire.uplink_values import UplinkCounters, UplinkSettings
+from gausslite.wire.security import TokenBucket
+from gausslite.wire.spool import Purpose, Spool, SpoolBatch, SpooledKeyframe
+from gausslite.wire.update_sender import FreeSpaceOutbox, ObjectOutbox, UpdateSender, UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
 _MIN_INTERVAL_S = 0.02

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.codec.records import from_bytes
+from gausslite.codec.stored import from_bytes
 from gausslite.codec.subset_codec import decode_subset
-from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.vote import FusedMap, fuse

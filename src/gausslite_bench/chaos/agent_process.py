@@ -14,11 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import merge_batches, select_voxels, tombstones
+from gausslite.domain.voxels import VoxelBatch, merge_batches, select_voxels, tombstones
 from gausslite.wire.spool import Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_bench.chaos.journal import Journal, JournalingClient
 from gausslite_bench.server.synthetic_updates import GRID, voxels_batch
 

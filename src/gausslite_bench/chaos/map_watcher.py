@@ -8,8 +8,7 @@ import time
 import numpy as np
 
 from gausslite.domain.errors import GaussLiteError, RevisionGoneError
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch
+from gausslite.domain.voxels import VoxelBatch, empty_batch
 from gausslite.wire.clients import FusionClient
 
 _RETRY_S = 0.1

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gausslite.config.plain_values import split_names
-from gausslite.config.values import read_numbers
+from gausslite.config.values import read_numbers, split_names
 
 
 def read_image_sizes(text: str) -> tuple[tuple[int, int], ...]:

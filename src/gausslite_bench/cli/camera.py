@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar, progress_bar
-from gausslite.codec.files import write_atomic
+from gausslite.codec.state_file import write_atomic
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
-from gausslite.codec.files import write_atomic
+from gausslite.codec.state_file import write_atomic
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.fuzz.run import FuzzResult, FuzzSettings, run_fuzz
 

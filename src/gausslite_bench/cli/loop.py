@@ -18,20 +18,17 @@ from gausslite.cli.source_options import (
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option
 from gausslite.config.program import Program
-from gausslite.datasets.held_out import HeldOutSplit
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import EstimatorFactory, build_mapper, region_estimator
-from gausslite.mission.frame_stream import FrameStream
 from gausslite.mission.results import as_text, peak_rss_mib
+from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,

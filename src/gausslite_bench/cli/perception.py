@@ -15,19 +15,16 @@ from gausslite.cli.source_options import (
     open_recorded,
     stated_values,
 )
-from gausslite.codec.png import write_png
+from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
-from gausslite.config.plain_values import split_names
 from gausslite.config.program import Program
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.config.values import split_names
+from gausslite.datasets.source import Source, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.object_names import head_of, same_kind
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import Region
+from gausslite.domain.objects import NounMatch, head_of, same_kind
+from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
+from gausslite.domain.relevance import Region
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.mission.settings import PerceptionSettings, SourceSettings
 from gausslite.perception.detector import Detector, Tiling
@@ -84,7 +81,7 @@ def configure_perception(parser: CommandParser) -> None:
 
 def run_perception(options: argparse.Namespace) -> int:
     """Run every task on every frame and print the scores of each stage."""
-    from gausslite.perception.models.model_registry import ModelRegistry
+    from gausslite.perception.models import ModelRegistry
 
     if options.detector is None:
         raise InvalidInputError("--detector: expected a model file to compare with ground truth, got none")

@@ -60,7 +60,7 @@ def configure_raster(parser: argparse.ArgumentParser) -> None:
 
 def run_raster(options: argparse.Namespace) -> int:
     """Measure every case; print lines of text for each, or one JSON list."""
-    from gausslite.render.cpu_kernels import usable_simd
+    from gausslite.render.cpu import usable_simd
 
     if options.details is not None:
         prepare_file(options.details)

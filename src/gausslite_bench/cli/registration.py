@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
 from gausslite.config.program import Program
-from gausslite.datasets.held_out import HeldOutSplit
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
-from gausslite.datasets.selection import frame_size, select_frames
-from gausslite.domain.depth_registration import DepthRegistration
+from gausslite.datasets.source import HeldOutSplit, frame_size, select_frames
+from gausslite.domain.recording import DepthRegistration
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mapping.policies import follows_task
 from gausslite.mission.build import build_mapper
-from gausslite.mission.frame_stream import FrameStream
-from gausslite.mission.runner import MissionRunner
+from gausslite.mission.runner import FrameStream, MissionRunner
 from gausslite.mission.settings import MissionSettings, SourceSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator, RegionRelevanceEstimator

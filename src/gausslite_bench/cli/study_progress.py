@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from gausslite.cli.progress import print_above_bar, progress_bar
-from gausslite.codec.files import write_atomic
+from gausslite.codec.state_file import write_atomic
 from gausslite.mission.build import open_models
 from gausslite.mission.results import write_json
 from gausslite_bench.quality.equal_time import first_visible_scene, load_rate, measure_rate, rate_trials

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 
-from gausslite.view.level_of_detail import DEFAULT_LIMIT
 from gausslite_bench.cli.argument_types import read_counts, read_image_size
 from gausslite_bench.view_rates import ViewRate, measure_view
+from gausslite_view.contents import DEFAULT_LIMIT
 
 _GAUSSIANS = (100_000, 1_000_000)
 

@@ -15,9 +15,7 @@ import zstandard
 from gausslite.codec.ply import SH_C0, ply_bytes
 from gausslite.codec.subset_codec import SubsetCoding, decode_subset, encode_subset, split_batch
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.export.splat_formats import write_splat, write_spz
 
 _GEOMETRY = ("means_m", "quats_wxyz", "scales_m", "opacities", "rgb")

@@ -9,11 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gausslite.codec.free_space import decode_free_space
-from gausslite.codec.object_report import decode_object_report
+from gausslite.codec.json import decode_object_report
 from gausslite.codec.ply import gaussians_from_ply, world_frame_from_ply
-from gausslite.codec.records import from_bytes
-from gausslite.codec.stored_voxels import CODES, from_stored
+from gausslite.codec.stored import CODES, decode_free_space, from_bytes, from_stored
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.convert import decode_frame

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.domain.errors import NameInUseError, NotPermittedError, UnavailableError
+from gausslite.wire.channel import require_serving
 from gausslite.wire.clients import FusionClient
-from gausslite.wire.health import require_serving
 from gausslite_bench.fuzz.corpus import AGENT_ID
 from gausslite_bench.loop.memory import resident_mib
 from gausslite_bench.server.synthetic_updates import GRID

@@ -13,8 +13,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mapping.training import SkippableStage, Stage
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming, SchedulerSettings
 from gausslite.mission.runner import MissionRunner
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper

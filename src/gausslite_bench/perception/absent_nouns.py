@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.object_names import is_generic, is_structure, normalised_noun, same_kind
+from gausslite.domain.objects import NounMatch, is_generic, is_structure, normalised_noun, same_kind
 from gausslite.domain.task import TaskGraph
 from gausslite_bench.perception.stage_scores import PerceptionStage, TaskQuery, TaskScore
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounMatch
+from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.perception.detector import Detector
 

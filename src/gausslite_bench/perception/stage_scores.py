@@ -12,10 +12,9 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounMatch
+from gausslite.domain.objects import NounMatch
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.region import Region
-from gausslite.domain.relevance import Detection
+from gausslite.domain.relevance import Detection, Region
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.views import MIN_ROI_PIXELS
 from gausslite.perception.detector import Detector

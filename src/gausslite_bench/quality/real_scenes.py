@@ -10,18 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.held_out import HeldOutSplit
-from gausslite.datasets.intrinsics import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
+from gausslite.datasets.corrected import CorrectedSource
+from gausslite.datasets.files import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
-from gausslite.datasets.source import Source
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.depth_registration import DepthRegistration
+from gausslite.datasets.source import HeldOutSplit, Source
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.object_names import head_of
+from gausslite.domain.objects import head_of
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite_bench.quality.scenes import PosePolicy, Scene, UnseenRegionError, make_scene, require_count

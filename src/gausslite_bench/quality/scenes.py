@@ -12,9 +12,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import Region
-from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.recording import PoseExposurePrior
+from gausslite.domain.relevance import Region, RelevanceMap
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate, RelevanceEstimator

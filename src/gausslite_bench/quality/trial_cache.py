@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.codec.png import write_png
+from gausslite.codec.state_file import write_png
 from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import largest_roi_views

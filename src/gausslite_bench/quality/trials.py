@@ -17,9 +17,8 @@ from numpy import ndarray
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.evaluation.compare import MapScores, PerceptualDistance, average, score_view
-from gausslite.evaluation.fitted import render_fitted, render_fitted_at_region
 from gausslite.evaluation.pictures import to_uint8
-from gausslite.evaluation.views import MapViewer, largest_roi_views
+from gausslite.evaluation.views import MapViewer, largest_roi_views, render_fitted, render_fitted_at_region
 from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.runner import MissionRunner

@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.errors import KernelError
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.rasterizer import ROW_WIDTH, TILE_PX
 from gausslite_bench.raster.procedural_room import BenchView
 

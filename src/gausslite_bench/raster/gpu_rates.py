@@ -18,12 +18,10 @@ from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.keyframes import tiles_touching
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.settings import MapperSettings
+from gausslite.mapping.settings import DensitySettings, MapperSettings
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.frame_scheduler import FrameScheduler
-from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.splat_table import SplatTable
-from gausslite.render.rasterizer import FULL_FRAME, Subset
-from gausslite.render.row_encoding import rows_to_gaussians
+from gausslite.render.rasterizer import FULL_FRAME, Subset, rows_to_gaussians
 from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
 from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, ZERO_LEARNING_RATES, Duration
 

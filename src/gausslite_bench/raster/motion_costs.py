@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite.domain.camera_motion import CameraMotion
-from gausslite.domain.trajectory import Twist
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.domain.camera import CameraMotion
+from gausslite.domain.pose import Twist
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite_bench.raster.procedural_room import BenchView
 from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, Duration, RepeatedStep, measure_seconds

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.optimize.splat_table import SplatTable
-from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.cpu_kernels import core_clock_ghz
+from gausslite.mapping.splat_table import SplatTable
+from gausslite.render.cpu import CpuRasterizer, core_clock_ghz
 from gausslite.render.rasterizer import Rendering
 from gausslite_bench.raster.block_cost import BlockCost
 from gausslite_bench.raster.external_rasterizer import ExternalRasterizer

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import TILE_PX, LossWeights
 from gausslite_bench.raster.procedural_room import BenchView

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from gausslite.domain.camera_motion import CameraMotion
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.domain.camera import CameraMotion
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import FULL_FRAME, AdamSettings, LossWeights, Subset
 from gausslite_bench.raster.procedural_room import BenchView

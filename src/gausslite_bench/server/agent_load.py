@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gausslite.wire.async_calls import UpdateStream, UpdateStreams
 from gausslite.wire.clients import FusionClient
-from gausslite.wire.update_streams import UpdateStream, UpdateStreams
 from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, tombstone_message
 
 RATE_HZ = 4.0

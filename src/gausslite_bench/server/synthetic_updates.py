@@ -8,9 +8,7 @@ import numpy as np
 
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel, tombstones
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, tombstones
 
 GRID = VoxelGrid(0.10)
 GAUSSIANS_PER_VOXEL = 40

@@ -8,19 +8,16 @@ from dataclasses import dataclass, field, replace
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.evaluation.compare import MapScores
-from gausslite.evaluation.team import score_team
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
+from gausslite.evaluation.compare import MapScores, score_team
 from gausslite.evaluation.views import MapViewer
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frame_alignment import AlignmentSettings
-from gausslite.fusion.joint_refinement import RefineSettings, refine
+from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.refinement import RefineSettings, refine
+from gausslite.fusion.store import MissionConfig
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.render.choose import choose_rasterizer

@@ -9,12 +9,10 @@ from statistics import fmean
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import HeldOutView, MapViewer
-from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import MissionSettings, SceneInfo

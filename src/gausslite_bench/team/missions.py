@@ -9,14 +9,12 @@ from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.frame import Frame
 from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.mapping.free_space import FreeSpaceMap
 from gausslite.mapping.keyframe_selection import KeyframeSelection
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.runner import MissionRunner

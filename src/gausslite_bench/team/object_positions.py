@@ -12,13 +12,12 @@ from numpy import ndarray
 
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
-from gausslite.domain.object_names import same_kind
-from gausslite.domain.objects import ObjectReport, TeamObject
+from gausslite.domain.objects import ObjectReport, TeamObject, same_kind
 from gausslite.domain.pose import transform_points
-from gausslite.domain.region import Region
+from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
-from gausslite.fusion.team_objects import find_objects
+from gausslite.fusion.objects import find_objects
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.settings import PerceptionSettings
 from gausslite.task.rules import RuleParser

@@ -10,8 +10,7 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.region import Region
-from gausslite.domain.relevance import RelevanceMap
+from gausslite.domain.relevance import Region, RelevanceMap
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.relevance import RegionRelevanceEstimator

@@ -15,7 +15,7 @@ from gausslite.cli.main import main
 from gausslite.cli.map_command import configure
 from gausslite.cli.map_inputs import MapInputs
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.recording import CameraCorrection
 
 HOME = "sim:home-1?frames=24&size=120x90&noise=0&exposure=0"
 CLIP_FRAMES = 8

@@ -14,8 +14,8 @@ from tum_recording import write_home
 from gausslite.calibration.camera_estimate import estimate_camera, minimum
 from gausslite.calibration.exposure_time import estimate_exposure_time
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.lens import Lens, LensModel
+from gausslite.domain.camera import Lens, LensModel
+from gausslite.domain.recording import CameraCorrection
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 

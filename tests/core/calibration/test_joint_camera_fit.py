@@ -7,8 +7,8 @@ import pytest
 from gausslite.calibration.joint_camera_fit import fit_camera
 from gausslite.calibration.moving_pairs import MovingPairs
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.lens import Lens
+from gausslite.domain.camera import Lens
+from gausslite.domain.recording import CameraCorrection
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.calibration.pose_exposure_error import estimate_pose_exposure_prior
-from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.calibration.errors import estimate_pose_exposure_prior
+from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite.domain.region import Region
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory
+from gausslite.domain.relevance import Region
 
 FRAMES = 40
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")

@@ -11,18 +11,17 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.calibration.alignment import fit_pose
-from gausslite.calibration.exposure import AffineExposure, fit_exposure
+from gausslite.calibration.errors import AffineExposure, fit_exposure
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.evaluation.fitted import render_fitted
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.evaluation.metrics import psnr
-from gausslite.evaluation.views import MapViewer
+from gausslite.evaluation.views import MapViewer, render_fitted
 from gausslite.mapping.keyframes import Keyframe, window_view
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.poses import RefinementSettings, ViewRefiner
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
-from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rendering
 

@@ -10,16 +10,15 @@ import pytest
 from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
 from gausslite.calibration.registration import RegistrationEstimate, estimate_from_frames, find_registration
-from gausslite.datasets.images import RgbdImage, resize_rgbd
+from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
 from gausslite.datasets.registered_source import register_depth
 from gausslite.domain.camera import Camera, FileIntrinsics
-from gausslite.domain.depth_registration import DepthRegistration
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse
-from gausslite.domain.region import Region
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory, inverse
+from gausslite.domain.recording import DepthRegistration
+from gausslite.domain.relevance import Region
 
 DEPTH_CAMERA = Camera(300.0, 300.0, 162.0, 118.5, 320, 240)
 

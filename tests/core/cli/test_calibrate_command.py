@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.recording import CameraCorrection
 from gausslite_agent.settings import parse_arguments
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")

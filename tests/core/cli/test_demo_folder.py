@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.cli.demo.results_folder import remove_results, require_no_demo
+from gausslite.cli.demo_services import remove_results, require_no_demo
 from gausslite.cli.main import main
 from gausslite.domain.errors import StorageError
 

@@ -9,14 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.cli.demo.scenario import AgentPlan
-from gausslite.cli.demo.service_processes import ServiceProcess
-from gausslite.cli.demo.services import DemoPlan, RunningService, RunningServices, watch_missions
+from gausslite.cli.demo_services import (
+    AgentPlan,
+    DemoPlan,
+    RunningService,
+    RunningServices,
+    ServiceProcess,
+    watch_missions,
+)
 from gausslite.config.option import plain_options
-from gausslite.config.plain_values import to_toml
+from gausslite.config.values import to_toml
 from gausslite.domain.errors import UnavailableError
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.mapping.stages import SkippableStage
+from gausslite.domain.recording import PoseExposurePrior
+from gausslite.mapping.training import SkippableStage
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite_agent.settings import parse_arguments
 

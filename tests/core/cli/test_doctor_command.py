@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from tiny_yolo import write_tiny_yolo
 
-from gausslite.cli.doctor import machine_checks
+from gausslite.cli import doctor_command as machine_checks
 from gausslite.cli.main import main
 from gausslite.render.choose import choose_rasterizer
-from gausslite.render.cpu_kernels import choose_simd
-from gausslite.wire.address import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
+from gausslite.render.cpu import choose_simd
+from gausslite.wire.channel import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
 
 Doctor = Callable[..., tuple[int, dict[str, dict[str, str]]]]
 
@@ -113,7 +113,7 @@ def test_a_taken_port_is_a_warning() -> None:
 def test_the_checked_ports_are_those_that_the_services_take_by_default() -> None:
     from gausslite_agent.settings import parse_arguments as agent_settings
     from gausslite_fusion_server.settings import ServerSettings
-    from gausslite_parser.settings import ParserSettings
+    from gausslite_parser.program import ParserSettings
 
     assert ParserSettings().listen == PARSER_ADDRESS
     assert ServerSettings().listen == FUSION_ADDRESS

@@ -14,7 +14,7 @@ from run_folders import write_run
 from tiny_sequences import write_tum
 
 from gausslite.cli.main import main
-from gausslite.process.interrupts import end_quietly_while_starting
+from gausslite.process import end_quietly_while_starting
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "commands.md"
 ROWS = re.findall(r"^\| (\d+) \| .+ \| (?:`gausslite (.+)` )?\|$", PAGE.read_text(), re.MULTILINE)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.codec.keyframe_views import read_keyframe_views
 from gausslite.codec.ply import read_ply, write_ply
+from gausslite.codec.run_files import read_keyframe_views
 from gausslite.domain.gaussians import Gaussians
 from gausslite.export.formats import FORMATS
 

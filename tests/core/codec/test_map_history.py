@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sample_gaussians import random_gaussians
 
-from gausslite.codec.map_history import MAX_GAUSSIANS, MapSnapshot, read_map_history, write_map_history
+from gausslite.codec.run_files import MAX_GAUSSIANS, MapSnapshot, read_map_history, write_map_history
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.gaussians import Gaussians

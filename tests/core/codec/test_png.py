@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.codec.png import write_png
+from gausslite.codec.state_file import write_png
 from gausslite.domain.errors import StorageError
 
 RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)

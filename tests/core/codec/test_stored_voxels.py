@@ -10,13 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.sample_batches import make_batch
 
-from gausslite.codec.records import RECORD, to_records
-from gausslite.codec.stored_voxels import CODES, from_stored, is_stored, to_stored
+from gausslite.codec.stored import CODES, RECORD, from_stored, is_stored, to_records, to_stored
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 
 SIZE_HEADER_BYTES = 8
 CASES = st.tuples(

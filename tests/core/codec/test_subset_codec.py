@@ -17,8 +17,7 @@ from gausslite.codec.columns import OPACITY_BINS, RGB_MAX, RGB_MIN, SCALE_MIN_M
 from gausslite.codec.subset_codec import CodecLimits, SubsetCoding, decode_subset, encode_subset, split_batch
 from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 
 SIZES_M = [0.1, 0.05, 0.125, 0.1 / 3, 65535 * 2.0**-20, 1.0]
 

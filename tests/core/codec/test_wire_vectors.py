@@ -10,9 +10,7 @@ import pytest
 
 from gausslite.codec.subset_codec import SubsetCoding, decode_subset, encode_subset
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tombstones
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "wire.md"
 GRID = VoxelGrid(0.1)

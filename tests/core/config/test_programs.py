@@ -13,8 +13,8 @@ import pytest
 
 import gausslite_agent.settings as agent
 import gausslite_fusion_server.settings as fusion_server
-import gausslite_parser.settings as parser_service
-from gausslite.cli.commands import build_parser
+import gausslite_parser.program as parser_service
+from gausslite.cli.main import build_parser
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import OptionField
 from gausslite.config.program import PROGRAM, Program, choices_of, parse_options, variable_name

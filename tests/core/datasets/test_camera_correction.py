@@ -11,17 +11,14 @@ import numpy as np
 import pytest
 from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
-from gausslite.datasets.camera_correction import correct_frame, ideal_camera
-from gausslite.datasets.corrected_source import CorrectedSource
-from gausslite.datasets.intrinsics import read_folder_camera
+from gausslite.datasets.corrected import CorrectedSource, correct_frame, ideal_camera
+from gausslite.datasets.files import read_folder_camera
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera import Camera, lift, project
-from gausslite.domain.camera_correction import CameraCorrection
+from gausslite.domain.camera import Camera, Lens, LensModel, lift, project
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.pose import inverse, transform_points
-from gausslite.domain.trajectory import Twist
+from gausslite.domain.pose import Twist, inverse, transform_points
+from gausslite.domain.recording import CameraCorrection
 
 CAMERA = Camera(160.0, 160.0, 100.0, 75.0, 200, 150)
 STILL = Twist(np.zeros(3), np.zeros(3))

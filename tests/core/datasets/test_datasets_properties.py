@@ -9,15 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gausslite.datasets.images import RgbdImage, resize_rgbd
-from gausslite.datasets.poses import estimate_up, nearest_rigid, pose_from_quaternion, slerp
-from gausslite.datasets.selection import select_frames
+from gausslite.datasets.files import RgbdImage, resize_rgbd
+from gausslite.datasets.folder import estimate_up, nearest_rigid, pose_from_quaternion, slerp
+from gausslite.datasets.source import select_frames
 from gausslite.domain.camera import Camera, back_project, project
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import require_rigid, rotation_angle_deg
-from gausslite.domain.region import Region
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory, require_rigid, rotation_angle_deg
+from gausslite.domain.relevance import Region
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -12,10 +12,10 @@ import pytest
 from tiny_sequences import HEIGHT, WIDTH, write_depth, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.selection import downscaled_size, frame_size, select_frames
+from gausslite.datasets.source import downscaled_size, frame_size, select_frames
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
-from gausslite.domain.region import BallRegion, VoxelRegion
+from gausslite.domain.relevance import BallRegion, VoxelRegion
 
 
 def test_tum_uses_sparse_poses_only_at_their_own_images(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from exported_recordings import home_frames, write_record3d, write_zed, zip_fold
 
 import gausslite as gl
 from gausslite.datasets.open import open_source
-from gausslite.datasets.record3d_files import Record3dFiles
+from gausslite.datasets.record3d import Record3dFiles
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 

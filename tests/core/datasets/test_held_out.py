@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gausslite.datasets.held_out import HeldOutSplit
+from gausslite.datasets.source import HeldOutSplit
 from gausslite.domain.errors import InvalidInputError
 
 

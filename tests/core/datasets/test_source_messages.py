@@ -13,9 +13,7 @@ from gausslite.calibration.calibrate import Calibration
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import open_source
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.depth_registration import DepthRegistration
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
+from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 
 EXACT = PoseExposurePrior()
 CAMERA = DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0")

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from gausslite.domain.camera_motion import CameraMotion
-from gausslite.domain.trajectory import Twist
+from gausslite.domain.camera import CameraMotion
+from gausslite.domain.pose import Twist
 
 _TURN = Twist(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 

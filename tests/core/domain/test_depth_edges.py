@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gausslite.domain.depth_edges import without_depth_edges
+from gausslite.domain.frame import without_depth_edges
 
 
 def step(width_px: int = 12) -> np.ndarray:

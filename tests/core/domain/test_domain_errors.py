@@ -7,12 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion, Lens
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.even_history import EvenHistory
-from gausslite.domain.lens import Lens
-from gausslite.domain.trajectory import Trajectory, Twist
+from gausslite.domain.pose import Trajectory, Twist
+from gausslite.domain.state import EvenHistory
 
 TURN = Twist(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 NO_RAY = (np.array([0.1, 2.0]), np.array([0.0, 0.0]))

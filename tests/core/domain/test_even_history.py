@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gausslite.domain.even_history import EvenHistory
+from gausslite.domain.state import EvenHistory
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 100, 3000])

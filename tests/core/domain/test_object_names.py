@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gausslite.domain.object_names import meant_by
+from gausslite.domain.objects import meant_by
 
 KITCHEN = ("chair_1", "chair_2", "stool", "table", "counter", "mug_1", "wall")
 

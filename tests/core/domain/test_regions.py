@@ -8,7 +8,7 @@ import pytest
 from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
-from gausslite.domain.region import BallRegion, VoxelRegion
+from gausslite.domain.relevance import BallRegion, VoxelRegion
 
 CAMERA = Camera(60.0, 55.0, 31.7, 24.4, 64, 48)
 

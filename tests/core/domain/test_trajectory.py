@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.trajectory import Trajectory, Twist
+from gausslite.domain.pose import Trajectory, Twist
 
 
 def test_twist_of_a_constant_motion_is_found_at_every_pose() -> None:

@@ -12,7 +12,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import BallRegion
 from gausslite.evaluation.compare import MAX_PSNR_DB, average, evaluate, score_view
 from gausslite.evaluation.metrics import psnr
 from gausslite.evaluation.views import HeldOutView, MapViewer

@@ -9,9 +9,8 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.frame import Frame
-from gausslite.evaluation.fitted import render_fitted, render_fitted_at_region
 from gausslite.evaluation.metrics import psnr
-from gausslite.evaluation.views import HeldOutView, MapViewer
+from gausslite.evaluation.views import HeldOutView, MapViewer, render_fitted, render_fitted_at_region
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, OptimizationSettings
 from gausslite.render.cpu import CpuRasterizer

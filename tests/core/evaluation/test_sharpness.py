@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.evaluation.sharpness import gradient_deviation, laplacian_ratio
+from gausslite.evaluation.metrics import gradient_deviation, laplacian_ratio
 
 
 def photograph(seed: int = 0) -> np.ndarray:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gausslite.domain.pose import transform_of
-from gausslite.domain.trajectory import Trajectory
-from gausslite.evaluation.trajectory_error import trajectory_error
+from gausslite.domain.pose import Trajectory, transform_of
+from gausslite.evaluation.metrics import trajectory_error
 
 
 def walk(count: int = 50, noise_m: float = 0.0) -> Trajectory:

@@ -13,8 +13,8 @@ import pyoctomap
 import pytest
 import yaml
 
-from gausslite.codec.keyframe_views import read_keyframe_views
 from gausslite.codec.ply import SH_C0, read_ply, write_ply
+from gausslite.codec.run_files import read_keyframe_views
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.export.formats import FORMATS, ExportSettings, read_map

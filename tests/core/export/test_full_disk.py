@@ -12,7 +12,7 @@ import pytest
 from test_formats import plate
 from test_video import CAMERA, Picture, turned
 
-from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.errors import StorageError
 from gausslite.export.occupancy import OccupancySettings, write_octomap
 from gausslite.export.video import write_video

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians

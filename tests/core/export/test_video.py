@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gausslite.codec.keyframe_views import KeyframeView
+from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import require_rigid

@@ -10,14 +10,12 @@ from sample_gaussians import plain_gaussians
 from test_fusion_properties import assert_same_batch
 
 from gausslite.domain.errors import RevisionGoneError
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, merge_batches, select_voxels
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batch, merge_batches, select_voxels
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.store import MissionConfig
 from gausslite.fusion.vote import FusedMap, fuse, rank_voxels
 
 GRID = VoxelGrid(0.10)

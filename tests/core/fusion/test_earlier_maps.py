@@ -10,16 +10,14 @@ from fusion_running import GRID, keys, make_subset
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxels import RoiSubset, group_by_voxel
 from gausslite.fusion.agent_data import earlier_map_of
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState
+from gausslite.fusion.frames import AlignmentSettings, AlignmentState
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store import FusionStore, MissionConfig
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
 EARLIER = "ant:earlier"

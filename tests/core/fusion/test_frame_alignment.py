@@ -12,21 +12,16 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.free_space import FreeSpace, split_indices
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.moved_gaussians import move_gaussians
+from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.alignment import SurfaceSamples, fit_frame
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frame_alignment import AlignmentSettings, AlignmentState
+from gausslite.fusion.frames import AlignmentSettings, AlignmentState, SurfaceSamples, fit_frame
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store import FusionStore, MissionConfig
 
 GRID = VoxelGrid(0.10)
 ANYTHING = MissionConfig("", "", 0.10)

@@ -12,18 +12,16 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
-from gausslite.codec.free_space import decode_free_space, encode_free_space
+from gausslite.codec.stored import decode_free_space, encode_free_space
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import GaussLiteError, MismatchError
 from gausslite.domain.frame import Frame
 from gausslite.domain.free_space import FreeSpace
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import MissionConfig
 from gausslite.mapping.free_space import FreeSpaceMap
 
 GRID = VoxelGrid(0.10)

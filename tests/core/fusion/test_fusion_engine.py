@@ -7,13 +7,11 @@ import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, QuotaError, SessionUnknownError
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, tombstones
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig, reconcile
+from gausslite.fusion.store import MissionConfig, reconcile
 from gausslite.fusion.traffic import TrafficCounters
 
 GRID = VoxelGrid(0.10)

@@ -12,14 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel, merge_batches, select_keys, select_voxels, tombstones
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import (
+    RoiSubset,
+    VoxelBatch,
+    VoxelGrid,
+    group_by_voxel,
+    merge_batches,
+    select_keys,
+    select_voxels,
+    tombstones,
+)
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.offline import fuse_maps
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.vote import FusedMap, fuse, rank_voxels, union_maps
+from gausslite.fusion.vote import FusedMap, fuse, fuse_maps, rank_voxels, union_maps
 
 GRID = VoxelGrid(0.10)
 AGENTS = ("ant", "bee", "cat", "dog")

@@ -15,19 +15,14 @@ import numpy as np
 import pytest
 from support.sample_batches import make_batch
 
-from gausslite.codec.records import to_records
+from gausslite.codec.stored import to_records
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import gather_rows, select_keys
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, select_keys
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.sqlite_file import SCHEMA_VERSION
-from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import AgentTotals, SessionRecord
+from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
+from gausslite.fusion.store import AgentTotals, FusionStore, MissionConfig, SessionRecord
 
 KEYS = (11, 22, 33)
 

@@ -17,15 +17,14 @@ from gausslite.domain.errors import (
     QuotaError,
     SessionUnknownError,
 )
-from gausslite.domain.voxel_batch import RoiSubset
+from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.membership import SessionRegistry
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.sessions import SessionRegistry
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore
-from gausslite.fusion.update_checks import MAX_SEQ_STEP, UpdateChecks
+from gausslite.fusion.store import FusionStore, MissionConfig
+from gausslite.fusion.updates import MAX_SEQ_STEP, UpdateChecks
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
 LARGEST = (1 << 63) - 1

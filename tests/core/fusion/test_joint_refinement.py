@@ -13,11 +13,10 @@ from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.fusion.joint_refinement import RefineProgress, RefineSettings, refine
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, KeyframeLimits, KeyframePool
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.rates import ONLINE_RATES
+from gausslite.fusion.refinement import RefineProgress, RefineSettings, refine
+from gausslite.mapping.settings import ONLINE_RATES, DensitySettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings
 from gausslite.render.reference import ReferenceRasterizer

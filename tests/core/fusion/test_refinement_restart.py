@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from fusion_running import GRID, keys, make_subset
 
-from gausslite.domain.column_hash import hash_columns
 from gausslite.domain.errors import CodecError, MismatchError
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxel_changes import hash_columns
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import MissionConfig
 from gausslite.fusion.traffic import TrafficCounters, TrafficLog
 
 ANYTHING = MissionConfig("", "", GRID.size_m)

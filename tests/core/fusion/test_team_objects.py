@@ -9,17 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gausslite.codec.object_report import decode_object_report, encode_object_report
+from gausslite.codec.json import decode_object_report, encode_object_report
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole, object_of_gaussian
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.object_merge import merge_objects
+from gausslite.fusion.objects import find_objects, merge_objects
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.team_objects import find_objects
+from gausslite.fusion.store import MissionConfig
 
 GRAPH = TaskGraph("t", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),))
 ANYTHING = MissionConfig("", "", 0.10)

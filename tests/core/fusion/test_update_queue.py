@@ -13,14 +13,12 @@ from test_fusion_stores import make_subset
 
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxel_operations import tombstones
+from gausslite.domain.voxels import RoiSubset, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
-from gausslite.fusion.store_values import PutOutcome
-from gausslite.fusion.update_queue import SLICE_VOXELS, PendingUpdate, UpdateQueue
+from gausslite.fusion.store import MissionConfig, PutOutcome
+from gausslite.fusion.updates import SLICE_VOXELS, PendingUpdate, UpdateQueue
 from gausslite.fusion.vote import fuse
 
 ANY = MissionConfig("", "", 0.10)

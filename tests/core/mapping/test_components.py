@@ -9,8 +9,7 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.settings import Components, KeyframeSettings, MapperSettings, SeedingSettings
-from gausslite.optimize.density import DensitySettings
+from gausslite.mapping.settings import Components, DensitySettings, KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.render.cpu import CpuRasterizer
 
 SIZE = (32, 24)

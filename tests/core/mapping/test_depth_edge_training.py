@@ -11,8 +11,7 @@ from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.frame import Frame
 from gausslite.mapping.keyframes import Keyframe, window_view
-from gausslite.mapping.settings import KeyframeSettings
-from gausslite.optimize.rates import ONLINE_RATES
+from gausslite.mapping.settings import ONLINE_RATES, KeyframeSettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import LossWeights
 

@@ -6,9 +6,8 @@ import numpy as np
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.mapping.eviction import insert_seeds
-from gausslite.mapping.seeding import Seeds
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.seeding import Seeds, insert_seeds
+from gausslite.mapping.splat_table import SplatTable
 
 SEED_OPACITY = 0.5
 

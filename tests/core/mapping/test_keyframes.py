@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import CameraMotion
+from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.trajectory import Twist
-from gausslite.mapping.baselines import uniform_policy
-from gausslite.mapping.keyframe_store import KeyframeStore
-from gausslite.mapping.keyframes import Keyframe, motion_blur_px, tiles_touching, window_view
+from gausslite.mapping.keyframes import Keyframe, KeyframeStore, motion_blur_px, tiles_touching, window_view
+from gausslite.mapping.policies import uniform_policy
 from gausslite.mapping.settings import Components, KeyframeSettings
 from gausslite.render.cpu import CpuRasterizer
 

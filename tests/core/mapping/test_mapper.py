@@ -17,14 +17,14 @@ from gausslite.mapping.policies import policy
 from gausslite.mapping.settings import (
     ActivePhase,
     Components,
+    DensitySettings,
     KeyframeSettings,
     MapperSettings,
     OptimizationSettings,
     SeedingSettings,
 )
-from gausslite.mapping.stages import Stage
+from gausslite.mapping.training import Stage
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
-from gausslite.optimize.density import DensitySettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import RGB, LossWeights
 

@@ -14,11 +14,15 @@ from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import TASK, disable, policy
-from gausslite.mapping.saturation import SaturationSettings
-from gausslite.mapping.settings import MapperSettings, OptimizationSettings, SeedingSettings
-from gausslite.mapping.task_change import TaskChangeSettings
-from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.mapping.settings import (
+    DensitySettings,
+    MapperSettings,
+    OptimizationSettings,
+    SaturationSettings,
+    SeedingSettings,
+    TaskChangeSettings,
+)
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.cpu import CpuRasterizer
 
 

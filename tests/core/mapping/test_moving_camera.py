@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import CameraMotion
 from gausslite.domain.frame import Frame
+from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.trajectory import Twist
-from gausslite.mapping.checkpoint import frame_from_state, frame_state
+from gausslite.mapping.keyframes import frame_from_state, frame_state
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeder, SeedingContext
 from gausslite.mapping.settings import Components, MapperSettings, SeedingSettings

@@ -10,12 +10,10 @@ from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse, transform_of, translation_m, twist_of
-from gausslite.domain.pose_correction import CorrectionTrack
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.mapping import pose_history
-from gausslite.mapping.pose_history import PoseHistory
-from gausslite.mapping.view_refinement import RefinementSettings, ViewRefiner
+from gausslite.domain.pose import CorrectionTrack, inverse, transform_of, translation_m, twist_of
+from gausslite.domain.recording import PoseExposurePrior
+from gausslite.mapping import poses as pose_history
+from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
 from gausslite.render.rasterizer import Rendering
 
 SMALL = wall_frame(size=(4, 3))

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from gausslite.domain.camera import Camera
-from gausslite.mapping.sampling import edge_magnitude, sample_pixels, sample_stratified
-from gausslite.mapping.spacing import initial_spacing_m, neighbour_distance_px
+from gausslite.mapping.seeding import (
+    edge_magnitude,
+    initial_spacing_m,
+    neighbour_distance_px,
+    sample_pixels,
+    sample_stratified,
+)
 
 SHAPE = (96, 128)
 EVEN = np.ones(SHAPE, np.float32)

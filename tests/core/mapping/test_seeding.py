@@ -7,8 +7,7 @@ import pytest
 from mapping_scenes import middle_relevance, rendering_of, wall_frame
 
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.mapping.coverage import RenderedView, rendered_behind, undersampled_roi
-from gausslite.mapping.seeding import Seeder, SeedingContext
+from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, rendered_behind, undersampled_roi
 from gausslite.mapping.settings import Components, SeedingSettings
 
 NO_MEANS = np.zeros((0, 3), np.float32)

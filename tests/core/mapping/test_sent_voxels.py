@@ -7,10 +7,8 @@ import pytest
 from sample_gaussians import some_gaussians
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch, group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.sent_voxels import SentVoxelTracker
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 
 GRID = VoxelGrid(0.5)
 

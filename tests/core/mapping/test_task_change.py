@@ -13,22 +13,23 @@ from sample_gaussians import some_gaussians
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import NO_TARGET, RelevanceMap
+from gausslite.domain.relevance import NO_TARGET, BallRegion, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.coverage import visible_means
-from gausslite.mapping.eviction import insert_seeds
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.seeding import Seeds
-from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
-from gausslite.mapping.task_change import TaskChangeSettings
+from gausslite.mapping.seeding import Seeds, insert_seeds, visible_means
+from gausslite.mapping.settings import (
+    DensitySettings,
+    KeyframeSettings,
+    MapperSettings,
+    SeedingSettings,
+    TaskChangeSettings,
+)
+from gausslite.mapping.splat_table import SplatTable
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.optimize.density import DensitySettings
-from gausslite.optimize.splat_table import SplatTable
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import AsyncRelevanceEstimator, RegionRelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.settings import RelevanceTrackerSettings

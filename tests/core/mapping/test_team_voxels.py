@@ -6,12 +6,9 @@ import numpy as np
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mapping.team_voxels import insert_team_voxels
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, group_by_voxel
+from gausslite.mapping.splat_table import SplatTable
+from gausslite.mapping.voxel_exchange import SentVoxelTracker, insert_team_voxels
 
 GRID = VoxelGrid(0.10)
 

@@ -16,20 +16,18 @@ from mapping_scenes import wall_frame
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose_exposure_prior import PoseExposurePrior
-from gausslite.domain.region import BallRegion
+from gausslite.domain.recording import PoseExposurePrior
+from gausslite.domain.relevance import BallRegion
 from gausslite.domain.state import State, select_prefix
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
-from gausslite.mapping.checkpoint import generator_state, restore_generator
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
+from gausslite.mapping.keyframes import generator_state, restore_generator
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.sent_voxels import SentVoxelTracker
-from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
+from gausslite.mapping.settings import DensitySettings, KeyframeSettings, MapperSettings, SeedingSettings
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.settings import MissionSettings, TaskSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.optimize.density import DensitySettings
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import RelevanceTrackerSettings

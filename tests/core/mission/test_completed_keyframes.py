@@ -9,13 +9,11 @@ import pytest
 from mapping_scenes import wall_frame
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import Detection
+from gausslite.domain.relevance import BallRegion, Detection
 from gausslite.domain.task import TaskGraph
-from gausslite.mapping.coverage import visible_means
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings
-from gausslite.mapping.task_change import TaskChangeSettings
+from gausslite.mapping.seeding import visible_means
+from gausslite.mapping.settings import KeyframeSettings, MapperSettings, SeedingSettings, TaskChangeSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import TaskRelevanceEstimator

@@ -15,8 +15,8 @@ from gausslite.cli.main import main
 from gausslite.codec.state_file import read_state
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.domain.frame import Frame
-from gausslite.mapping.pose_history import PoseHistory
-from gausslite.process.interrupts import DeferredInterrupt
+from gausslite.mapping.poses import PoseHistory
+from gausslite.process import DeferredInterrupt
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 

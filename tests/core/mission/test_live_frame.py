@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gausslite.datasets.camera_correction import ideal_camera, undistort_frame
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_correction import CameraCorrection
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.datasets.corrected import ideal_camera, undistort_frame
+from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.trajectory import Twist
-from gausslite.mission.live_frame import correct_live_frame
+from gausslite.domain.pose import Twist
+from gausslite.domain.recording import CameraCorrection
+from gausslite.mission.runner import correct_live_frame
 
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
 MOTION = CameraMotion(Twist(np.array([0.3, -0.1, 0.2]), np.array([0.5, 1.5, -0.4])), readout_s=0.03, exposure_s=0.01)

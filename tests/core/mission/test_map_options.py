@@ -11,9 +11,8 @@ import gausslite as gl
 from gausslite.calibration.registration import find_registration
 from gausslite.cli.main import main
 from gausslite.codec.ply import read_world_frame
-from gausslite.datasets.open import open_source
-from gausslite.datasets.sequence_name import default_world_frame
-from gausslite.mission.folder_lock import locked_folder
+from gausslite.datasets.open import default_world_frame, open_source
+from gausslite.mission.results import locked_folder
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 FRAMES = tuple(range(0, 24, 4))

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from sample_gaussians import random_gaussians
 
-from gausslite.codec.map_history import read_map_history
+from gausslite.codec.run_files import read_map_history
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.mapping.pose_history import PoseHistory
-from gausslite.mission.map_recorder import MapRecorder
+from gausslite.mapping.poses import PoseHistory
+from gausslite.mission.schedule import MapRecorder
 
 CAMERA = Camera(4.0, 4.0, 2.0, 2.0, 4, 4)
 

@@ -8,12 +8,12 @@ import numpy as np
 from mapping_scenes import wall_frame
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import BallRegion
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.sent_voxels import SentVoxelTracker
 from gausslite.mapping.settings import MapperSettings, SeedingSettings
-from gausslite.mapping.stages import SkippableStage, Stage
+from gausslite.mapping.training import SkippableStage, Stage
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, SchedulerSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import (

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gausslite.mission.frame_scheduler import FrameTiming
+from gausslite.mission.schedule import Timeline, read_timeline
 from gausslite.mission.task_mapper import FrameOutcome, Reevaluation
-from gausslite.mission.timeline import Timeline, read_timeline
 
 
 def outcome(index: int) -> FrameOutcome:

@@ -12,9 +12,8 @@ from mapping_scenes import wall_frame
 
 from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounMatch
-from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import Detection
+from gausslite.domain.objects import NounMatch
+from gausslite.domain.relevance import BallRegion, Detection
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings

@@ -9,7 +9,7 @@ import pytest
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.perception.models.model_file import open_model
+from gausslite.perception.model_file import open_model
 from gausslite.perception.yolo_network import YoloNetwork, letterbox
 
 torch = pytest.importorskip("torch", reason="torch, which this network is made with, is not installed")

@@ -11,7 +11,7 @@ import pytest
 from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounMatch
+from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.perception.detector import BoxSizeLimits, Tile, TiledDetector, Tiling, crop, tiles_of
 

@@ -12,7 +12,7 @@ from observed_objects import ObservedObjects
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import NounMatch
+from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.evidence import LandmarkState, VisibilityCheck

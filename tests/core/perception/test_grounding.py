@@ -16,7 +16,7 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import DetectedBox
-from gausslite.perception.models.model_file import open_model
+from gausslite.perception.model_file import open_model
 from gausslite.perception.open_vocabulary import GroundingDino, GroundingSettings, corners_px, phrase_scores, preprocess
 from gausslite.perception.text_features import BertTokenizer, encode_phrase
 

@@ -13,7 +13,7 @@ from tool_modules import load_tool
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.perception.detector import BoxSizeLimits
-from gausslite.perception.models.model_file import open_model
+from gausslite.perception.model_file import open_model
 from gausslite.perception.open_vocabulary import INPUTS, GroundingDino, GroundingSettings, preprocess
 from gausslite.perception.text_features import encode_phrase, open_phrase_vectors
 

@@ -12,11 +12,11 @@ from tiny_yolo import write_boxes_only, write_tiny_yolo
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, KernelError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import MatchBasis, NounMatch
+from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
 from gausslite.perception.detector import SegmentedDetector
-from gausslite.perception.models.model_file import choose_providers, open_model
-from gausslite.perception.models.model_registry import ModelFamily, ModelRegistry, identify_family
+from gausslite.perception.model_file import choose_providers, open_model
+from gausslite.perception.models import ModelFamily, ModelRegistry, identify_family
 
 # in the network's pixels; in the image columns 32 to 64, rows 16 to 48
 CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)

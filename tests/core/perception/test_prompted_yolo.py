@@ -12,9 +12,9 @@ from tiny_prompted import DIMENSIONS, WORDS, word_vectors, write_prompted, write
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import MatchBasis
-from gausslite.perception.models.model_file import open_model
-from gausslite.perception.models.model_registry import ModelFamily, ModelRegistry, identify_family
+from gausslite.domain.objects import MatchBasis
+from gausslite.perception.model_file import open_model
+from gausslite.perception.models import ModelFamily, ModelRegistry, identify_family
 from gausslite.perception.open_vocabulary import PromptedYolo
 from gausslite.perception.text_features import NOUN_NAMES_FILE, NOUN_VECTORS_FILE, ClipTextEncoder, NounVectorTable
 

@@ -12,7 +12,7 @@ from observed_objects import ObservedObjects
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import BallRegion
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TaskGraph
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.object_map import Landmark, Observation

@@ -11,9 +11,8 @@ from observed_objects import ObservedObjects
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import MatchBasis
-from gausslite.domain.region import BallRegion
-from gausslite.domain.relevance import NO_TARGET
+from gausslite.domain.objects import MatchBasis
+from gausslite.domain.relevance import NO_TARGET, BallRegion
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.lifting import best_depth_m

@@ -7,7 +7,7 @@ import pytest
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.noun_match import MatchBasis, NounMatch
+from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.relevance import TaskRelevanceEstimator

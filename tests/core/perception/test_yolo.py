@@ -14,7 +14,7 @@ from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detector import BoxSizeLimits
-from gausslite.perception.models.model_file import open_model
+from gausslite.perception.model_file import open_model
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 from gausslite.perception.yolo import (

@@ -23,7 +23,7 @@ class Watch:
 sys.meta_path.insert(0, Watch())
 from pathlib import Path
 from gausslite.domain.errors import InvalidInputError
-from gausslite.perception.models.model_file import open_model
+from gausslite.perception.model_file import open_model
 from gausslite.task.language.onnx import OnnxLanguageModel
 for attempt in (lambda: open_model(Path(sys.argv[1])), lambda: OnnxLanguageModel(Path(sys.argv[2]))):
     try:

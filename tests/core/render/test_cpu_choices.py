@@ -9,8 +9,7 @@ import pytest
 from cpu_scenes import CAMERA, random_rows, view_of
 
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
-from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.cpu_kernels import MAX_THREADS, SIMD_VARIABLE, cores_allowed
+from gausslite.render.cpu import MAX_THREADS, SIMD_VARIABLE, CpuRasterizer, cores_allowed
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")

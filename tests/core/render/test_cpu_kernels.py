@@ -10,8 +10,7 @@ from cpu_scenes import CAMERA, random_rows, view_of
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
-from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.cpu_kernels import core_clock_ghz
+from gausslite.render.cpu import CpuRasterizer, core_clock_ghz
 from gausslite.render.rasterizer import AdamSettings, LossWeights, SplatGradients, Subset
 
 kernels = pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")

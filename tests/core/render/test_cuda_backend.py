@@ -12,8 +12,7 @@ from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.errors import InvalidInputError, KernelError
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.settings import MapperSettings, SeedingSettings
-from gausslite.optimize.density import DensitySettings
+from gausslite.mapping.settings import DensitySettings, MapperSettings, SeedingSettings
 from gausslite.render.rasterizer import AdamSettings, LossWeights, Rasterizer, Subset
 
 pytest.importorskip("torch", reason="torch is not installed")

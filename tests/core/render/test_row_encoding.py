@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from sample_gaussians import some_gaussians
 
-from gausslite.render.row_encoding import gaussians_to_rows, rows_to_gaussians
+from gausslite.render.rasterizer import gaussians_to_rows, rows_to_gaussians
 
 
 def test_row_encoding_round_trip() -> None:

@@ -11,9 +11,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from gausslite.domain.errors import LanguageModelError
-from gausslite.task.backends import Backend, BackendSettings, open_parser
 from gausslite.task.language.http import HttpLanguageModel, HttpSettings, ResponseFormat
-from gausslite.task.language.prompt import ANSWER_SCHEMA, messages_for
+from gausslite.task.language.parsers import ANSWER_SCHEMA, messages_for
+from gausslite.task.rules import Backend, BackendSettings, open_parser
 
 GOOD = json.dumps(
     {

@@ -15,10 +15,17 @@ from pathlib import Path
 import pytest
 
 from gausslite.domain.errors import LanguageModelError, ModelFileError
-from gausslite.task.backends import Backend, BackendSettings, open_parser
-from gausslite.task.language.model import Message, MessageRole
 from gausslite.task.language.onnx import OnnxLanguageModel, phi3_chat
-from gausslite.task.language.prompt import MAX_PHRASE_CHARS, MAX_PHRASES, MAX_RELATIONS, PHRASE_KEYS, messages_for
+from gausslite.task.language.parsers import (
+    MAX_PHRASE_CHARS,
+    MAX_PHRASES,
+    MAX_RELATIONS,
+    PHRASE_KEYS,
+    Message,
+    MessageRole,
+    messages_for,
+)
+from gausslite.task.rules import Backend, BackendSettings, open_parser
 from gausslite_bench.parser_scores import load_sentences
 
 TASKS = int(os.environ.get("GAUSSLITE_ONNX_TASKS", "5"))

@@ -10,14 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.errors import InvalidInputError, LanguageModelError, TaskError
-from gausslite.domain.task import Predicate, Relation, TargetRole
-from gausslite.domain.task_limits import require_graph
-from gausslite.task.backends import Backend, BackendSettings, open_parser
-from gausslite.task.language.answer import parse_answer
-from gausslite.task.language.model import Message, MessageRole
-from gausslite.task.language.parsers import CachedParser, FallbackParser, LanguageParser
-from gausslite.task.language.prompt import MAX_PHRASES, MAX_RELATIONS, messages_for
-from gausslite.task.rules import RuleParser
+from gausslite.domain.task import Predicate, Relation, TargetRole, require_graph
+from gausslite.task.language.parsers import (
+    MAX_PHRASES,
+    MAX_RELATIONS,
+    CachedParser,
+    FallbackParser,
+    LanguageParser,
+    Message,
+    MessageRole,
+    messages_for,
+    parse_answer,
+)
+from gausslite.task.rules import Backend, BackendSettings, RuleParser, open_parser
 
 TASK = "Pick up the mugs on the table"
 

@@ -6,14 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.errors import TaskError
-from gausslite.domain.task_limits import require_graph
+from gausslite.domain.task import require_graph
 from gausslite.task import lexicon
 from gausslite.task.clause_types import MODALS, WISHES
-from gausslite.task.lexicon import NOUNS
-from gausslite.task.parser import task_id_of
-from gausslite.task.prepositions import PREPOSITIONS
+from gausslite.task.grounding import task_id_of
+from gausslite.task.lexicon import NOUNS, word_set
 from gausslite.task.rules import RuleParser
-from gausslite.task.word_set import word_set
+from gausslite.task.tokens import PREPOSITIONS
 
 WORDS = st.sampled_from(
     sorted(

@@ -7,16 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.codec.task_json import graph_as_json
+from gausslite.codec.json import graph_as_json
 from gausslite.domain.errors import TaskError
-from gausslite.domain.task import Predicate, Relation, TargetRole, TaskGraph
-from gausslite.domain.task_limits import require_graph
+from gausslite.domain.task import Predicate, Relation, TargetRole, TaskGraph, require_graph
 from gausslite.task import lexicon
-from gausslite.task.attributes import COLOURS
-from gausslite.task.nouns import COMMON_ANCHORS
-from gausslite.task.parser import task_id_of
+from gausslite.task.grounding import task_id_of
+from gausslite.task.lexicon import COLOURS, COMMON_ANCHORS, singular
 from gausslite.task.rules import RuleParser
-from gausslite.task.singular import singular
 from gausslite_bench.parser_scores import load_sentences, matching_parts, score_parser
 
 SENTENCES = load_sentences()

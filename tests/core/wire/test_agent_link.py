@@ -10,10 +10,10 @@ from agent_running import TASK, Agent, agent
 from exported_recordings import home_frames
 from waiting import wait_until
 
+from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import UnavailableError
-from gausslite.domain.lens import Lens, LensModel
-from gausslite.wire.agent_link import AgentLink, LinkSettings
 from gausslite.wire.clients import AgentClient
+from gausslite.wire.robot import AgentLink, LinkSettings
 
 SETTINGS = LinkSettings(poll_s=0.02, queue_frames=2, lossless=True)
 

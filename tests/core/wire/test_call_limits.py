@@ -17,11 +17,17 @@ from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, RateLimitError
 from gausslite.task.rules import RuleParser
-from gausslite.wire.call_limits import MESSAGE_BYTES, CallLimits, CallUsage, limit_stream, wait_for_bandwidth
-from gausslite.wire.caller import Caller
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.token_bucket import TokenBucket
-from gausslite_parser.servicer import parser_service
+from gausslite.wire.security import (
+    MESSAGE_BYTES,
+    Caller,
+    CallLimits,
+    CallUsage,
+    TokenBucket,
+    limit_stream,
+    wait_for_bandwidth,
+)
+from gausslite_parser.program import parser_service
 
 SERVING = health_pb2.HealthCheckResponse.SERVING
 ROBOT = Caller("10.0.0.7")

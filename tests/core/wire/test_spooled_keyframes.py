@@ -9,9 +9,8 @@ from uplink_running import WAIT_S, uplink
 
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import frame_to_message
-from gausslite.wire.spool import Purpose, Spool
-from gausslite.wire.spooled_keyframes import SpooledKeyframe
-from gausslite.wire.uplink_values import UplinkSettings
+from gausslite.wire.spool import Purpose, Spool, SpooledKeyframe
+from gausslite.wire.update_sender import UplinkSettings
 
 
 def keyframe(index: int, value: float, size: int = 1000) -> SpooledKeyframe:

@@ -14,8 +14,8 @@ from gausslite.domain import errors
 from gausslite.domain.errors import GaussLiteError, QuotaError, UnavailableError
 from gausslite.domain.task import TaskGraph
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
+from gausslite.wire.channel import MAX_MESSAGE_BYTES
 from gausslite.wire.clients import ParserClient
-from gausslite.wire.connection import MAX_MESSAGE_BYTES
 from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason, error_from_reason
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gausslite.domain.errors import CodecError
-from gausslite.domain.tile_digests import TileDigests
+from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelGrid, tile_of
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.digest_messages import digests_from_messages, digests_to_messages
+from gausslite.wire.convert import digests_from_messages, digests_to_messages
 
 RNG = np.random.default_rng(0)
 KEYS = np.unique(VoxelGrid(0.1).keys(RNG.uniform(-40, 40, (40_000, 3)).astype(np.float32)))

@@ -16,16 +16,16 @@ from fusion_running import GRID, fusion_server
 from sample_gaussians import plain_gaussians
 from serving import serving
 
-from gausslite.cli.health_check import main as ask_health
+from gausslite.cli.team import main as ask_health
 from gausslite.domain.errors import InvalidInputError, NotPermittedError, UnavailableError
-from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxels import group_by_voxel
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
+from gausslite.wire.security import Tls
 from gausslite.wire.spool import Spool
-from gausslite.wire.tls import Tls
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_parser.servicer import parser_service
+from gausslite_parser.program import parser_service
 
 _FILES = (("cert", "server/cert.pem"), ("key", "server/key.pem"), ("ca", "server/ca.pem"))
 
@@ -162,7 +162,7 @@ def test_wrong_files_are_one_error_line_before_serving(
 def test_a_folder_of_another_user_is_one_line_with_the_command_that_helps(certs: Path) -> None:
     code = (
         "import pathlib, sys\n"
-        "from gausslite.wire.tls import Tls, InvalidInputError\n"
+        "from gausslite.wire.security import Tls, InvalidInputError\n"
         "try: Tls.read(*map(pathlib.Path, sys.argv[1:]))\n"
         "except InvalidInputError as error: print(error)"
     )

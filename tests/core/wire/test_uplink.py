@@ -22,7 +22,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.wire.spool import Purpose, Spool
-from gausslite.wire.uplink_values import UplinkSettings
+from gausslite.wire.update_sender import UplinkSettings
 
 
 def test_the_latest_update_of_each_voxel_arrives() -> None:

@@ -23,8 +23,7 @@ from gausslite.domain.errors import (
     StorageError,
     UnavailableError,
 )
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc

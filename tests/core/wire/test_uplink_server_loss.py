@@ -14,8 +14,8 @@ from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import back_up, restore
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
 
 QUICK = UplinkSettings(interval_s=0.02, first_backoff_s=0.05, check_interval_s=0.1)
 

@@ -14,25 +14,20 @@ from google.protobuf.message import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gausslite.codec.json import graph_as_json, graph_from_json
 from gausslite.codec.subset_codec import DEFAULT_LIMITS, encode_subset
-from gausslite.codec.task_json import graph_as_json, graph_from_json
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, TaskError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import Frame, image_size
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.image_bytes import image_size
-from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.pose import require_rigid
+from gausslite.domain.pose import Twist, require_rigid
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TargetRole, TaskGraph
-from gausslite.domain.trajectory import Twist
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.mission.live_frame import correct_live_frame
+from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelBatch, VoxelGrid
+from gausslite.mission.runner import correct_live_frame
 from gausslite.v1 import agent_service_pb2, gaussians_pb2, geometry_pb2, task_pb2
 from gausslite.wire import convert, convert_task
 from gausslite.wire.clients import is_done
-from gausslite.wire.images import decode_colour, encode_colour, encode_depth
+from gausslite.wire.convert import decode_colour, encode_colour, encode_depth
 
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
 GRAPH = TaskGraph(

@@ -15,17 +15,17 @@ from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.load import LoadSettings, QueuePolicy
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.status import Outcome
+from gausslite_agent.settings import LoadSettings, QueuePolicy
+from gausslite_agent.state import Outcome
 
 
 def test_a_full_queue_drops_and_reports_the_oldest_frame() -> None:

@@ -19,32 +19,31 @@ import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server
 from tiny_yolo import write_tiny_yolo
 
-from gausslite.codec.map_history import read_map_history
 from gausslite.codec.ply import read_ply
+from gausslite.codec.run_files import read_map_history
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError, StorageError, TaskError
 from gausslite.domain.frame import Frame
-from gausslite.domain.region import BallRegion, Region
-from gausslite.domain.trajectory import Trajectory
+from gausslite.domain.pose import Trajectory
+from gausslite.domain.relevance import BallRegion, Region
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.mission.frame_stream import FrameStream
+from gausslite.mission.runner import FrameStream
+from gausslite.mission.schedule import read_timeline
 from gausslite.mission.settings import SourceSettings
-from gausslite.mission.timeline import read_timeline
 from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
 from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
 from gausslite.wire.clients import AgentClient, FusionClient
-from gausslite.wire.process import run_service
-from gausslite.wire.server import serve_until_stopped
+from gausslite.wire.server import run_service, serve_until_stopped
 from gausslite.wire.spool import Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.agent_mission import AgentMission
-from gausslite_agent.keyframe_upload import KeyframeUpload
+from gausslite_agent.background import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.mission_state import MissionState
+from gausslite_agent.mission import AgentMission
 from gausslite_agent.settings import AgentSettings, parse_arguments
+from gausslite_agent.state import MissionState
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 

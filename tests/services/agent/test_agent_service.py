@@ -12,8 +12,7 @@ import pytest
 from agent_running import TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -23,10 +22,9 @@ from gausslite.domain.errors import (
     TaskError,
 )
 from gausslite.domain.frame import Frame
-from gausslite.domain.lens import Lens, LensModel
-from gausslite.domain.region import BallRegion
+from gausslite.domain.pose import Twist
+from gausslite.domain.relevance import BallRegion
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.trajectory import Twist
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.perception.detector import RegionDetector
@@ -36,8 +34,8 @@ from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire import convert, convert_task
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
 from gausslite_agent.mapping_worker import MappingWorker
 
 

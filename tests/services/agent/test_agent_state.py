@@ -19,21 +19,20 @@ from gausslite.codec.ply import read_ply
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import MapFileError, MismatchError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.region import BallRegion
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.relevance import BallRegion
+from gausslite.domain.voxels import VoxelBatch, group_by_voxel
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Purpose, Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.agent_mission import AgentMission
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.mission_checkpoint import MissionCheckpoint, SavedMission
+from gausslite_agent.mission import AgentMission
 from gausslite_agent.program import run
 from gausslite_agent.settings import AgentIdentity, AgentSettings, parse_arguments
+from gausslite_agent.state import MissionCheckpoint, SavedMission
 
 MUG, TASK, LATER = BallRegion((0.0, 0.0, 1.2), 0.2), "Pick up the mug", "Find the chair"
 

@@ -13,16 +13,16 @@ from browser import open_browser
 from fusion_running import frame
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.region import BallRegion
+from gausslite.domain.relevance import BallRegion
 from gausslite.evaluation.metrics import psnr
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import TaskRelevanceEstimator
-from gausslite.view.live_page import live_page, own_address
 from gausslite.wire.clients import AgentClient
+from gausslite_view.pages import live_page, own_address
 
 pytest.importorskip("viser")
-from gausslite.view.agent_panel import AgentPanel
-from gausslite.view.open_page import open_page
+from gausslite_view.agent_panel import AgentPanel
+from gausslite_view.pages import open_page
 
 
 def assign(tab: Any, task: str) -> None:

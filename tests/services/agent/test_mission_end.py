@@ -21,10 +21,9 @@ from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
-from gausslite_agent.mission_end import EndRequest
-from gausslite_agent.mission_state import MissionState, MissionStateMachine
+from gausslite_agent.state import EndRequest, MissionState, MissionStateMachine
 
 
 @contextmanager

@@ -16,8 +16,8 @@ from gausslite.domain.errors import TaskError, UnavailableError
 from gausslite.domain.task import TaskGraph
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import ParserClient
-from gausslite_agent.parser_wait import WaitingParser
-from gausslite_parser.servicer import parser_service
+from gausslite_agent.program import WaitingParser
+from gausslite_parser.program import parser_service
 
 TASK = "Pick up the mug"
 

@@ -13,8 +13,8 @@ from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.uplink_values import UplinkSettings
 
 
 def test_a_team_is_watched_ended_refined_and_fetched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,10 +10,9 @@ from fusion_running import GRID, RunningServer, fusion_server, make_subset
 
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxels import AxisAlignedBox
-from gausslite.mapping.team_voxels import InsertedVoxels, insert_team_voxels
-from gausslite.optimize.splat_table import SplatTable
+from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch
+from gausslite.mapping.splat_table import SplatTable
+from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
 from gausslite.wire.clients import FusionClient
 from gausslite_agent.team_map import TeamMapFollower
 

@@ -17,7 +17,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.storage_probe import StorageProbe
+from gausslite.fusion.traffic import StorageProbe
 from gausslite.wire.clients import FusionClient
 
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING

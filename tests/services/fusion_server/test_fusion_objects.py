@@ -11,7 +11,7 @@ from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.convert_objects import object_to_message, report_to_message
+from gausslite.wire.convert_task import object_to_message, report_to_message
 
 GRAPH = TaskGraph("t", "Pick up the mug", ("mug",), (), ())
 MUG = ObjectLandmark(

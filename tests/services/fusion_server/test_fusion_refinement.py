@@ -14,8 +14,8 @@ from gausslite.domain.errors import (
     MismatchError,
     QuotaError,
 )
-from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.refinement import RefineSettings
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
 

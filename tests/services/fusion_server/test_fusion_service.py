@@ -18,8 +18,7 @@ from gausslite.domain.errors import (
     SessionUnknownError,
     UnavailableError,
 )
-from gausslite.domain.voxel_batch import RoiSubset
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore

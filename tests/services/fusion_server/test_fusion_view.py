@@ -15,19 +15,16 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport
-from gausslite.domain.voxel_batch import RoiSubset, VoxelBatch
-from gausslite.domain.voxel_operations import group_by_voxel
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, group_by_voxel
 from gausslite.task.rules import RuleParser
-from gausslite.view.colours import ColourMode, legend_of
-from gausslite.view.live_page import live_page
-from gausslite.view.map_follower import FollowedMap, MapFollower
+from gausslite_view.contents import ColourMode, FollowedMap, MapFollower, legend_of
+from gausslite_view.pages import live_page
 
 pytest.importorskip("viser")
-from gausslite.view.fusion_panel import FusionPanel
-from gausslite.view.open_page import open_page
 from gausslite.wire.clients import FusionClient
-from gausslite.wire.convert import frame_to_message
-from gausslite.wire.images import encode_mask
+from gausslite.wire.convert import encode_mask, frame_to_message
+from gausslite_view.fusion_panel import FusionPanel
+from gausslite_view.pages import open_page
 
 WAIT_S = 60.0
 

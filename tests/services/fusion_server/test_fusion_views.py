@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
 
-from gausslite.codec.free_space import encode_free_space
+from gausslite.codec.stored import encode_free_space
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MismatchError, PoseError, QuotaError
 from gausslite.domain.free_space import FreeSpace, block_grid
 from gausslite.domain.pose import transform_of
-from gausslite.domain.voxel_operations import empty_batch
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.voxels import VoxelGrid, empty_batch
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
 

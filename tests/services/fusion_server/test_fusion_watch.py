@@ -8,12 +8,12 @@ from collections.abc import AsyncIterator, Callable
 from fusion_running import GRID, keys, make_subset
 
 from gausslite.codec.subset_codec import decode_subset
-from gausslite.domain.voxel_batch import VoxelBatch
+from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.joint_refinement import RefineSettings
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.mission_config import MissionConfig
+from gausslite.fusion.refinement import RefineSettings
+from gausslite.fusion.store import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock

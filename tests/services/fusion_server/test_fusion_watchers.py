@@ -12,9 +12,7 @@ from fusion_running import GRID, fusion_server, keys, make_subset
 from gausslite.domain.errors import (
     RevisionGoneError,
 )
-from gausslite.domain.voxel_batch import VoxelBatch
-from gausslite.domain.voxel_operations import empty_batch
-from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, empty_batch
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import MapUpdate
 

@@ -18,7 +18,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import ParserClient
 from gausslite.wire.server import start_server
-from gausslite_parser.servicer import parser_service
+from gausslite_parser.program import parser_service
 
 
 class FailingParser:
@@ -125,7 +125,7 @@ def test_an_address_without_a_service_is_connection_refused(address: str) -> Non
 
 
 def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> None:
-    from gausslite.cli.health_check import main
+    from gausslite.cli.team import main
 
     with serving([parser_service(RuleParser())]) as server:
         assert main([server.address]) == 0

@@ -12,15 +12,33 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Protocol, cast, runtime_checkable
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int64
+from numpy import ndarray
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import logsigmoid, normalize
 
-from gausslite.domain.camera import Camera
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import KernelError
-from gausslite.render.rasterizer import TILE_PX
-from gausslite.render.reference.compositing import Limits, render_images, render_images_backward
-from gausslite.render.reference.projection import Ellipses
+from gausslite.render.rasterizer import (
+    GRAD_2D_COUNT,
+    GRAD_2D_SUM,
+    LOG_SCALE,
+    MAX_UPDATE_COUNT,
+    MEAN,
+    NEAR_M,
+    OPACITY_LOGIT,
+    QUAT,
+    RGB,
+    TILE_PX,
+    UPDATE_COUNT,
+    AdamSettings,
+    UpdateCounter,
+)
+from gausslite.render.reference import Limits, render_images, render_images_backward
+from gausslite.render.reference_projection import LOW_PASS_PX2, MIN_ALPHA, Ellipses, ImageMotion, determinants
 
 GSPLAT_LIMITS = Limits(max_alpha=0.999, blends_last_splat=False)
 """gsplat clamps alpha at 0.999 and skips the splat that would take the transmittance to 1e-4."""
@@ -228,3 +246,220 @@ class _Composite(torch.autograd.Function):
         inverse_order = torch.argsort(ellipses.row_ids)
         columns = (d_means_px, d_conics, d_opacities, d_channels)
         return (*(column[inverse_order].float() for column in columns), None, None, None, None)
+
+
+_COUNTER_BATCH = 8
+"""Number of steps per update of the counters: each update waits for the device."""
+
+
+def to_device(array: NDArray[Any], device: torch.device) -> Tensor:
+    """Copy the array to the device; read-only arrays, which torch cannot share, are copied on the host first."""
+    writable = array if array.flags.writeable and array.flags.c_contiguous else array.copy(order="C")
+    return torch.from_numpy(writable).to(device)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HostTables:
+    """The three arrays of the caller."""
+
+    rows: Float32[ndarray, "n 16"]
+    first_moment: Float32[ndarray, "n 16"]
+    second_moment: Float32[ndarray, "n 16"]
+
+    @property
+    def arrays(self) -> tuple[ndarray, ndarray, ndarray]:
+        """The three arrays."""
+        return self.rows, self.first_moment, self.second_moment
+
+    def same_memory_as(self, other: HostTables) -> bool:
+        """Return True if all three arrays have the same addresses and shapes."""
+        return all(
+            a.ctypes.data == b.ctypes.data and a.shape == b.shape
+            for a, b in zip(self.arrays, other.arrays, strict=True)
+        )
+
+
+class DeviceTables:
+    """Copies of the three tables on a device; `write_back` copies them to the host arrays."""
+
+    def __init__(self, host: HostTables, device: torch.device) -> None:
+        self.host = host
+        # copy=True: a tensor on the CPU would share the memory of the caller
+        self.rows, self.first_moment, self.second_moment = (
+            torch.from_numpy(array).to(device, copy=True) for array in host.arrays
+        )
+        self._pending_counts: list[tuple[Int64[Tensor, " m"], UpdateCounter]] = []
+
+    def write_back(self) -> None:
+        """Write counters and tables back to the host arrays."""
+        self._flush_counts()
+        for array, tensor in zip(self.host.arrays, (self.rows, self.first_moment, self.second_moment), strict=True):
+            torch.from_numpy(array).copy_(tensor)
+
+    def count(self, row_ids: Int64[Tensor, " m"], update_counter: UpdateCounter) -> None:
+        """Count an update of these rows; the counter changes at the latest in `write_back`."""
+        self._pending_counts.append((row_ids, update_counter))
+        if len(self._pending_counts) == _COUNTER_BATCH:
+            self._flush_counts()
+
+    def _flush_counts(self) -> None:
+        for row_ids, update_counter in self._pending_counts:
+            rows = row_ids.cpu().numpy()
+            update_counter.counts[rows if update_counter.mask is None else rows[update_counter.mask[rows]]] += 1
+        self._pending_counts.clear()
+
+    @torch.no_grad()
+    def update(
+        self,
+        row_ids: Int64[Tensor, " m"],
+        gradients: Float32[Tensor, "m 16"],
+        mean_2d_grad_norm: Float32[Tensor, " m"],
+        adam: AdamSettings,
+    ) -> None:
+        """Apply sparse Adam (Kingma and Ba 2015) to these rows and add their density statistics.
+
+        The bias correction uses each row's own number of updates.
+        """
+        first = self.first_moment[row_ids]
+        second = self.second_moment[row_ids]
+        rows = self.rows[row_ids]
+        columns = slice(0, UPDATE_COUNT)
+        gradient = gradients[:, columns]
+        first[:, columns].lerp_(gradient, 1.0 - adam.beta1)
+        second[:, columns].mul_(adam.beta2).addcmul_(gradient, gradient, value=1.0 - adam.beta2)
+        updates = (rows[:, UPDATE_COUNT, None] + 1.0).clamp(max=MAX_UPDATE_COUNT)
+        rate_decay = (adam.decay_after_updates / updates).clamp(max=1.0).sqrt()
+        rates = to_device(adam.row_rates()[columns], rows.device)
+        first_unbiased = first[:, columns] / (1.0 - adam.beta1**updates)
+        second_unbiased = second[:, columns] / (1.0 - adam.beta2**updates)
+        rows[:, columns] -= rate_decay * rates * first_unbiased / (second_unbiased.sqrt() + adam.epsilon)
+        rows[:, UPDATE_COUNT] += 1.0
+        first[:, GRAD_2D_SUM] += mean_2d_grad_norm
+        first[:, GRAD_2D_COUNT] += 1.0
+        self.rows[row_ids], self.first_moment[row_ids], self.second_moment[row_ids] = rows, first, second
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeviceCamera:
+    """A camera on the device, with the principal point at the image centre; shift_px: from there to the real one.
+
+    gsplat clamps the tangent around the optical axis, the interface around the centre of the image. They agree with the
+    principal point at the centre; shift_px is added to the projected means.
+    """
+
+    size: tuple[int, int]
+    intrinsics: Float32[Tensor, "3 3"]
+    shift_px: Float32[Tensor, "2"]
+    half_size_px: Float32[Tensor, "2"]
+    motion: ImageMotion | None
+
+    @classmethod
+    def of(cls, camera: Camera, device: torch.device, motion: CameraMotion | None = None) -> DeviceCamera:
+        """Return the device form of this camera and its motion."""
+        middle_px = np.array([camera.width_px, camera.height_px]) / 2.0
+        intrinsics = [[camera.fx_px, 0.0, middle_px[0]], [0.0, camera.fy_px, middle_px[1]], [0.0, 0.0, 1.0]]
+        shift_px = np.array([camera.cx_px, camera.cy_px]) - middle_px
+        return cls(
+            (camera.width_px, camera.height_px),
+            torch.tensor(intrinsics, dtype=torch.float32, device=device),
+            torch.tensor(shift_px, dtype=torch.float32, device=device),
+            torch.tensor(middle_px, dtype=torch.float32, device=device),
+            ImageMotion.of(camera, motion, torch.float32, device),
+        )
+
+
+def project(
+    kernels: Kernels, rows: Float32[Tensor, "m 16"], device_camera: DeviceCamera, T_camera_world: Float32[Tensor, "4 4"]
+) -> Footprints:
+    """Return the footprints of these rows in the whole image, in the same order."""
+    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    points_m, motion = _rotate(rows[:, MEAN], R) + t, device_camera.motion
+    order_m = points_m[:, 2].detach()
+    if motion is not None:
+        points_m, s_per_row = motion.expose(points_m)
+    covariances_m2 = kernels.covariances(_unit(rows[:, QUAT]), rows[:, LOG_SCALE].exp())
+    # R Σ Rᵀ by two rotations of its rows: much faster than a batch of small products
+    rotated_m2 = _rotate(_rotate(covariances_m2, R).transpose(1, 2), R)
+    means_px, covariances_px2 = kernels.project(points_m, rotated_m2, device_camera.intrinsics, device_camera.size)
+    variance_x, variance_y = covariances_px2[:, 0, 0], covariances_px2[:, 1, 1]
+    covariance = 0.5 * (covariances_px2[:, 0, 1] + covariances_px2[:, 1, 0])
+    # a sigmoid whose derivative is precise near 1
+    opacities = logsigmoid(rows[:, OPACITY_LOGIT]).exp()
+    if motion is None:
+        variance_x, variance_y = variance_x + LOW_PASS_PX2, variance_y + LOW_PASS_PX2
+    else:
+        velocity = motion.image_velocity(points_m)
+        variance_x, covariance, variance_y = motion.shear((variance_x, covariance, variance_y), velocity, s_per_row)
+        sharp = variance_x + LOW_PASS_PX2, covariance, variance_y + LOW_PASS_PX2
+        (variance_x, covariance, variance_y), peak = motion.blur(sharp, velocity)
+        opacities = opacities * peak
+    determinant = determinants((variance_x, covariance, variance_y))
+    # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
+    reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
+    return Footprints(
+        means_px=means_px + device_camera.shift_px,
+        conics=torch.stack([variance_y, -covariance, variance_x], dim=1) / determinant[:, None],
+        opacities=opacities,
+        channels=torch.cat([rows[:, RGB], points_m[:, 2:]], dim=1),
+        order_m=order_m,
+        radius_px=torch.sqrt(reach[:, None] * torch.stack([variance_x, variance_y], dim=1).detach()),
+    )
+
+
+@torch.no_grad()
+def visible_rows(
+    kernels: Kernels,
+    rows: Float32[Tensor, "n 16"],
+    device_camera: DeviceCamera,
+    T_camera_world: Float32[Tensor, "4 4"],
+    ids: Int64[Tensor, " k"] | None,
+    tiles: Bool[ndarray, "th tw"] | None,
+) -> Int64[Tensor, " m"]:
+    """Return the numbers of the rows (of `ids`) whose ellipse can touch a pixel of `tiles`, ascending.
+
+    All candidates are projected and the invalid ones removed at the end, so that the host waits for one number only.
+    """
+    candidates = rows if ids is None else rows[ids]
+    is_valid = torch.isfinite(candidates[:, :UPDATE_COUNT]).all(dim=1) & (candidates[:, QUAT] != 0).any(dim=1)
+    is_valid &= candidates[:, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3] >= NEAR_M
+    footprints = project(kernels, candidates, device_camera, T_camera_world)
+    boxes_px = torch.cat([footprints.means_px, footprints.radius_px], dim=1)
+    is_valid &= torch.isfinite(footprints.conics).all(dim=1) & torch.isfinite(boxes_px).all(dim=1)
+    is_valid &= (footprints.opacities > MIN_ALPHA) & (footprints.channels[:, 3] >= NEAR_M)
+    boxes_px = torch.where(is_valid[:, None], boxes_px, 0.0)
+    chosen = torch.nonzero(is_valid & _touches(boxes_px[:, :2], boxes_px[:, 2:], device_camera, tiles))[:, 0]
+    return chosen if ids is None else ids[chosen]
+
+
+def _unit(quats_wxyz: Float32[Tensor, "m 4"]) -> Float32[Tensor, "m 4"]:
+    """Return unit quaternions, for any length but zero; scales first, so that no square overflows."""
+    scaled = quats_wxyz / quats_wxyz.detach().abs().amax(dim=1, keepdim=True)
+    return normalize(scaled, dim=1)
+
+
+def _touches(
+    means_px: Float32[Tensor, "m 2"],
+    radius_px: Float32[Tensor, "m 2"],
+    device_camera: DeviceCamera,
+    tiles: Bool[ndarray, "th tw"] | None,
+) -> Bool[Tensor, " m"]:
+    """Return True where the bounding box contains a pixel centre of the tiles (None: of the image)."""
+    last = 2.0 * device_camera.half_size_px - 1.0
+    low = torch.ceil(means_px - radius_px - 0.5).clamp(min=0.0)
+    high = torch.minimum(torch.floor(means_px + radius_px - 0.5), last)
+    hit = (low <= high).all(dim=1)
+    if tiles is None:
+        return hit
+    # number of rendered tiles in the box, from four corners of a summed-area table
+    table = to_device(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))), means_px.device)
+    x0, y0 = (torch.minimum(low, last).long() // TILE_PX).unbind(dim=1)
+    x1, y1 = (high.clamp(min=0.0).long() // TILE_PX + 1).unbind(dim=1)
+    return hit & (table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0)
+
+
+def _rotate(vectors: Tensor, R: Tensor) -> Tensor:
+    """Return vectors @ R.T of shape (..., 3), with a result for each vector that does not depend on the others.
+
+    A matrix product rounds by the number of rows and by the processor, which shows in thin splats.
+    """
+    return vectors[..., 0:1] * R[:, 0] + vectors[..., 1:2] * R[:, 1] + vectors[..., 2:3] * R[:, 2]

@@ -12,10 +12,8 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
-from gausslite.render.cuda.projection import DeviceCamera
-from gausslite.render.cuda.tables import to_device
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.render.cuda.kernels import DeviceCamera, to_device
 from gausslite.render.rasterizer import TILE_PX, LossWeights
 
 MIN_DEPTH_ALPHA = 0.5

@@ -12,21 +12,22 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt32
 from numpy import ndarray
 from torch import Tensor
 
-from gausslite.domain.camera import Camera
-from gausslite.domain.camera_motion import CameraMotion
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
-from gausslite.render.checks import (
-    require_image_gradients,
-    require_row_masks,
-    require_scene,
-    require_table,
-    require_tables,
-    require_view,
+from gausslite.render.cuda.kernels import (
+    DeviceCamera,
+    DeviceTables,
+    Footprints,
+    GsplatKernels,
+    HostTables,
+    Kernels,
+    TorchKernels,
+    load_gsplat,
+    project,
+    to_device,
+    visible_rows,
 )
-from gausslite.render.cuda.kernels import Footprints, GsplatKernels, Kernels, TorchKernels, load_gsplat
 from gausslite.render.cuda.loss import CudaView, Window, training_loss
-from gausslite.render.cuda.projection import DeviceCamera, project, visible_rows
-from gausslite.render.cuda.tables import DeviceTables, HostTables, to_device
 from gausslite.render.rasterizer import (
     FULL_FRAME,
     AdamSettings,
@@ -37,6 +38,12 @@ from gausslite.render.rasterizer import (
     Subset,
     TrainingView,
     UpdateCounter,
+    require_image_gradients,
+    require_row_masks,
+    require_scene,
+    require_table,
+    require_tables,
+    require_view,
 )
 
 

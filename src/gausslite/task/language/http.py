@@ -16,8 +16,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from gausslite.domain.errors import InvalidInputError, LanguageModelError
-from gausslite.task.language.model import MAX_ANSWER_BYTES, Message
-from gausslite.task.language.prompt import ANSWER_SCHEMA
+from gausslite.task.language.parsers import ANSWER_SCHEMA, MAX_ANSWER_BYTES, Message
 
 _MAX_ANSWER_TOKENS: Final = 1024
 

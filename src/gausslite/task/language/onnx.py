@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from gausslite.domain.errors import InvalidInputError, LanguageModelError, ModelFileError
-from gausslite.process.telemetry import disable_telemetry
-from gausslite.task.language.model import Message
-from gausslite.task.language.prompt import ANSWER_SCHEMA
+from gausslite.process import disable_telemetry
+from gausslite.task.language.parsers import ANSWER_SCHEMA, Message
 
 _CONFIG: Final = "genai_config.json"
 _MAX_CONFIG_BYTES: Final = 1 << 20

@@ -1,0 +1,339 @@
+"""Run one mission of the agent: map its frames, send the rest to the fusion server, write the results."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from concurrent.futures import Future
+from pathlib import Path
+
+from gausslite.codec.json import graph_as_json, noun_as_json, object_as_json
+from gausslite.domain.errors import GaussLiteError, MismatchError, StorageError
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.task import TaskGraph
+from gausslite.mission.checkpoint import ResumeConfig
+from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
+from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
+from gausslite.task.grounding import TaskParser
+from gausslite.wire.spool import Purpose
+from gausslite.wire.update_sender import UplinkCounters
+from gausslite.wire.uplink import Uplink
+from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.settings import AgentSettings
+from gausslite_agent.state import (
+    EndRequest,
+    FrameReport,
+    MissionCheckpoint,
+    MissionState,
+    MissionStateMachine,
+    MissionSummary,
+    WorkerStatus,
+)
+
+
+def mission_report(
+    agent_id: str, status: WorkerStatus, gaussians: Gaussians, uplink: UplinkCounters, seconds: float
+) -> dict[str, object]:
+    """Return the figures of a mission. map_shared_percent: share of the map in the task's region, if it was sent."""
+    graph, active = status.graph, int(gaussians.active.sum())
+    is_sent = uplink.subsets_sent > 0
+    return {
+        "agent_id": agent_id,
+        "task": "" if graph is None else graph.text,
+        "targets": [] if graph is None else list(graph.targets),
+        "task_graph": None if graph is None else graph_as_json(graph),
+        "frames": status.mapped,
+        "frames_skipped": status.skipped,
+        "frames_dropped": status.dropped,
+        "frames_rejected": status.rejected,
+        "frames_short": status.under_trained,
+        "frames_without_words": status.publishing_skipped,
+        "frames_without_seeding": status.seeding_skipped,
+        "iterations": status.iterations,
+        "idle_iterations": status.idle_iterations,
+        "max_detection_lag_frames": status.max_detection_lag,
+        "keyframes_reread": status.keyframes_reevaluated,
+        "hz": status.hz,
+        "frame_age_p50_s": status.age_s(50),
+        "frame_age_p99_s": status.age_s(99),
+        "seconds": seconds,
+        "gaussians": len(gaussians),
+        "active_gaussians": active,
+        "roi_share": status.roi_share,
+        "bytes_sent": uplink.roi_bytes,
+        "handover_bytes": uplink.handover_bytes,
+        "keyframe_bytes": uplink.keyframe_bytes,
+        "keyframes_sent": uplink.keyframes_sent,
+        "keyframes_waiting": uplink.keyframes_waiting,
+        "gaussians_sent": uplink.gaussians_sent,
+        "voxels_sent": uplink.voxels_sent,
+        "subsets_sent": uplink.subsets_sent,
+        "subsets_rejected": uplink.subsets_rejected,
+        "voxels_waiting": uplink.voxels_waiting,
+        "uplink_stopped_because": uplink.stopped_because,
+        "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
+        "peak_rss_mib": peak_rss_mib(),
+        "team_gaussians_inserted": status.team_gaussians,
+        "objects": [object_as_json(each) for each in status.objects],
+        "nouns": [noun_as_json(each) for each in status.nouns],
+        "notes": [*status.notes, *status.task_notes, *status.load_notes],
+    }
+
+
+_log = logging.getLogger(__name__)
+_INTERRUPTED = "interrupted"
+NO_DETECTOR = (
+    "this agent cannot find the objects of a task, because it has no detector; start it with --detector FILE.onnx"
+)
+
+
+class AgentMission:
+    """One mission after another, with one map. Its methods block and are thread-safe: call them on a thread."""
+
+    def __init__(
+        self,
+        settings: AgentSettings,
+        worker: MappingWorker,
+        parser: TaskParser,
+        resumed: MissionCheckpoint | None = None,
+        can_detect: bool = True,
+    ) -> None:
+        """Resumed: the checkpoint that the worker was restored from. can_detect: False if any task would fail."""
+        self.can_detect = can_detect
+        self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
+        self._state_machine = MissionStateMachine()
+        self._start_s = time.monotonic()
+        self._corrupt = CorruptFrames(_log.warning)
+        self._pending: Future[FrameReport] | None = None
+        # set while no source is replayed
+        self._replay_ended = threading.Event()
+        self._replay_ended.set()
+        self._stopping = threading.Event()
+        self._stop_deadline_s: float | None = None
+        self._ending = threading.Lock()
+        self._summary: MissionSummary | None = None
+
+    @property
+    def state(self) -> MissionState:
+        """The state of the mission."""
+        return self._state_machine.state
+
+    @property
+    def failure(self) -> str:
+        """The error that ended the mission; empty unless it failed."""
+        return self._state_machine.failure
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Messages for the operator about the mission itself."""
+        failed = (f"the mission failed: {self.failure}",) if self.failure else ()
+        return failed if self.can_detect else (*failed, NO_DETECTOR)
+
+    @property
+    def end_by_options(self) -> EndRequest:
+        """How the mission ends without a request: by the options of the command line."""
+        return EndRequest(self._settings.link.handover, self._settings.link.drain_s)
+
+    def stop(self, grace_s: float = 0.0) -> None:
+        """End the mission after the current frame; sending ends after `grace_s` seconds, also if it has begun."""
+        self._stop_deadline_s = time.monotonic() + grace_s
+        self._stopping.set()
+        if self._worker.uplink is not None:
+            self._worker.uplink.limit_drain(grace_s)
+
+    def assign(self, graph: TaskGraph) -> None:
+        """Assign a task; it begins the next mission if the last one has ended.
+
+        Raises MismatchError while a mission ends, ModelFileError and the like.
+        """
+        self._state_machine.require_accepting("task")
+        if not self.can_detect:
+            raise MismatchError(f"task: {NO_DETECTOR}")
+        self._worker.assign(graph).result()
+        self._begin()
+
+    def assign_task(self) -> None:
+        """Assign the task of the command line.
+
+        A resumed mission that was started with the same command-line task keeps its current task. Raises TaskError,
+        UnavailableError, ModelFileError.
+        """
+        resumed, task = self._resumed, self._settings.task
+        if resumed is not None:
+            _log.info("resuming %r after frame %d", resumed.graph.text, resumed.last_index)
+            self._begin()
+        if task is not None and (resumed is None or task != resumed.requested_task):
+            self.assign(self._parser.parse(task))
+
+    def submit(self, frame: Frame) -> Future[FrameReport]:
+        """Queue a frame and return the future of its report. Raises MismatchError unless the mission is mapping."""
+        self._state_machine.require_mapping()
+        return self._worker.submit(frame)
+
+    def run(self, stream: FrameStream) -> None:
+        """Assign the task, map every frame and end the mission. Raises the errors of the source, the disk and the task.
+
+        An error after the first mapped frame ends the mission early: the map so far is sent and written first.
+        """
+        self._start_s = time.monotonic()
+        try:
+            self.assign_task()
+            failure = self._replay(stream)
+        except GaussLiteError as error:
+            self._state_machine.enter(MissionState.FAILED, str(error))
+            raise
+        if failure is None and self._worker.status().mapped == 0:
+            failure = self._corrupt.first_error
+        if failure is None or self._worker.status().mapped > 0:
+            self._end(self.end_by_options, None if failure is None else str(failure))
+        if failure is not None:
+            raise failure
+
+    def end(self, request: EndRequest) -> MissionSummary:
+        """End the mission and return what was sent and left. A later call waits and returns the same.
+
+        Raises MismatchError before the first task, StorageError if the results cannot be written; the mission is FAILED
+        then and can be ended again.
+        """
+        if self._state_machine.state is MissionState.WAITING_FOR_TASK:
+            raise MismatchError("mission: expected a task first, got none yet; call AssignTask")
+        self._stopping.set()
+        self._replay_ended.wait()
+        return self._end(request, None)
+
+    def finish(self) -> None:
+        """End the mission because the process ends; one without a task has nothing to send or write."""
+        self._stopping.set()
+        self._replay_ended.wait()
+        if self._state_machine.state is not MissionState.WAITING_FOR_TASK:
+            self._end(self.end_by_options, None)
+
+    def describe_lost_data(self) -> str:
+        """Return what is lost when the process ends now, because no file keeps it; empty if nothing is."""
+        uplink = self._worker.uplink
+        if uplink is None or self._settings.link.spool is not None:
+            return ""
+        left = uplink.counters()
+        if not (left.voxels_waiting or left.keyframes_waiting):
+            return ""
+        return (
+            f"lost {left.voxels_waiting} voxels and {left.keyframes_waiting} keyframes that were not sent; "
+            "--set spool=FILE keeps them until the next start"
+        )
+
+    def save(self) -> float:
+        """Save the mission after the current frame if there is a file for it; returns the seconds that it took.
+
+        Raises StorageError.
+        """
+        settings = self._settings
+        if settings.state is None:
+            return 0.0
+        config = ResumeConfig.of(*settings.fixed_settings)
+        return self._worker.save(settings.state, config, settings.task or "").result()
+
+    def save_if_mapping(self) -> float:
+        """Do the same, unless the mission is not mapping now."""
+        return self.save() if self._state_machine.state is MissionState.MAPPING else 0.0
+
+    def _begin(self) -> None:
+        if self._state_machine.state is not MissionState.MAPPING:
+            self._summary = None
+            self._state_machine.enter(MissionState.MAPPING)
+
+    def _replay(self, stream: FrameStream) -> GaussLiteError | None:
+        """Map the frames of the stream, and return the error that ended it early."""
+        self._replay_ended.clear()
+        try:
+            last_index = -1 if self._resumed is None else self._resumed.last_index
+            frames = stream.after(last_index).frames(None if self._settings.strict else self._corrupt)
+            result = MissionRunner(self._submit, should_stop=self._stopping.is_set).run(frames, last_index)
+            self._wait_for_pending()
+        except GaussLiteError as error:
+            return error
+        finally:
+            self._replay_ended.set()
+        return result.stopped_by if isinstance(result.stopped_by, GaussLiteError) else None
+
+    def _submit(self, frame: Frame) -> None:
+        """Wait for the frame before, then queue this one, so that one frame is read while another is mapped."""
+        self._wait_for_pending()
+        if not self._stopping.is_set():
+            self._pending = self._worker.submit(frame)
+
+    def _wait_for_pending(self) -> None:
+        pending, self._pending = self._pending, None
+        if pending is None:
+            return
+        report = pending.result()
+        if report.reason:
+            _log.info("frame %d %s: %s", report.index, report.outcome.value, report.reason)
+
+    def _end(self, request: EndRequest, ended_by: str | None) -> MissionSummary:
+        """End the mission once; ended_by: the error that ended it early."""
+        with self._ending:
+            if self._summary is not None:
+                return self._summary
+            # from here on frames are refused; those in the queue are still mapped
+            self._state_machine.enter(MissionState.DRAINING)
+            try:
+                summary = self._send_and_write(request, ended_by)
+            except GaussLiteError as error:
+                self._state_machine.enter(MissionState.FAILED, str(error))
+                raise
+            _log.log(logging.INFO if summary.is_complete else logging.WARNING, "%s", summary.line())
+            self._stopping.clear()
+            self._summary = summary
+            self._state_machine.enter(MissionState.ENDED)
+            return summary
+
+    def _send_and_write(self, request: EndRequest, ended_by: str | None) -> MissionSummary:
+        self._worker.end_idle_training().result()
+        # first, because sending and writing can take minutes that a robot may not have
+        self.save()
+        if self._worker.uplink is not None:
+            self._send_all(self._worker.uplink, request)
+        if ended_by is None and (self._settings.source is not None or self._stop_deadline_s is not None):
+            ended_by = _INTERRUPTED if self._stopping.is_set() else None
+        gaussians = self._worker.run(lambda mapper: mapper.gaussians()).result()
+        status, uplink = self._worker.status(), self._worker.uplink
+        for note in status.task_notes:
+            _log.warning("%s", note)
+        counters = None if uplink is None else uplink.counters()
+        if self._settings.out is not None and status.mapped > 0:
+            self._write_results(self._settings.out, gaussians, counters or UplinkCounters(), ended_by)
+        spool = self._settings.link.spool
+        return MissionSummary(status.mapped, status.hz, len(gaussians), ended_by, counters, spool)
+
+    def _write_results(
+        self, folder: Path, gaussians: Gaussians, counters: UplinkCounters, ended_by: str | None
+    ) -> None:
+        seconds = time.monotonic() - self._start_s
+        report = {
+            **mission_report(self._settings.agent_id, self._worker.status(), gaussians, counters, seconds),
+            "frames_corrupt": self._corrupt.count,
+            "memory_mib": self._worker.run(lambda mapper: mapper.memory_mib()).result(),
+            "stopped_by": ended_by,
+            "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
+        }
+        write_results(folder, gaussians, report, self._settings.link.uplink.world_frame)
+        self._worker.run(lambda mapper: write_poses(folder, mapper.poses)).result()
+        self._worker.run(lambda mapper: write_keyframes(folder, mapper.keyframes())).result()
+        self._worker.write_history(folder).result()
+
+    def _send_all(self, uplink: Uplink, request: EndRequest) -> None:
+        """Send the rest of the region and the keyframes and, for a handover, the rest of the map, within one time."""
+        deadline_s = time.monotonic() + request.drain_s
+        drained = uplink.drain(request.drain_s)
+        # without a file, more data would only delay the region's, and would be lost
+        if not request.handover or not (drained or self._settings.link.spool):
+            return
+        self._state_machine.enter(MissionState.HANDING_OVER)
+        try:
+            self._worker.select_keyframes().result()
+            uplink.enqueue(self._worker.handover_batch().result(), Purpose.HANDOVER)
+        except StorageError as error:
+            _log.warning("handover: %s", error)
+        uplink.drain(deadline_s - time.monotonic())

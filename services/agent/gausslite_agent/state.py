@@ -1,0 +1,361 @@
+"""Save and read an agent's mission: the mapping run, its task and its map revision."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, MapFileError, MismatchError
+from gausslite.domain.objects import NounReport, ObjectLandmark
+from gausslite.domain.pose import PoseCorrection
+from gausslite.domain.state import State, encode_text, get_array, get_counts, get_text, int_array
+from gausslite.domain.task import TaskGraph
+from gausslite.mapping.training import SkippableStage
+from gausslite.mission.checkpoint import SavedRun
+from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.v1 import task_pb2
+from gausslite.wire.convert_task import graph_from_message, graph_to_message
+from gausslite.wire.update_sender import UplinkCounters
+
+
+@dataclass(frozen=True, slots=True)
+class MissionCheckpoint:
+    """A mission at the time it was saved.
+
+    last_index: index of its last frame; graph: its task; requested_task: the task of the command line; map_revision:
+    the latest revision that was sent to watchers.
+    """
+
+    last_index: int
+    graph: TaskGraph
+    requested_task: str
+    map_revision: int
+
+    def state(self) -> State:
+        """Return the arrays that are saved with the mapping run."""
+        data = graph_to_message(self.graph).SerializeToString()
+        return {
+            "graph": np.frombuffer(data, np.uint8),
+            "requested_task": encode_text(self.requested_task),
+            "map_revision": int_array(self.map_revision),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class SavedMission:
+    """A mission read from a file. It is as large as the map and its keyframes; release it after `restore`."""
+
+    run: SavedRun
+    checkpoint: MissionCheckpoint
+
+    @classmethod
+    def read(cls, path: Path, *settings: Any) -> SavedMission:
+        """Read a saved mission.
+
+        Raises MapFileError if the file is not one, MismatchError if it was saved with other settings.
+        """
+        run = SavedRun.read(path)
+        run.require(*settings)
+        try:
+            data = get_array(run.extra, "graph", (None,), np.uint8).tobytes()
+            graph = graph_from_message(task_pb2.TaskGraph.FromString(data))
+            [map_revision] = get_counts(run.extra, "map_revision", 1)
+            requested_task = get_text(run.extra, "requested_task")
+        except (GaussLiteError, DecodeError) as error:
+            raise MapFileError(f"{path}: expected the state of an agent's mission: {error}") from error
+        return cls(run, MissionCheckpoint(run.last_index, graph, requested_task, map_revision))
+
+
+MAX_DRAIN_S = 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class EndRequest:
+    """handover: also send the rest of the map; drain_s: the longest time for sending."""
+
+    handover: bool
+    drain_s: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.drain_s) and 0 <= self.drain_s <= MAX_DRAIN_S):
+            raise InvalidInputError(f"drain_seconds: expected 0 to {MAX_DRAIN_S:.0f}, got {self.drain_s}")
+
+
+@dataclass(frozen=True, slots=True)
+class MissionSummary:
+    """The figures of a mission that has ended.
+
+    ended_by: why it ended early, None after its regular end. uplink: None without a fusion server. spool: file of the
+    data that was left, None if it is in memory.
+    """
+
+    frames: int
+    hz: float
+    gaussians: int
+    ended_by: str | None
+    uplink: UplinkCounters | None
+    spool: Path | None
+
+    @property
+    def is_complete(self) -> bool:
+        """True if the server has acknowledged everything."""
+        uplink = self.uplink
+        return uplink is None or (uplink.voxels_waiting == 0 and uplink.keyframes_waiting == 0)
+
+    def line(self) -> str:
+        """Return one line for the operator: what was mapped, what was sent, what was left and where it is."""
+        ending = "ended" if self.ended_by is None else f"ended early ({self.ended_by})"
+        mapped = f"mission {ending}: {self.frames} frames at {self.hz:.2f} Hz, {self.gaussians} Gaussians"
+        uplink = self.uplink
+        if uplink is None:
+            return mapped
+        sent = (
+            f"{uplink.voxels_sent} voxels of the task's region in {uplink.roi_bytes} bytes, "
+            f"{uplink.keyframes_sent} keyframes in {uplink.keyframe_bytes} bytes, "
+            f"a handover of {uplink.handover_bytes} bytes"
+        )
+        return f"{mapped}; sent {sent}; {self._left(uplink)}"
+
+    def _left(self, uplink: UplinkCounters) -> str:
+        if self.is_complete:
+            return "nothing was left"
+        stays = f"in {self.spool} until the agent runs again" if self.spool is not None else "lost when the agent ends"
+        return f"left {uplink.voxels_waiting} voxels and {uplink.keyframes_waiting} keyframes, {stays}"
+
+
+class MissionState(Enum):
+    """State of a mission.
+
+    DRAINING sends the pending updates of the task's region and the pending keyframes, HANDING_OVER the rest of the map.
+    """
+
+    WAITING_FOR_TASK = "waiting for task"
+    MAPPING = "mapping"
+    DRAINING = "draining"
+    HANDING_OVER = "handing over"
+    ENDED = "ended"
+    FAILED = "failed"
+
+
+_ENDING = frozenset({MissionState.DRAINING, MissionState.HANDING_OVER})
+_FOLLOWING = {
+    MissionState.WAITING_FOR_TASK: {MissionState.MAPPING, MissionState.FAILED},
+    MissionState.MAPPING: {MissionState.DRAINING, MissionState.FAILED},
+    MissionState.DRAINING: {MissionState.HANDING_OVER, MissionState.ENDED, MissionState.FAILED},
+    MissionState.HANDING_OVER: {MissionState.ENDED, MissionState.FAILED},
+    MissionState.ENDED: {MissionState.MAPPING},
+    MissionState.FAILED: {MissionState.MAPPING, MissionState.DRAINING},
+}
+
+
+class MissionStateMachine:
+    """The current state of the mission. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._state = MissionState.WAITING_FOR_TASK
+        self._failure = ""
+        self._lock = threading.Lock()
+
+    @property
+    def state(self) -> MissionState:
+        """The current state."""
+        with self._lock:
+            return self._state
+
+    @property
+    def failure(self) -> str:
+        """The error that ended the mission; empty unless FAILED."""
+        with self._lock:
+            return self._failure
+
+    def enter(self, state: MissionState, failure: str = "") -> None:
+        """Enter this state. Raises MismatchError if it cannot follow the current one; failure: the error of FAILED."""
+        with self._lock:
+            if state not in _FOLLOWING[self._state]:
+                raise MismatchError(f"mission: expected a state that can follow {self._state.value}, got {state.value}")
+            self._state, self._failure = state, failure
+
+    def require_accepting(self, what: str) -> None:
+        """Raise MismatchError while the mission ends; what: the data that it would have accepted."""
+        with self._lock:
+            if self._state in _ENDING:
+                raise MismatchError(f"{what}: expected a mission that accepts it, got one that is {self._state.value}")
+
+    def require_mapping(self) -> None:
+        """Raise MismatchError if frames cannot be mapped now."""
+        with self._lock:
+            if self._state is not MissionState.MAPPING:
+                raise MismatchError(
+                    f"frames: expected a mission that is mapping, got one that is {self._state.value}; call AssignTask"
+                )
+
+
+_AGES_KEPT = 1000
+
+
+class Outcome(Enum):
+    """Result of a frame."""
+
+    MAPPED = "mapped"
+    SKIPPED = "skipped"
+    DROPPED = "dropped"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameReport:
+    """The outcome of one frame; reason: why it was not mapped.
+
+    seconds: its processing time; age_s: time from its arrival until it was mapped, including its wait in the queue.
+    """
+
+    index: int
+    outcome: Outcome
+    reason: str = ""
+    iterations: int = 0
+    gaussians: int = 0
+    roi_share: float = 0.0
+    seconds: float = 0.0
+    age_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerStatus:
+    """Totals since the start of the agent.
+
+    busy_s: time of perception and mapping. under_trained, publishing_skipped, seeding_skipped: frames whose time was
+    too short for all of it. max_detection_lag: longest delay of a detection, in frames. keyframes_reevaluated:
+    keyframes evaluated for a new task. publish_error: why the uplink refused the newest changes. ages_s: ages of the
+    latest mapped frames. correction: the odometry's latest correction, mapped at corrected_at_s of the monotonic clock.
+    notes: messages of the relevance estimator. objects: the confirmed objects of the task. nouns: what is searched for
+    each noun, and what was detected. team_gaussians: Gaussians inserted from the fused map.
+    """
+
+    graph: TaskGraph | None = None
+    map_revision: int = 0
+    gaussians: int = 0
+    mapped: int = 0
+    skipped: int = 0
+    dropped: int = 0
+    rejected: int = 0
+    iterations: int = 0
+    busy_s: float = 0.0
+    roi_share_sum: float = 0.0
+    idle_iterations: int = 0
+    under_trained: int = 0
+    publishing_skipped: int = 0
+    seeding_skipped: int = 0
+    max_detection_lag: int = 0
+    keyframes_reevaluated: int = 0
+    publish_error: str = ""
+    ages_s: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
+    correction: PoseCorrection | None = None
+    corrected_at_s: float = 0.0
+    objects: tuple[ObjectLandmark, ...] = ()
+    nouns: tuple[NounReport, ...] = ()
+    team_gaussians: int = 0
+
+    @property
+    def noun_notes(self) -> tuple[str, ...]:
+        """One line for each noun that is searched: its class, detections and best score."""
+        return tuple(each.describe() for each in self.nouns if each.match.is_searched)
+
+    @property
+    def task_notes(self) -> tuple[str, ...]:
+        """One line if no frame has shown the task's region."""
+        if self.mapped == 0 or self.graph is None or self.roi_share_sum > 0:
+            return ()
+        return (f"the task's targets were not found in {self.mapped} frames: {', '.join(self.graph.targets)}",)
+
+    @property
+    def load_notes(self) -> tuple[str, ...]:
+        """One line for each kind of work that was dropped for lack of time or space."""
+        counts = (
+            (self.dropped, "frames were dropped"),
+            (self.under_trained, "frames trained fewer iterations than min-iterations"),
+            (self.publishing_skipped, "frames published their changes with a later frame"),
+            (self.seeding_skipped, "frames were not seeded"),
+        )
+        overload = tuple(f"overload: {count} {effect}" for count, effect in counts if count)
+        return (*overload, f"changes are not published: {self.publish_error}") if self.publish_error else overload
+
+    @property
+    def hz(self) -> float:
+        """Mapped frames per second of perception and mapping."""
+        return self.mapped / self.busy_s if self.busy_s > 0 else 0.0
+
+    @property
+    def roi_share(self) -> float:
+        """Mean share of the pixels in the task's region."""
+        return self.roi_share_sum / max(self.mapped, 1)
+
+    def age_s(self, percent: float) -> float:
+        """Return the percentile of the latest frames' ages; 0 before the first."""
+        return float(np.percentile(self.ages_s, percent)) if self.ages_s else 0.0
+
+    def with_report(self, report: FrameReport) -> WorkerStatus:
+        """Return the totals with one more frame."""
+        if report.outcome is not Outcome.MAPPED:
+            return replace(self, **{report.outcome.value: getattr(self, report.outcome.value) + 1})
+        return replace(
+            self,
+            mapped=self.mapped + 1,
+            gaussians=report.gaussians,
+            iterations=self.iterations + report.iterations,
+            busy_s=self.busy_s + report.seconds,
+            roi_share_sum=self.roi_share_sum + report.roi_share,
+            ages_s=(*self.ages_s[1 - _AGES_KEPT :], report.age_s),
+        )
+
+    def with_outcome(self, outcome: FrameOutcome) -> WorkerStatus:
+        """Return the totals with the skipped stages, detections and keyframes of one mapped frame."""
+        skipped = outcome.timing.skipped_stages
+        return replace(
+            self,
+            under_trained=self.under_trained + outcome.timing.under_trained,
+            publishing_skipped=self.publishing_skipped + (SkippableStage.PUBLISHING in skipped),
+            seeding_skipped=self.seeding_skipped + (SkippableStage.SEEDING in skipped),
+            max_detection_lag=max(self.max_detection_lag, outcome.detection_lag_frames or 0),
+            keyframes_reevaluated=self.keyframes_reevaluated + outcome.reevaluation.keyframes,
+        )
+
+
+class StatusHolder:
+    """The current WorkerStatus, for the worker and for the readers on other threads."""
+
+    def __init__(self, status: WorkerStatus) -> None:
+        self._status = status
+        self._lock = threading.Lock()
+
+    def get(self) -> WorkerStatus:
+        """Return the current status."""
+        with self._lock:
+            return self._status
+
+    def update(self, **changes: Any) -> None:
+        """Replace these fields."""
+        with self._lock:
+            self._status = replace(self._status, **changes)
+
+    def add_report(self, report: FrameReport, map_revision: int) -> None:
+        """Count one frame."""
+        with self._lock:
+            self._status = replace(self._status.with_report(report), map_revision=map_revision)
+
+    def add_outcome(self, outcome: FrameOutcome) -> None:
+        """Count what one mapped frame skipped, detected and re-evaluated."""
+        with self._lock:
+            self._status = self._status.with_outcome(outcome)
+
+    def add_idle_iteration(self) -> None:
+        """Count one idle iteration."""
+        with self._lock:
+            self._status = replace(self._status, idle_iterations=self._status.idle_iterations + 1)

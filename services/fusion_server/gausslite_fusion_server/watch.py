@@ -1,0 +1,120 @@
+"""Read a layer of the fused map and its changes for a watcher, tile by tile, without holding the map for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.voxels import (
+    TILE_VOXELS,
+    AxisAlignedBox,
+    VoxelBatch,
+    VoxelGrid,
+    crop_to_box,
+    merge_batches,
+    tombstones,
+)
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fused_map import MapLayer, WonVoxels
+from gausslite.v1.gaussians_pb2 import Provenance
+from gausslite.wire.map_changes import EncodedPart, EncodedPartCache, Parts, encode_parts
+
+_SENDER = "fusion-server"
+"""The agent id inside the subset bytes of fused voxels; readers use the provenance instead."""
+
+
+@dataclass(frozen=True, slots=True)
+class WatchedPart:
+    """What a watcher wants: a layer, the part in a region, without the voxels that one agent wins."""
+
+    layer: MapLayer
+    region: AxisAlignedBox | None = None
+    exclude_agent: str = ""
+
+    def __post_init__(self) -> None:
+        if self.exclude_agent and self.layer is MapLayer.REFINED:
+            raise InvalidInputError("exclude_agent_id: expected none with REFINED, whose voxels belong to everyone")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusedMapReader:
+    """Reads what one watcher wants; a tile is read when its block is due. The cache is that of all watchers."""
+
+    engine: FusionEngine
+    watched: WatchedPart
+    cache: EncodedPartCache
+
+    def snapshot(self) -> tuple[int, Parts]:
+        """Return the current revision and the tiles of the layer, each as it is when it is read."""
+        revision, tiles = self.engine.maps.tiles(self.watched.layer)
+        return revision, self._tiles(self._in_region(tiles))
+
+    def changes(self, since_revision: int) -> tuple[int, Parts]:
+        """Return the current revision and what changed since. Raises RevisionGoneError."""
+        if self.engine.maps.revision(self.watched.layer) == since_revision:
+            return since_revision, ()
+        changes = self.engine.maps.changes(since_revision, self.watched.layer)
+
+        def encode() -> tuple[EncodedPart, ...]:
+            won = self._select(self.watched, changes.won)
+            changed = np.union1d(changes.won.batch.keys, changes.removed)
+            if self.watched.region is not None:
+                changed = changed[self.watched.region.contains(self.engine.grid.centres_m(changed))]
+            return _encode(won, np.setdiff1d(changed, won.batch.keys), self.engine.grid)
+
+        return changes.revision, (self.cache.get((self.watched, since_revision, changes.revision), encode),)
+
+    def _tiles(self, tiles: np.ndarray) -> Iterator[tuple[EncodedPart, ...]]:
+        for tile in tiles.tolist():
+            yield self._tile(tile)
+
+    def _tile(self, tile: int) -> tuple[EncodedPart, ...]:
+        """Return a tile as it is now; a tile completely in the region is shared with other watchers."""
+        watched = self.watched
+        if watched.region is not None and _contains(watched.region, tile, self.engine.grid):
+            watched = WatchedPart(watched.layer, None, watched.exclude_agent)
+        # read before the tile: a change in between makes the kept tile newer than its revision, never older
+        revision = self.engine.maps.tile_revision(watched.layer, tile)
+
+        def encode() -> tuple[EncodedPart, ...]:
+            won = self._select(watched, self.engine.maps.tile(watched.layer, tile))
+            return _encode(won, np.zeros(0, np.int64), self.engine.grid)
+
+        return self.cache.get((watched, tile, revision), encode)
+
+    def _select(self, watched: WatchedPart, won: WonVoxels) -> WonVoxels:
+        if watched.exclude_agent:
+            won = won.without(watched.exclude_agent)
+        if watched.region is None:
+            return won
+        return WonVoxels(crop_to_box(won.batch, watched.region, self.engine.grid), won.keys_by_winner)
+
+    def _in_region(self, tiles: np.ndarray) -> np.ndarray:
+        grid, region = self.engine.grid, self.watched.region
+        if region is None:
+            return tiles
+        low_m = grid.indices(tiles) * grid.size_m
+        high_m = low_m + TILE_VOXELS * grid.size_m
+        touches = (low_m <= np.array(region.max_m)) & (high_m >= np.array(region.min_m))
+        return tiles[touches.all(axis=1)]
+
+
+def _encode(won: WonVoxels, removed: np.ndarray, grid: VoxelGrid) -> tuple[EncodedPart, ...]:
+    """Encode voxels and, as tombstones, the keys of empty ones; no part if there are none."""
+    agents = sorted(won.keys_by_winner)
+    winner_of = {key: index for index, name in enumerate(agents) for key in won.keys_by_winner[name]}
+
+    def provenance(part: VoxelBatch) -> Provenance:
+        if not agents:
+            return Provenance()
+        return Provenance(agent_ids=agents, winner=[winner_of.get(key, 0) for key in part.keys.tolist()])
+
+    return encode_parts(merge_batches(won.batch, tombstones(removed)), grid, _SENDER, provenance)
+
+
+def _contains(region: AxisAlignedBox, tile: int, grid: VoxelGrid) -> bool:
+    low_m = grid.indices(np.array([tile], np.int64)) * grid.size_m
+    return bool(region.contains(np.concatenate([low_m, low_m + TILE_VOXELS * grid.size_m]).astype(np.float32)).all())

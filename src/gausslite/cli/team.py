@@ -1,0 +1,357 @@
+"""The commands for a running team: status, objects, refine, fetch, evict, unban, end."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gausslite.cli.progress import progress_bar
+from gausslite.codec.json import object_as_json, object_from_json
+from gausslite.codec.state_file import write_atomic
+from gausslite.config.command_parser import CommandParser, bounded
+from gausslite.config.option import build
+from gausslite.config.program import add_flags
+from gausslite.config.values import read_path
+from gausslite.domain.checks import quote_name, require_identifier
+from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.domain.objects import ObjectReport, TeamObject
+from gausslite.domain.task import TaskGraph
+from gausslite.fusion.objects import find_objects
+from gausslite.mission.results import MAP_FILE, as_text, prepare_file, read_report
+from gausslite.process import print_message
+from gausslite.wire.channel import require_callable, require_serving
+from gausslite.wire.clients import AgentClient, Export, FusionClient, query_status
+from gausslite.wire.security import TlsFiles
+
+
+def add_address(parser: CommandParser, service: str) -> None:
+    """Add ADDRESS and the options of encrypted connections."""
+    parser.add_argument("address", metavar="HOST:PORT|unix:PATH", help=f"address of {service}")
+    add_flags(parser, TlsFiles)
+
+
+def add_json(parser: CommandParser) -> None:
+    """Add --json."""
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+
+
+def fusion_client(options: argparse.Namespace) -> FusionClient:
+    """Return a client of the fusion server at the address. Raises InvalidInputError."""
+    require_callable("address of the fusion server", options.address)
+    return FusionClient(options.address, tls=build(TlsFiles, options).read())
+
+
+def agent_client(options: argparse.Namespace) -> AgentClient:
+    """Return a client of the agent at the address. Raises InvalidInputError."""
+    require_callable("address of the agent", options.address)
+    return AgentClient(options.address, tls=build(TlsFiles, options).read())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return 0 if the service is SERVING, 1 with one line on stderr if not, 2 for wrong options."""
+    parser = CommandParser(prog="python -m gausslite.cli.team")
+    parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
+    add_flags(parser, TlsFiles)
+    options = parser.parse_args(arguments)
+    try:
+        require_serving(options.address, build(TlsFiles, options).read())
+    except InvalidInputError as error:
+        print_message(str(error))
+        return 2
+    except UnavailableError as error:
+        print_message(str(error))
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
+
+
+_MAX_DRAIN_S = 86_400.0
+
+
+def configure_end(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite end`."""
+    add_address(parser, "the agent")
+    parser.add_argument(
+        "--handover",
+        action="store_true",
+        help="also send the map outside the task's region (default: as the agent's option)",
+    )
+    parser.add_argument(
+        "--drain-timeout",
+        metavar="S",
+        type=bounded(float, 0, _MAX_DRAIN_S),
+        help="longest time for sending, in seconds (default: the agent's)",
+    )
+    parser.set_defaults(run=run_end, handover=None)
+
+
+def run_end(options: argparse.Namespace) -> int:
+    """End the mission and print what was sent and left. Returns 0 if nothing was left, 1 otherwise.
+
+    Raises MismatchError before the first task, UnavailableError.
+    """
+    with agent_client(options) as client:
+        response = client.end_mission(options.handover, options.drain_timeout)
+    print(response.summary)
+    return 1 if response.voxels_waiting or response.keyframes_waiting else 0
+
+
+def configure_evict(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite evict`."""
+    add_address(parser, "the fusion server")
+    parser.add_argument("agent", metavar="AGENT", help="id of the agent, as `gausslite status` prints it")
+    parser.add_argument("--ban", action="store_true", help="also refuse later joins under this id")
+    parser.set_defaults(run=run_evict)
+
+
+def run_evict(options: argparse.Namespace) -> int:
+    """End the agent's session, delete its data and print how much that was. Returns the exit code.
+
+    Raises InvalidInputError for an unknown agent, NotPermittedError unless the caller is an operator, UnavailableError.
+    """
+    require_identifier("AGENT", options.agent)
+    with fusion_client(options) as client:
+        voxels = client.evict(options.agent, options.ban)
+    print(f"{'banned' if options.ban else 'evicted'} {options.agent}: data of {voxels} voxels deleted")
+    return 0
+
+
+def configure_unban(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite unban`."""
+    add_address(parser, "the fusion server")
+    parser.add_argument("agent", metavar="AGENT", help="id of the banned agent, as `gausslite status` prints it")
+    parser.set_defaults(run=run_unban)
+
+
+def run_unban(options: argparse.Namespace) -> int:
+    """Lift the ban. Returns the exit code.
+
+    Raises InvalidInputError if the agent is not banned, NotPermittedError unless the caller is an operator,
+    UnavailableError.
+    """
+    require_identifier("AGENT", options.agent)
+    with fusion_client(options) as client:
+        client.unban(options.agent)
+    print(f"{options.agent} may join again")
+    return 0
+
+
+_STRATEGIES = ("vote", "refined", "concatenation")
+
+
+def configure_fetch(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite fetch`."""
+    add_address(parser, "the fusion server")
+    add = parser.add_argument
+    add("--out", metavar="FILE.ply", type=read_path, required=True, help="the file to write")
+    add(
+        "--strategy",
+        choices=_STRATEGIES,
+        default=_STRATEGIES[0],
+        help="the winner of each voxel, the latest refinement, or all agents' Gaussians (default: %(default)s)",
+    )
+    add("--agent", metavar="NAME", default="", help="only this agent's Gaussians (default: all agents')")
+    parser.set_defaults(run=run_fetch)
+
+
+def run_fetch(options: argparse.Namespace) -> int:
+    """Download the map. Returns the exit code. Raises MismatchError before the first refinement, UnavailableError."""
+    prepare_file(options.out, MAP_FILE)
+    with fusion_client(options) as client:
+        data = client.export(Export(options.strategy, options.agent))
+    write_atomic(options.out, data)
+    print(f"wrote {options.out}, {len(data)} bytes")
+    return 0
+
+
+_MAX_ITERATIONS, _MAX_SEED = 1_000_000, (1 << 63) - 1
+
+
+def configure_refine(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite refine`."""
+    add_address(parser, "the fusion server")
+    add = parser.add_argument
+    add(
+        "--iterations",
+        metavar="N",
+        type=bounded(int, 1, _MAX_ITERATIONS),
+        default=0,
+        help="training iterations (default: the server's)",
+    )
+    add(
+        "--seed",
+        metavar="N",
+        type=bounded(int, 0, _MAX_SEED),
+        default=0,
+        help="seed of the random views (default: %(default)s)",
+    )
+    add("--out", metavar="FILE.ply", type=read_path, help="also download the refined map to this file")
+    parser.set_defaults(run=run_refine)
+
+
+def run_refine(options: argparse.Namespace) -> int:
+    """Refine the map, and show the progress. Ctrl-C cancels the refinement. Returns the exit code.
+
+    Raises MismatchError without a map and keyframes, QuotaError while another refinement runs, UnavailableError.
+    """
+    if options.out is not None:
+        prepare_file(options.out, MAP_FILE)
+    gaussians = 0
+    with fusion_client(options) as client:
+        with progress_bar(options.iterations, "refine", "it") as bar:
+            for progress in client.refine(options.iterations, seed=options.seed):
+                bar.total, gaussians = progress.iterations, progress.gaussians
+                bar.set_postfix_str(f"loss {progress.loss:.4f}", refresh=False)
+                bar.update(progress.iteration - bar.n)
+        print(f"refined {gaussians} Gaussians")
+        if options.out is not None:
+            write_atomic(options.out, client.export(Export("refined")))
+            print(f"wrote {options.out}")
+    return 0
+
+
+_STATE_PREFIX = "AGENT_STATE_"
+
+
+def configure_status(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite status`."""
+    add_address(parser, "an agent or a fusion server")
+    add_json(parser)
+    parser.set_defaults(run=run_status)
+
+
+def run_status(options: argparse.Namespace) -> int:
+    """Print the status. Returns the exit code. Raises UnavailableError, InvalidInputError."""
+    status = query_status(options.address, build(TlsFiles, options).read())
+    if options.json:
+        print(json.dumps(status.values))
+    else:
+        print("\n".join((_agent_lines if status.is_agent else _fusion_lines)(status.values)))
+    return 0
+
+
+def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:
+    state = status["state"].removeprefix(_STATE_PREFIX).replace("_", " ").lower()
+    yield f"agent {status['agent_id']}: {state}"
+    if "graph" in status:
+        yield f"task       {status['graph']['text']}"
+    yield (
+        f"frames     {status['frames_mapped']} mapped at {status['hz']:.2f} Hz, {status['frames_skipped']} skipped, "
+        f"{status['frames_dropped']} dropped, {status['frames_rejected']} rejected"
+    )
+    roi_percent = 100 * status["roi_share"]
+    yield f"map        {status['gaussians']} Gaussians, {roi_percent:.1f} % of the pixels in the task's region"
+    if "uplink" in status:
+        yield from _uplink_lines(status["uplink"])
+    for note in status["notes"]:
+        yield f"note       {note}"
+
+
+def _uplink_lines(uplink: Mapping[str, Any]) -> Iterator[str]:
+    connection = "connected" if uplink["connected"] else uplink["stopped_because"] or "not connected"
+    yield (
+        f"uplink     {connection}; sent {uplink['voxels_sent']} voxels ({uplink['bytes_sent']} bytes) and "
+        f"{uplink['keyframes_sent']} keyframes ({uplink['keyframe_bytes']} bytes)"
+    )
+    yield f"waiting    {uplink['voxels_waiting']} voxels, {uplink['keyframes_waiting']} keyframes"
+
+
+def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
+    yield f"fusion server, mission {status['mission_id'] or '(no agent has joined yet)'}"
+    yield f"fused map  {status['fused_gaussians']} Gaussians in {status['fused_voxels']} voxels"
+    yield f"keyframes  {status['keyframes']}; {'refined' if status['refined'] else 'not refined yet'}"
+    for agent in status["agents"]:
+        yield (
+            f"{agent['agent_id']:10} {'joined' if agent['joined'] else 'absent'}; {agent['gaussians']} Gaussians, "
+            f"wins {agent['won_voxels']} of {agent['voxels']} voxels, {agent['keyframes']} keyframes; "
+            f"received {agent['roi_bytes']} bytes of the task's region, {agent['handover_bytes']} of handovers"
+        )
+    if status["banned_agents"]:
+        yield f"banned     {', '.join(status['banned_agents'])}"
+
+
+_NS_PER_S = 1e9
+
+
+def configure_objects(parser: CommandParser) -> None:
+    """Add the options of `gausslite objects`."""
+    add = parser.add_argument
+    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
+    add("noun", metavar="NOUN", nargs="?", default="", help='a noun phrase such as "mug" (default: all objects)')
+    add("--json", action="store_true", help="print JSON for scripts")
+    add_flags(parser, TlsFiles)
+    parser.set_defaults(run=run_objects)
+
+
+def run_objects(options: argparse.Namespace) -> int:
+    """Print the objects, the most confident first. Returns 0, or 1 if there is none."""
+    folder = Path(options.place)
+    objects = _read_folder(folder, options.noun) if folder.is_dir() else _query(options)
+    if options.json:
+        print(as_text({"objects": [_as_json(each) for each in objects]}))
+    else:
+        print("\n".join(_describe(each) for each in objects) or _no_object(options.noun))
+    return 0 if objects else 1
+
+
+def _no_object(noun: str) -> str:
+    return f"no object {quote_name(noun)}" if noun else "no object"
+
+
+def _query(options: argparse.Namespace) -> Sequence[TeamObject]:
+    # imported late, because the objects of a folder need no gRPC
+    from gausslite.wire.channel import require_callable
+    from gausslite.wire.clients import FusionClient
+
+    require_callable("a fusion server or the output folder of a run", options.place)
+    with FusionClient(options.place, tls=build(TlsFiles, options).read()) as client:
+        return client.query_objects(options.noun)
+
+
+def _read_folder(folder: Path, noun: str) -> Sequence[TeamObject]:
+    """Return the objects in report.json. Raises InvalidInputError, CodecError."""
+    report = read_report(folder)
+    values = report.get("objects")
+    if not isinstance(values, list):
+        raise InvalidInputError(f"{folder}: expected a report.json with objects, got none")
+    agent_id = str(report.get("agent_id") or folder.resolve().name)
+    targets = report.get("targets")
+    nouns = tuple(str(each) for each in targets) if isinstance(targets, list) else ()
+    graph = TaskGraph("", str(report.get("task") or ""), nouns, (), ())
+    return find_objects({agent_id: ObjectReport(graph, tuple(object_from_json(each) for each in values))}, {}, noun)
+
+
+def _as_json(team_object: TeamObject) -> dict[str, object]:
+    observers = [
+        {
+            "agent_id": each.agent_id,
+            "id": each.object_id,
+            "target": each.target,
+            "confidence": each.confidence,
+            "first_seen_ns": each.first_seen_ns,
+            "last_seen_ns": each.last_seen_ns,
+        }
+        for each in team_object.observers
+    ]
+    return {**object_as_json(team_object.landmark), "observers": observers}
+
+
+def _describe(team_object: TeamObject) -> str:
+    landmark = team_object.landmark
+    place = ", ".join(f"{value:.2f}" for value in landmark.centroid_m)
+    size = " x ".join(f"{value:.2f}" for value in landmark.size_m)
+    seen = "; ".join(
+        f"{each.agent_id} from {each.first_seen_ns / _NS_PER_S:.1f} s to {each.last_seen_ns / _NS_PER_S:.1f} s"
+        for each in team_object.observers
+    )
+    return (
+        f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({place}) m, size {size} m, "
+        f"confidence {landmark.confidence:.2f}, seen by {seen}"
+    )

@@ -1,0 +1,362 @@
+"""Read and resize colour and depth images; reject damaged files by name."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
+from numpy.typing import NDArray
+
+from gausslite.domain.camera import Camera, FileIntrinsics, Lens, LensModel
+from gausslite.domain.checks import require_size
+from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.frame import image_size
+
+_ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+_ENDING_WINDOW_BYTES = 64
+_MAX_IMAGE_PX = 1 << 26
+_PNG_START = 8
+
+
+@dataclass(frozen=True, slots=True)
+class DepthUnits:
+    """Units per metre of a 16-bit depth image, and the values that mark missing depth."""
+
+    per_metre: float
+    invalid: tuple[int, ...] = (0,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RgbdImage:
+    """A colour and a depth image of the same size, with the camera for this size.
+
+    recorded_rgb: the colour image before it was made smaller, see Frame.
+    """
+
+    rgb: UInt8[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    camera: Camera
+    recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
+
+
+def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:
+    """Return an 8-bit RGB image. Raises DatasetError with the file name."""
+    bgr = _decode(path, cv2.IMREAD_COLOR)
+    rgb: UInt8[ndarray, "h w 3"] = np.ascontiguousarray(bgr[..., ::-1])
+    return rgb
+
+
+def first_readable_size(paths: Iterable[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image that can be read. Raises the first error if none can."""
+    first_error: DatasetError | None = None
+    for path in paths:
+        try:
+            height, width = read_colour(path).shape[:2]
+        except DatasetError as error:
+            first_error = first_error or error
+        else:
+            return width, height
+    raise first_error or DatasetError("expected an image, got none")
+
+
+def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
+    """Return depth in metres, 0 if invalid, of a 16-bit image or of a .npy file of float32 in the same units.
+
+    Raises DatasetError with the file name.
+    """
+    if path.suffix == ".npy":
+        depth_m = (_read_npy(path) / np.float32(units.per_metre)).astype(np.float32, copy=False)
+        depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
+        return depth_m
+    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise DatasetError(f"{path}: expected a 16-bit image of one channel, got {raw.dtype} of shape {raw.shape}")
+    depth_m = raw.astype(np.float32) / np.float32(units.per_metre)
+    depth_m[np.isin(raw, units.invalid)] = 0.0
+    return depth_m
+
+
+def load_rgbd(
+    colour_path: Path, depth_path: Path, camera: Camera, units: DepthUnits, size: tuple[int, int] | None
+) -> RgbdImage:
+    """Return both images of a frame at (width, height), or at the camera's own size if None. Raises DatasetError."""
+    rgb, depth_m = read_colour(colour_path), read_depth(depth_path, units)
+    if rgb.shape[:2] != depth_m.shape:
+        raise DatasetError(f"{depth_path}: expected the size of {colour_path.name}, {_size(rgb)}, got {_size(depth_m)}")
+    if rgb.shape[:2] != (camera.height_px, camera.width_px):
+        expected = f"{camera.width_px}x{camera.height_px}"
+        raise DatasetError(f"{colour_path}: expected the camera's size {expected}, got {_size(rgb)}")
+    return resize_rgbd(RgbdImage(rgb, depth_m, camera), size)
+
+
+def resize_rgbd(image: RgbdImage, size: tuple[int, int] | None) -> RgbdImage:
+    """Resize an image to (width, height): colour by area, depth by nearest pixel (averages lie on no surface)."""
+    if size is not None:
+        require_size("size", size)
+    if size is None or size == (image.camera.width_px, image.camera.height_px):
+        return image
+    width, height = size
+    camera = image.camera.resized(width, height)
+    rgb = cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA)
+    recorded_rgb = image.rgb if width < image.camera.width_px else image.recorded_rgb
+    return RgbdImage(rgb, resize_depth(image.depth_m, size), camera, recorded_rgb)
+
+
+def resize_depth(depth_m: Float32[ndarray, "h w"], size: tuple[int, int]) -> Float32[ndarray, "ho wo"]:
+    """Return the depth image at (width, height) by nearest pixel."""
+    width, height = size
+    rows = ((np.arange(height) + 0.5) * (depth_m.shape[0] / height)).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * (depth_m.shape[1] / width)).astype(np.int64)
+    return np.ascontiguousarray(depth_m[np.ix_(rows, columns)])
+
+
+def _read_npy(path: Path) -> Float32[ndarray, "h w"]:
+    """Return a float32 image. Type, shape and size in the header are checked before memory is taken."""
+    try:
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: expected a depth image, got none") from None
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(f"{path}: expected a .npy file; {' '.join(str(error).split())[:120]}") from None
+    if not isinstance(mapped, np.ndarray) or mapped.dtype != np.float32 or mapped.ndim != 2:
+        got = f"{mapped.dtype} of shape {mapped.shape}" if isinstance(mapped, np.ndarray) else "an archive"
+        raise DatasetError(f"{path}: expected a float32 image of one channel, got {got}")
+    require_pixel_count(str(path), mapped.shape[1], mapped.shape[0])
+    return np.array(mapped)
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: expected an image, got none") from None
+    except OSError as error:
+        raise DatasetError(f"{path}: expected a readable image, got {type(error).__name__}") from None
+    return decode_image(str(path), data, path.suffix.lower(), flags)
+
+
+def decode_image(location: str, data: bytes, suffix: str, flags: int) -> NDArray[Any]:
+    """Return an encoded image as OpenCV decodes it with these flags; suffix: ".png", ".jpg", ".jpeg", or another.
+
+    Size and checksums are checked before memory is taken. Raises DatasetError with the location.
+    """
+    # decoders fill a truncated file with grey without an error, so check the end marker first
+    ending = _ENDINGS.get(suffix, b"")
+    if ending not in data[-_ENDING_WINDOW_BYTES:]:
+        raise DatasetError(f"{location}: expected a whole image file, got one cut short or of another format")
+    _require_undamaged(location, data, suffix)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise DatasetError(f"{location}: expected an image, got bytes that cannot be decoded")
+    return np.asarray(image)
+
+
+def _require_undamaged(location: str, data: bytes, suffix: str) -> None:
+    """Raise DatasetError for an image too large for memory, or a PNG with a wrong checksum, on which libpng prints."""
+    size_px = image_size(data)
+    if size_px is None:
+        raise DatasetError(f"{location}: expected a PNG or JPEG image, got another format")
+    require_pixel_count(location, *size_px)
+    position = _PNG_START if suffix == ".png" else len(data)
+    while position + 12 <= len(data):
+        end = position + 8 + int.from_bytes(data[position : position + 4], "big")
+        if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise DatasetError(f"{location}: expected an undamaged image, got one whose checksum is wrong")
+        position = end + 4
+
+
+def require_pixel_count(location: str, width_px: int, height_px: int) -> None:
+    """Raise DatasetError with the location for an empty image and for one that is too large for memory."""
+    if not (width_px > 0 and height_px > 0 and width_px * height_px <= _MAX_IMAGE_PX):
+        raise DatasetError(f"{location}: expected an image of 1 to {_MAX_IMAGE_PX} pixels, got {width_px}x{height_px}")
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def read_text(path: Path) -> str:
+    """Return the whole file without a byte-order mark. Raises DatasetError if it is missing or not text."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: expected a text file, got none") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: expected a readable text file, got {type(error).__name__}") from None
+
+
+def read_rows(path: Path) -> list[tuple[str, list[str]]]:
+    """Return the location ("FILE line 3") and the fields of each row, without blank rows and comments (#)."""
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        text = line.strip()
+        if text and not text.startswith("#"):
+            rows.append((f"{path} line {number}", text.split()))
+    return rows
+
+
+def parse_numbers(location: str, fields: list[str], count: int, meaning: str) -> list[float]:
+    """Return exactly `count` numbers, which may be NaN or infinite. Raises DatasetError with the location."""
+    if len(fields) != count:
+        raise DatasetError(f"{location}: expected {count} numbers ({meaning}), got {len(fields)}")
+    try:
+        return [float(field) for field in fields]
+    except ValueError as error:
+        raise DatasetError(f"{location}: expected {count} numbers ({meaning}); {error}") from None
+
+
+INTRINSICS_FILE = "camera-intrinsics.txt"
+CAMERA_FILE = "cam_params.json"
+CAMERA_INFO_FILES = ("camera_info.yaml", "camera_info.yml")
+COLMAP_FILE = "cameras.txt"
+
+
+def find_in_or_above(folder: Path, name: str) -> Path | None:
+    """Return the file of this name in the folder or in its parent, or None."""
+    return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)
+
+
+@dataclass(frozen=True, slots=True)
+class FolderCamera:
+    """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none."""
+
+    camera: Camera
+    units_per_metre: float | None = None
+    lens: Lens | None = None
+
+
+def read_folder_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera | None:
+    """Return the camera of a camera file in or above the folder; None without such a file.
+
+    Read in this order: cam_params.json (with depth units), camera_info.yaml (ROS), cameras.txt (COLMAP),
+    camera-intrinsics.txt (a matrix). Raises DatasetError.
+    """
+    readers: tuple[tuple[str, Callable[[Path], FolderCamera]], ...] = (
+        (CAMERA_FILE, read_json_camera),
+        *((name, read_camera_info) for name in CAMERA_INFO_FILES),
+        (COLMAP_FILE, read_colmap_camera),
+        (INTRINSICS_FILE, lambda path: FolderCamera(read_matrix(path).camera(str(path), width_px, height_px))),
+    )
+    for name, read in readers:
+        path = find_in_or_above(folder, name)
+        if path is not None:
+            return read(path)
+    return None
+
+
+def read_matrix(path: Path) -> FileIntrinsics:
+    """Return the intrinsics of a file with a 3x3 matrix K in three rows. Raises DatasetError."""
+    rows = read_rows(path)
+    if len(rows) != 3:
+        raise DatasetError(f"{path}: expected the 3 rows of a camera matrix, got {len(rows)}")
+    K = np.array([parse_numbers(location, fields, 3, "a row of a camera matrix") for location, fields in rows])
+    zeros = (K[0, 1], K[1, 0], K[2, 0], K[2, 1])
+    if any(value != 0.0 for value in zeros) or K[2, 2] != 1.0:
+        raise DatasetError(f"{path}: expected rows fx 0 cx, 0 fy cy, 0 0 1, got {K.tolist()}")
+    return FileIntrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+
+
+def read_json_camera(path: Path) -> FolderCamera:
+    """Return the camera of {"camera": {"w","h","fx","fy","cx","cy","scale"}}, scale: depth units per metre.
+
+    "distortion_model" and "distortion" (a list) may state the lens. Raises DatasetError.
+    """
+    try:
+        fields = json.loads(read_text(path))["camera"]
+        numbers = {name: float(fields[name]) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
+        lens = lens_of(str(path), fields.get("distortion_model", "plumb_bob"), fields.get("distortion", ()))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
+        raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {error}") from None
+    if not (np.isfinite(numbers["scale"]) and numbers["scale"] > 0):
+        raise DatasetError(f"{path}: expected a positive depth scale, got {numbers['scale']}")
+    if not (np.isfinite(numbers["w"]) and np.isfinite(numbers["h"])):
+        raise DatasetError(f"{path}: expected a finite width and height, got {numbers['w']} and {numbers['h']}")
+    intrinsics = FileIntrinsics(numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"])
+    return FolderCamera(intrinsics.camera(str(path), int(numbers["w"]), int(numbers["h"])), numbers["scale"], lens)
+
+
+def read_camera_info(path: Path) -> FolderCamera:
+    """Return the camera of a ROS camera_info file (YAML): image_width, camera_matrix, distortion_coefficients.
+
+    Raises DatasetError.
+    """
+    import yaml
+
+    try:
+        fields = yaml.safe_load(read_text(path))
+        width, height = int(fields["image_width"]), int(fields["image_height"])
+        K = [float(value) for value in fields["camera_matrix"]["data"]]
+        lens = lens_of(
+            str(path), fields.get("distortion_model", "plumb_bob"), fields["distortion_coefficients"]["data"]
+        )
+        intrinsics = FileIntrinsics(K[0], K[4], K[2], K[5])
+    except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        expected = "image_width, image_height, camera_matrix and distortion_coefficients with data"
+        reason = " ".join(str(error).split())[:120]
+        raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {reason}") from None
+    return FolderCamera(intrinsics.camera(str(path), width, height), lens=lens)
+
+
+_COLMAP_LENSES: Mapping[str, Callable[[Sequence[float]], tuple[float, ...]]] = {
+    "SIMPLE_PINHOLE": lambda p: (p[0], p[0], p[1], p[2]),
+    "PINHOLE": lambda p: (p[0], p[1], p[2], p[3]),
+    "SIMPLE_RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0),
+    "RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0),
+    "OPENCV": lambda p: tuple(p[:8]),
+    "FULL_OPENCV": lambda p: tuple(p[:12]),
+    "OPENCV_FISHEYE": lambda p: tuple(p[:8]),
+}
+"""Parameters of COLMAP's camera models as fx fy cx cy and OpenCV's distortion coefficients."""
+
+
+def read_colmap_camera(path: Path) -> FolderCamera:
+    """Return the first camera of COLMAP's cameras.txt, whose principal point counts from the image corner.
+
+    Raises DatasetError.
+    """
+    location, fields = next(iter(read_rows(path)), (str(path), []))
+    model = fields[1] if len(fields) > 1 else ""
+    if model not in _COLMAP_LENSES:
+        raise DatasetError(
+            f"{location}: expected ID MODEL WIDTH HEIGHT PARAMETERS with a model of "
+            f"{', '.join(_COLMAP_LENSES)}, got {model[:30]!r}"
+        )
+    numbers = parse_numbers(location, fields[2:], len(fields) - 2, "a camera's size and parameters")
+    try:
+        fx, fy, cx, cy, *distortion = _COLMAP_LENSES[model](numbers[2:])
+    except (IndexError, ValueError):
+        raise DatasetError(f"{location}: expected more parameters for {model}, got {len(numbers) - 2}") from None
+    lens = lens_of(str(path), "equidistant" if model == "OPENCV_FISHEYE" else "plumb_bob", distortion)
+    camera = FileIntrinsics(fx, fy, cx - 0.5, cy - 0.5).camera(str(path), int(numbers[0]), int(numbers[1]))
+    return FolderCamera(camera, lens=lens)
+
+
+_LENS_MODELS = {
+    "plumb_bob": LensModel.RADTAN,
+    "rational_polynomial": LensModel.RADTAN,
+    "radtan": LensModel.RADTAN,
+    "equidistant": LensModel.FISHEYE,
+    "fisheye": LensModel.FISHEYE,
+}
+
+
+def lens_of(location: str, model: str, coefficients: Iterable[float]) -> Lens | None:
+    """Return the lens of these coefficients in OpenCV's order; None without distortion. Raises DatasetError."""
+    values = tuple(float(value) for value in coefficients)
+    if not any(values):
+        return None
+    if model not in _LENS_MODELS:
+        raise DatasetError(f"{location}: distortion_model: expected one of {', '.join(_LENS_MODELS)}, got {model!r}")
+    try:
+        return Lens(_LENS_MODELS[model], values)
+    except InvalidInputError as error:
+        raise DatasetError(f"{location}: {error}") from None

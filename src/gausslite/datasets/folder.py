@@ -1,0 +1,329 @@
+"""Bases of the readers of recorded sequences: what all folder layouts have in common."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+from numpy import ndarray
+
+from gausslite.datasets.files import DepthUnits, FolderCamera, load_rgbd, parse_numbers, read_rows
+from gausslite.datasets.regions import REGIONS_FILE, balls_for_small_objects, load_voxel_regions
+from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import Trajectory, UpAxis, require_rigid
+from gausslite.domain.relevance import Region
+
+_REPAIRABLE_DEVIATION = 0.05
+FIRST_VIEW_UP = (0.0, -1.0, 0.0)
+"""Upward direction of a world that a level first view defines."""
+
+
+def is_lost(numbers: Float64[ndarray, "..."]) -> bool:
+    """True if a tracker wrote no pose: no finite number, or only zeros."""
+    return not np.isfinite(numbers).any() or not numbers.any()
+
+
+def nearest_rigid(location: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+    """Return the pose with the nearest exact rotation, if its own is orthonormal up to rounding (|R Rᵀ - I| <= 0.05).
+
+    Raises PoseError with the location for NaN, infinity, a wrong last row, a reflection or a larger deviation.
+    """
+    if not np.isfinite(matrix).all():
+        bad = float(matrix[~np.isfinite(matrix)][0])
+        raise PoseError(f"{location}: expected a pose of finite numbers, got {bad}")
+    R = matrix[:3, :3]
+    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(R))
+    if deviation > _REPAIRABLE_DEVIATION or determinant <= 0:
+        raise PoseError(
+            f"{location}: expected a rigid pose (orthonormal rotation, determinant +1), "
+            f"got deviation {deviation:.3g} and determinant {determinant:.3g}"
+        )
+    U, _, Vt = np.linalg.svd(R)
+    T = matrix.copy()
+    T[:3, :3] = U @ Vt
+    require_rigid(location, T)
+    return T
+
+
+def pose_from_quaternion(
+    location: str, translation_m: Float64[ndarray, "3"], quat_xyzw: Float64[ndarray, "4"]
+) -> Float64[ndarray, "4 4"]:
+    """Return the transform of a translation and a quaternion near unit length. Raises PoseError with the location."""
+    if not (np.isfinite(translation_m).all() and np.isfinite(quat_xyzw).all()):
+        raise PoseError(f"{location}: expected a pose of finite numbers, got NaN or infinity")
+    length = float(np.linalg.norm(quat_xyzw))
+    if abs(length - 1.0) > _REPAIRABLE_DEVIATION:
+        raise PoseError(f"{location}: expected a quaternion of length 1, got length {length:.3g}")
+    x, y, z, w = quat_xyzw / length
+    T = np.eye(4)
+    T[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    T[:3, 3] = translation_m
+    return T
+
+
+def slerp(a: Float64[ndarray, "4"], b: Float64[ndarray, "4"], share: float) -> Float64[ndarray, "4"]:
+    """Return the spherical interpolation between two quaternions along the shorter arc; share is in [0, 1]."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    cosine = float(a @ b)
+    if cosine < 0.0:
+        b, cosine = -b, -cosine
+    angle = float(np.arccos(min(cosine, 1.0)))
+    if angle < 1e-6:
+        mixed = a + share * (b - a)
+    else:
+        mixed = (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
+    unit: Float64[ndarray, "4"] = mixed / np.linalg.norm(mixed)
+    return unit
+
+
+def estimate_up(
+    rotations_world_camera: Float64[ndarray, "n 3 3"], fallback: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Return the up direction for a camera without roll: perpendicular to the image rows of all views.
+
+    The camera's x axes then lie in the ground plane, and up is the direction of their smallest variance. Returns the
+    fallback if the views turn too little for the x axes to span a plane.
+    """
+    x_axes: Float[ndarray, "n 3"] = rotations_world_camera[:, :, 0]
+    variances, directions = np.linalg.eigh(x_axes.T @ x_axes / max(len(x_axes), 1))
+    if variances[1] < 0.05 or variances[1] < 5 * variances[0]:
+        return fallback
+    up = directions[:, 0]
+    if up @ rotations_world_camera[:, :, 1].mean(axis=0) > 0:
+        up = -up
+    return (float(up[0]), float(up[1]), float(up[2]))
+
+
+_RATE_HZ = 30
+
+
+class FolderSource:
+    """Name, camera, upward direction and regions of a sequence in a folder."""
+
+    _camera: Camera
+    _lens: Lens | None
+    _units: DepthUnits
+    _up_axis: UpAxis
+
+    def __init__(self, folder: Path) -> None:
+        """Subclasses also call `_set_camera` and set `_up_axis`."""
+        self._folder = folder
+
+    def _set_camera(self, found: FolderCamera, default_units: DepthUnits) -> None:
+        """Use this camera and its depth units, if it states them."""
+        self._camera, self._lens = found.camera, found.lens
+        self._units = replace(default_units, per_metre=found.units_per_metre or default_units.per_metre)
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self._folder.name
+
+    @property
+    def camera(self) -> Camera:
+        """Camera at the size of the recorded images."""
+        return self._camera
+
+    @property
+    def lens(self) -> Lens | None:
+        """Lens that is stated for the camera, else None."""
+        return self._lens
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """The layout's upward direction, unless the caller gives another."""
+        return self._up_axis
+
+    @property
+    def camera_ideal(self) -> bool:
+        """False: a recording may have any camera."""
+        return False
+
+    @property
+    def poses_exact(self) -> bool:
+        """False: the files do not state how the poses were found."""
+        return False
+
+    @property
+    def world_frame(self) -> str:
+        """Name of the recording, also where the folder is given as "."."""
+        return self.name or self._folder.resolve().name
+
+    @property
+    def regions_file(self) -> Path | None:
+        """roi_voxels.npz in the folder; None without it."""
+        path = self._folder / REGIONS_FILE
+        return path if path.is_file() else None
+
+    def regions(self) -> Mapping[str, Region]:
+        """Return the regions of roi_voxels.npz in the folder, small objects as balls; empty without the file."""
+        path = self.regions_file
+        return {} if path is None else balls_for_small_objects(load_voxel_regions(path))
+
+
+class NumberedFolderSource(FolderSource, ABC):
+    """A folder whose image files are numbered, with times at 30 Hz.
+
+    Frames without a pose are excluded if poses are required; otherwise they have the identity.
+    """
+
+    _colours: dict[int, Path]
+    _numbers: list[int]
+    _require_poses: bool
+
+    def _find_colours(self, folder: Path, paths: Iterable[Path], pattern: re.Pattern[str], expected: str) -> None:
+        """Find the colour images by their names. Raises DatasetError if there are none."""
+        matches = (pattern.fullmatch(path.name) for path in paths)
+        colours = {int(match.group(1)): folder / match.group(0) for match in matches if match}
+        require_frames(folder, len(colours), f"images named {expected}")
+        self._colours = dict(sorted(colours.items()))
+
+    def _select_frames(self, require_poses: bool) -> None:
+        """Exclude the frames without a pose if poses are required. Raises DatasetError if none is left."""
+        self._require_poses = require_poses
+        self._numbers = [number for number in self._colours if not require_poses or not self._is_lost(number)]
+        require_frames(self._folder, len(self._numbers), "frames with a pose")
+
+    @abstractmethod
+    def _depth_path(self, number: int) -> Path:
+        """Return the path of a frame's depth image."""
+
+    @abstractmethod
+    def _read_matrix(self, number: int) -> Float64[ndarray, "4 4"]:
+        """Return a frame's pose as its file states it. Raises DatasetError."""
+
+    @abstractmethod
+    def _pose_location(self, number: int) -> str:
+        """Return the file, or the file and row, of a frame's pose, for error messages."""
+
+    @property
+    def excluded_frames(self) -> str:
+        """Message on the frames without a pose."""
+        return excluded_frames_note(len(self._colours) - len(self._numbers), len(self._colours), "without a pose")
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """Return the frame at position i. Raises DatasetError, PoseError."""
+        require_position(self.name, i, len(self))
+        number = self._numbers[i]
+        T_world_camera = self._read_pose(number)
+        image = load_rgbd(self._colours[number], self._depth_path(number), self._camera, self._units, size)
+        return Frame(
+            number,
+            number * 10**9 // _RATE_HZ,
+            image.rgb,
+            image.depth_m,
+            image.camera,
+            T_world_camera,
+            recorded_rgb=image.recorded_rgb,
+        )
+
+    def indices(self) -> Sequence[int]:
+        """Return the numbers in the file names."""
+        return list(self._numbers)
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses at the frames' times."""
+        poses = [self._read_pose(number) for number in self._numbers]
+        return Trajectory(np.array(self._numbers) / _RATE_HZ, np.array(poses))
+
+    def _is_lost(self, number: int) -> bool:
+        try:
+            return is_lost(self._read_matrix(number)[:3])
+        except (DatasetError, PoseError):
+            return False  # `frame` reports a damaged pose if it is used
+
+    def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
+        if not self._require_poses and not self._has_pose(number):
+            return np.eye(4)
+        return nearest_rigid(self._pose_location(number), self._read_matrix(number))
+
+    def _has_pose(self, number: int) -> bool:
+        try:
+            return not is_lost(self._read_matrix(number)[:3])
+        except (DatasetError, PoseError):
+            return False
+
+
+_MEANING = "time tx ty tz qx qy qz qw"
+
+
+def format_pose_rows(title: str, times_ns: Int64[ndarray, " n"], T: Float64[ndarray, "n 4 4"]) -> str:
+    """Return the text of a pose file: the title as a comment, then times in seconds, metres and unit quaternions."""
+    rows = [f"# {title}: {_MEANING}"]
+    for time_ns, pose in zip(times_ns.tolist(), T, strict=True):
+        numbers = " ".join(f"{value:.9f}" for value in (*pose[:3, 3], *quat_xyzw(pose[:3, :3])))
+        rows.append(f"{time_ns / 1e9:.9f} {numbers}")
+    return "\n".join(rows) + "\n"
+
+
+def read_pose_rows(path: Path) -> tuple[Int64[ndarray, " n"], Float64[ndarray, "n 4 4"]]:
+    """Return times in nanoseconds, ascending, and poses of a pose file. Raises DatasetError, PoseError."""
+    times_ns, poses = [], []
+    for location, fields in read_rows(path):
+        row = np.array(parse_numbers(location, fields, 8, _MEANING))
+        if not np.isfinite(row[0]) or abs(row[0]) > 9e9:
+            raise DatasetError(f"{location}: expected a time in seconds, got {fields[0]}")
+        times_ns.append(round(float(row[0]) * 1e9))
+        poses.append(pose_from_quaternion(location, row[1:4], row[4:8]))
+    if not poses:
+        raise DatasetError(f"{path}: expected rows of {_MEANING}, got none")
+    order = np.argsort(times_ns, kind="stable")
+    return np.array(times_ns, np.int64)[order], np.array(poses)[order]
+
+
+def quat_xyzw(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
+    """Return the unit quaternion of a rotation, in the order x y z w."""
+    rotation_rad = cv2.Rodrigues(R)[0].ravel()
+    half = 0.5 * float(np.linalg.norm(rotation_rad))
+    # np.sinc(x / π) = sin(x) / x, 1 at 0
+    return np.append(0.5 * np.sinc(half / np.pi) * rotation_rad, np.cos(half))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseTrack:
+    """Poses T_parent_child at ascending times, with quaternions of about unit length in the order x y z w.
+
+    location: file or topic, for error messages. Between two poses at most max_gap_s apart, positions are interpolated
+    linearly and rotations by slerp. In longer gaps and outside, a pose within max_lag_s is used.
+    """
+
+    location: str
+    times_s: Float64[ndarray, " n"]
+    translations_m: Float64[ndarray, "n 3"]
+    quats_xyzw: Float64[ndarray, "n 4"]
+    max_gap_s: float
+    max_lag_s: float
+
+    def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
+        """Return the interpolated pose, or None if there is none near this time. Raises PoseError."""
+        times = self.times_s
+        after = int(np.searchsorted(times, time_s))
+        before, after = max(after - 1, 0), min(after, len(times) - 1)
+        gap_s = float(times[after] - times[before])
+        if before == after or gap_s > self.max_gap_s:
+            # trajectories of keyframes have poses far apart, each at the timestamp of its image
+            nearest = int(np.abs(times - time_s).argmin())
+            if abs(float(times[nearest]) - time_s) > self.max_lag_s:
+                return None
+            before, after, gap_s = nearest, nearest, 0.0
+        share = (time_s - float(times[before])) / gap_s if gap_s > 0 else 0.0
+        a_m, b_m = self.translations_m[before], self.translations_m[after]
+        quat_xyzw = slerp(self.quats_xyzw[before], self.quats_xyzw[after], share)
+        return pose_from_quaternion(self.location, a_m + share * (b_m - a_m), quat_xyzw)

@@ -1,1 +1,0 @@
-"""ROS messages and bags as frames: conversion of messages, transforms, choice of topics, bag files."""

@@ -1,0 +1,100 @@
+"""Check the types of arguments of the Python API: errors name the argument, what was expected and what was received."""
+
+from __future__ import annotations
+
+import numbers
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from gausslite.domain.errors import InvalidInputError, ShapeError
+
+
+def require_instance(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """Raise InvalidInputError unless the value has the type; expected: a description of the type, for the message."""
+    if not isinstance(value, kind):
+        raise InvalidInputError(f"{name}: expected {expected}, got {describe(value)}")
+
+
+def require_whole(name: str, value: object) -> None:
+    """Raise InvalidInputError unless the value is a whole number; True and False are not numbers."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise InvalidInputError(f"{name}: expected a whole number, got {describe(value)}")
+
+
+def require_number(name: str, value: object) -> None:
+    """Raise InvalidInputError unless the value is a real number; True and False are not numbers."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise InvalidInputError(f"{name}: expected a number, got {describe(value)}")
+
+
+def require_size(name: str, value: object) -> None:
+    """Raise InvalidInputError unless the value is (width, height), two whole numbers above 0."""
+    sides = value if isinstance(value, tuple | list) else ()
+    if len(sides) != 2 or not all(isinstance(side, numbers.Integral) and int(side) > 0 for side in sides):
+        raise InvalidInputError(
+            f"{name}: expected (width, height) in pixels as whole numbers such as (320, 240), got {describe(value)}"
+        )
+
+
+def describe(value: object) -> str:
+    """Return a short text of a value for messages: its type and the start of its text."""
+    text = repr(value)
+    return f"{type(value).__name__} {text if len(text) <= 40 else text[:37] + '...'}"
+
+
+def require_array(name: str, value: NDArray[Any], shape: tuple[int | None, ...], dtype: DTypeLike) -> None:
+    """Raise ShapeError unless `value` has this dtype and shape (None matches any length)."""
+    expected = np.dtype(dtype)
+    if not isinstance(value, np.ndarray) or value.dtype != expected:
+        received = getattr(value, "dtype", type(value).__name__)
+        raise ShapeError(f"{name}: expected an array of {expected}, got {received}")
+    if value.shape == shape:
+        return
+    matches = len(value.shape) == len(shape) and all(
+        length is None or length == actual for length, actual in zip(shape, value.shape, strict=True)
+    )
+    if not matches:
+        pattern = "(" + ", ".join("*" if length is None else str(length) for length in shape) + ")"
+        raise ShapeError(f"{name}: expected shape {pattern}, got {value.shape}")
+
+
+def require_finite(name: str, value: NDArray[Any]) -> None:
+    """Raise InvalidInputError if any element is NaN or infinite."""
+    if not np.isfinite(value).all():
+        bad = int(np.count_nonzero(~np.isfinite(value)))
+        raise InvalidInputError(f"{name}: expected finite values, got {bad} NaN or infinite")
+
+
+MAX_NAME_BYTES = 255
+MAX_IDENTIFIER_CHARACTERS = 64
+_IDENTIFIER = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_IDENTIFIER_CHARACTERS - 1}}}")
+_MAX_QUOTED_CHARACTERS = 64
+
+
+def require_name(field: str, name: str) -> None:
+    """Raise InvalidInputError unless the name is printable text of at most MAX_NAME_BYTES bytes; empty is allowed."""
+    try:
+        size = len(name.encode())
+    except UnicodeEncodeError:
+        raise InvalidInputError(f"{field}: expected UTF-8 text, got other bytes") from None
+    if size > MAX_NAME_BYTES:
+        raise InvalidInputError(f"{field}: expected at most {MAX_NAME_BYTES} bytes, got {size}")
+    if not name.isprintable():
+        raise InvalidInputError(f"{field}: expected no line breaks or control characters, got {quote_name(name)}")
+
+
+def require_identifier(field: str, name: str) -> None:
+    """Raise InvalidInputError unless the name is safe in logs, file names, labels and shells; empty is refused."""
+    if not _IDENTIFIER.fullmatch(name):
+        raise InvalidInputError(
+            f"{field}: expected 1 to {MAX_IDENTIFIER_CHARACTERS} letters, digits and . _ -, beginning with a letter or "
+            f"a digit, got {quote_name(name)}"
+        )
+
+
+def quote_name(name: str) -> str:
+    """Return the name quoted and shortened, for an error message."""
+    return repr(name if len(name) <= _MAX_QUOTED_CHARACTERS else f"{name[:_MAX_QUOTED_CHARACTERS]}…")

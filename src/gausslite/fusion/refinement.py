@@ -1,0 +1,282 @@
+"""Refine the fused map by a short joint optimisation on all agents' keyframes (Sec. III-E).
+
+The fused map usually holds only the task's voxels. So a keyframe is compared only with pixels that the map explains:
+inside the footprint of the fused map, and not where the measured surface occludes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.config.option import option
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import InvalidInputError, QuotaError
+from gausslite.domain.frame import without_depth_edges
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import inverse
+from gausslite.domain.relevance import NO_TARGET
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fused_map import MapLayer
+from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
+from gausslite.mapping.density import densify, prune
+from gausslite.mapping.settings import REFINE_RATES, DensitySettings
+from gausslite.mapping.splat_table import SplatTable
+from gausslite.render.choose import choose_rasterizer
+from gausslite.render.rasterizer import (
+    AdamSettings,
+    LossWeights,
+    Rasterizer,
+    StepReport,
+    TrainingView,
+    UpdateCounter,
+    gaussians_to_rows,
+)
+
+_FOOTPRINT_ALPHA = 0.5
+_OCCLUSION_M, _OCCLUSION_SHARE = 0.05, 0.05
+"""A measured surface occludes the map's if it is closer by this distance plus this share of the depth."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefineSettings:
+    """Length and limits of a refinement. The map may grow by the factor `headroom`, up to max_gaussians.
+
+    Depth within depth_edge_px of a depth jump is not trained. The loss is a mean over each view's footprint. All steps
+    are masked, unlike the mapper's. normalise_by_image gave 0.05 dB less.
+    """
+
+    iterations: int = option(
+        500,
+        "iterations of joint refinement if a request states none",
+        key="refine-iterations",
+        low=1,
+        high=MAX_REFINE_ITERATIONS,
+    )
+    headroom: float = 1.25
+    max_gaussians: int = 3_000_000
+    seed: int = 0
+    report_every: int = 10
+    max_prepared_views: int = 48
+    depth_edge_px: int = 2
+    loss: LossWeights = field(default_factory=LossWeights)
+    adam: AdamSettings = REFINE_RATES
+    density: DensitySettings = field(default_factory=DensitySettings)
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "max_gaussians", "report_every", "max_prepared_views"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"refine {name}: expected at least 1, got {getattr(self, name)}")
+        if not 1.0 <= self.headroom <= 10.0:
+            raise InvalidInputError(f"refine headroom: expected 1 to 10, got {self.headroom}")
+
+
+@dataclass(frozen=True, slots=True)
+class RefineProgress:
+    """The state of a refinement after `iteration` of `iterations`."""
+
+    iteration: int
+    iterations: int
+    loss: float
+    gaussians: int
+
+
+CreateRasterizer = Callable[[], Rasterizer]
+"""Creates the rasterizer of a refinement when it starts: a server without refinements needs no kernels."""
+
+
+def rasterizer_of_backend(name: str) -> CreateRasterizer:
+    """Return a function that creates the backend of this name, see `choose_rasterizer`."""
+    return partial(choose_rasterizer, name)
+
+
+ProgressCallback = Callable[[RefineProgress], bool]
+"""Called every report_every iterations and at the end; the refinement stops if it returns False."""
+
+
+def refine(
+    gaussians: Gaussians,
+    keyframes: Sequence[AgentKeyframe],
+    rasterizer: Rasterizer,
+    settings: RefineSettings,
+    report_progress: ProgressCallback,
+) -> Gaussians:
+    """Return the map after joint optimisation of every Gaussian; the partial result if stopped.
+
+    The Gaussians of the tasks' regions are active in the result: those that show a target.
+    Raises InvalidInputError if no keyframe shows the map, QuotaError if the map exceeds max_gaussians.
+    """
+    table = _fill_table(gaussians, settings)
+    views = _ViewPool(_refinement_views(table, keyframes, rasterizer), rasterizer, settings)
+    extent_m = _extent_m(gaussians)
+    rng = np.random.default_rng(settings.seed)
+    with ExitStack() as binding:
+        binding.enter_context(_bind_tables(table, rasterizer))
+        for iteration in range(1, settings.iterations + 1):
+            view, T_camera_world = views.draw(rng)
+            report = _train(table, view, T_camera_world, rasterizer, settings)
+            if _density_control_is_due(iteration, settings.density):
+                binding.close()
+                _control_density(table, iteration, settings, extent_m)
+                binding.enter_context(_bind_tables(table, rasterizer))
+            due = iteration % settings.report_every == 0 or iteration == settings.iterations
+            if due and not report_progress(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
+                break
+    refined = table.to_gaussians()
+    return replace(refined, active=refined.target != NO_TARGET)
+
+
+def _bind_tables(table: SplatTable, rasterizer: Rasterizer) -> AbstractContextManager[None]:
+    return rasterizer.bind_tables(table.rows, table.first_moment, table.second_moment)
+
+
+def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
+    count = len(gaussians)
+    if count == 0:
+        raise InvalidInputError("refine: expected a fused map with Gaussians, got an empty one")
+    if count > settings.max_gaussians:
+        raise QuotaError(f"refine: expected at most {settings.max_gaussians} Gaussians, got {count}")
+    table = SplatTable(min(int(np.ceil(count * settings.headroom)), settings.max_gaussians))
+    table.append(replace(gaussians, active=np.ones(count, np.bool_)))
+    return table
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _RefinementView:
+    """A keyframe with its pixel weights and camera pose."""
+
+    keyframe: AgentKeyframe
+    pixel_weights: Float32[ndarray, "h w"]
+    T_camera_world: Float64[ndarray, "4 4"]
+
+
+def _refinement_views(
+    table: SplatTable, keyframes: Sequence[AgentKeyframe], rasterizer: Rasterizer
+) -> list[_RefinementView]:
+    """Return the keyframes that show some of the map, with the weights of their pixels."""
+    views = []
+    for keyframe in keyframes:
+        frame = keyframe.frame
+        T_camera_world = inverse(frame.T_world_camera)
+        rendering = rasterizer.forward(table.rows, frame.camera, T_camera_world, motion=frame.motion)
+        surface_m = rendering.expected_depth_m(_FOOTPRINT_ALPHA)
+        occluded = (frame.depth_m > 0) & (frame.depth_m < surface_m * (1 - _OCCLUSION_SHARE) - _OCCLUSION_M)
+        pixel_weights = ((rendering.alpha > _FOOTPRINT_ALPHA) & ~occluded).astype(np.float32)
+        if keyframe.pixel_weights is not None:
+            pixel_weights *= keyframe.pixel_weights
+        if pixel_weights.any():
+            views.append(_RefinementView(keyframe, pixel_weights, T_camera_world))
+    if not views:
+        raise InvalidInputError(
+            f"refine: expected keyframes that show the fused map, got {len(keyframes)} but none does"
+        )
+    return views
+
+
+class _ViewPool:
+    """The views to draw from. Up to max_prepared_views stay prepared; the others are prepared at each use."""
+
+    def __init__(self, views: list[_RefinementView], rasterizer: Rasterizer, settings: RefineSettings) -> None:
+        self._views = views
+        self._rasterizer = rasterizer
+        self._max_prepared, self._depth_edge_px = settings.max_prepared_views, settings.depth_edge_px
+        self._prepared: dict[int, TrainingView] = {}
+
+    def draw(self, rng: np.random.Generator) -> tuple[TrainingView, Float64[ndarray, "4 4"]]:
+        """Draw a view uniformly from all agents' keyframes; returns it with its T_camera_world."""
+        index = int(rng.integers(len(self._views)))
+        chosen = self._views[index]
+        view = self._prepared.get(index)
+        if view is None:
+            frame = chosen.keyframe.frame
+            depth_m = without_depth_edges(frame.depth_m, self._depth_edge_px)
+            view = self._rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, chosen.pixel_weights, frame.motion)
+            if len(self._prepared) < self._max_prepared:
+                self._prepared[index] = view
+        return view, chosen.T_camera_world
+
+
+def _train(
+    table: SplatTable,
+    view: TrainingView,
+    T_camera_world: Float64[ndarray, "4 4"],
+    rasterizer: Rasterizer,
+    settings: RefineSettings,
+) -> StepReport:
+    return rasterizer.step(
+        table.rows,
+        table.first_moment,
+        table.second_moment,
+        view=view,
+        T_camera_world=T_camera_world,
+        loss=settings.loss,
+        adam=settings.adam,
+        masked=True,
+        update_counter=UpdateCounter(table.kappa),
+    )
+
+
+def _density_control_is_due(iteration: int, density: DensitySettings) -> bool:
+    return iteration % density.densify_every == 0 or iteration % density.prune_every == 0
+
+
+def _control_density(table: SplatTable, iteration: int, settings: RefineSettings, extent_m: float) -> None:
+    """Clone, split and prune as the mapper does, but never prune the whole map."""
+    if iteration % settings.density.densify_every == 0 and iteration < settings.iterations:
+        densify(table, settings.density, extent_m)
+    if iteration % settings.density.prune_every == 0 and (table.opacities >= settings.density.min_opacity).any():
+        prune(table, settings.density)
+
+
+def _extent_m(gaussians: Gaussians) -> float:
+    """Return the radius of the map about its centre without the farthest 5 %; at least 1 cm."""
+    distance_m = np.linalg.norm(gaussians.means_m - np.median(gaussians.means_m, axis=0), axis=1)
+    return max(0.01, float(np.quantile(distance_m, 0.95)))
+
+
+_MAX_VIEW_PX = 1920 * 1080
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayerView:
+    """A rendering of a map layer; depth is 0 where the map is not opaque. revision: of the rendered layer."""
+
+    rgb: UInt8[ndarray, "h w 3"]
+    depth_m: Float32[ndarray, "h w"]
+    revision: int
+
+
+class MapRenderer:
+    """Renders on one thread; the rasterizer is created with the first view, and the rows are kept per revision."""
+
+    def __init__(self, engine: FusionEngine, create_rasterizer: Callable[[], Rasterizer]) -> None:
+        self._engine, self._create_rasterizer = engine, create_rasterizer
+        self._rasterizer: Rasterizer | None = None
+        self._shown: tuple[MapLayer, int] | None = None
+        self._rows = np.zeros((0, 16), np.float32)
+
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer) -> LayerView:
+        """Return a view of a layer. Raises QuotaError above two megapixels, KernelError."""
+        pixels = camera.width_px * camera.height_px
+        if pixels > _MAX_VIEW_PX:
+            raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
+        revision = self._engine.maps.revision(layer)
+        if self._shown != (layer, revision):
+            self._rows = gaussians_to_rows(self._engine.maps.layer(layer).gaussians)
+            self._shown = layer, revision
+        size = camera.height_px, camera.width_px
+        rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
+        if len(self._rows):
+            if self._rasterizer is None:
+                self._rasterizer = self._create_rasterizer()
+            rendering = self._rasterizer.forward(self._rows, camera, inverse(T_world_camera))
+            rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
+            depth_m = rendering.expected_depth_m()
+        return LayerView(rgb, depth_m, revision)

@@ -1,0 +1,289 @@
+"""Check what an agent states about its updates: Σkappa is computed, kappa and sequence numbers are bounded."""
+
+from __future__ import annotations
+
+import heapq
+import struct
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from threading import Lock, RLock
+
+import numpy as np
+
+from gausslite.domain.checks import quote_name
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, slice_voxels
+from gausslite.fusion.limits import Quotas
+from gausslite.fusion.store import FusionStore, PutOutcome
+
+MAX_SEQ_STEP = 1 << 32
+"""An honest agent counts its messages; a larger step would let one message use up all later numbers."""
+RECORD = "first-joined"
+_JOINED = struct.Struct("<d")
+
+
+class UpdateChecks:
+    """Knows when each agent first joined. Not thread-safe; FusionEngine holds a lock.
+
+    The first joins persist with the store. clock_s: the time since the epoch in seconds.
+    """
+
+    def __init__(self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float] = time.time) -> None:
+        self._store, self._quotas, self._clock_s = store, quotas, clock_s
+        self._first_joined_s = {agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(RECORD).items()}
+
+    def record_join(self, agent_id: str) -> None:
+        """Note the agent's first join. Raises StorageError."""
+        if agent_id not in self._first_joined_s:
+            now_s = self._clock_s()
+            self._store.save_record(agent_id, RECORD, _JOINED.pack(now_s))
+            self._first_joined_s[agent_id] = now_s
+
+    def check(self, subset: RoiSubset) -> RoiSubset:
+        """Return the message with Σkappa computed from its Gaussians, whatever it declares.
+
+        Raises InvalidInputError for a sequence number too far above the stored ones, QuotaError for a kappa that no
+        robot can have reached yet: the bound grows with the time since its first join.
+        """
+        name, highest = quote_name(subset.agent_id), self._store.totals(subset.agent_id).highest_update_seq
+        if subset.update_seq > highest + MAX_SEQ_STEP:
+            raise InvalidInputError(
+                f"agent {name}: expected an update_seq of at most {highest + MAX_SEQ_STEP}, got {subset.update_seq}"
+            )
+        batch = subset.batch
+        largest, bound = int(batch.gaussians.kappa.max(initial=0)), self._kappa_bound(subset.agent_id)
+        if largest > bound:
+            raise QuotaError(
+                f"agent {name}: expected a kappa of at most {bound} this long after its first join, got {largest}"
+            )
+        return replace(subset, batch=with_computed_sums(batch))
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Delete what is known of the agent; the store deletes its records."""
+        self._first_joined_s.pop(agent_id, None)
+
+    def _kappa_bound(self, agent_id: str) -> int:
+        """Return the largest plausible kappa: the iterations before the first join, and those since then."""
+        now_s = self._clock_s()
+        elapsed_s = max(0.0, now_s - self._first_joined_s.get(agent_id, now_s))
+        return self._quotas.kappa_at_join + int(self._quotas.kappa_per_second * elapsed_s)
+
+
+def with_computed_sums(batch: VoxelBatch) -> VoxelBatch:
+    """Return the batch with the Σkappa of its own Gaussians (Sec. III-E)."""
+    totals = np.concatenate([np.zeros(1, np.uint64), np.cumsum(batch.gaussians.kappa, dtype=np.uint64)])
+    offsets = batch.offsets
+    return replace(batch, kappa_sums=totals[offsets[1:]] - totals[offsets[:-1]])
+
+
+SLICE_VOXELS = 2048
+"""A larger message is stored in parts of this size, so that it does not delay the other agents."""
+_MESSAGE_COST = 16
+"""The cost of a message beside its voxels, in voxels."""
+_MAX_PENDING = 64
+"""Of one agent; a robot waits for each acknowledgement, so it has one or two."""
+
+
+@dataclass(slots=True, eq=False)
+class PendingUpdate:
+    """A message that waits for its commit. It is stored in slices; `outcomes` has those of the stored slices."""
+
+    session_id: str
+    subset: RoiSubset
+    future: Future[PutOutcome] = field(default_factory=Future)
+    next_voxel: int = 0
+    outcomes: list[PutOutcome] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        # a client that disconnects cannot cancel it any more: the message is stored in any case
+        self.future.set_running_or_notify_cancel()
+
+    def next_slice(self) -> RoiSubset:
+        """Return the part of the message to store next."""
+        subset, start = self.subset, self.next_voxel
+        if len(subset.batch) <= SLICE_VOXELS:
+            return subset
+        part = slice_voxels(subset.batch, start, start + SLICE_VOXELS)
+        return RoiSubset(subset.agent_id, subset.session_id, subset.message_seq, subset.update_seq, part)
+
+    def add_outcome(self, outcome: PutOutcome) -> bool:
+        """Note that the next slice is stored; returns whether it was the last one."""
+        self.outcomes.append(outcome)
+        self.next_voxel += SLICE_VOXELS
+        return self.next_voxel >= len(self.subset.batch)
+
+    def outcome(self) -> PutOutcome:
+        """Return the outcome of the whole message."""
+        return PutOutcome(
+            np.concatenate([each.accepted for each in self.outcomes]),
+            np.concatenate([each.stale for each in self.outcomes]),
+        )
+
+
+class UpdateQueue:
+    """Start-time fair queueing over the agents, by voxels. Thread-safe.
+
+    Source: P. Goyal et al., "Start-time fair queueing", IEEE/ACM Transactions on Networking 5(5), 1997.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._pending: dict[str, deque[PendingUpdate]] = {}
+        # (virtual start time, order of arrival, agent id) of each agent with pending messages
+        self._waiting: list[tuple[float, int, str]] = []
+        self._finish: dict[str, float] = {}
+        self._now = 0.0
+        self._arrivals = 0
+
+    def add(self, update: PendingUpdate) -> None:
+        """Queue a message. Raises UnavailableError if its agent has too many."""
+        agent_id = update.subset.agent_id
+        with self._lock:
+            own = self._pending.setdefault(agent_id, deque())
+            if len(own) >= _MAX_PENDING:
+                raise UnavailableError(
+                    f"agent {quote_name(agent_id)}: expected at most {_MAX_PENDING} messages that wait for their "
+                    "acknowledgement; wait for some"
+                )
+            own.append(update)
+            if len(own) == 1:
+                self._wait(agent_id)
+
+    @property
+    def has_waiting(self) -> bool:
+        """Whether `take` would return a message."""
+        return bool(self._waiting)
+
+    def take(self, max_voxels: int) -> list[PendingUpdate]:
+        """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue."""
+        taken: list[PendingUpdate] = []
+        cost = 0
+        with self._lock:
+            while self._waiting and cost < max_voxels:
+                start, _, agent_id = heapq.heappop(self._waiting)
+                self._now = start
+                update = self._pending[agent_id][0]
+                own_cost = _MESSAGE_COST + min(len(update.subset.batch) - update.next_voxel, SLICE_VOXELS)
+                self._finish[agent_id] = start + own_cost
+                cost += own_cost
+                taken.append(update)
+        return taken
+
+    def put_back(self, update: PendingUpdate, is_done: bool) -> None:
+        """Let the agent of a taken message wait for its next slice, or for its next message."""
+        agent_id = update.subset.agent_id
+        with self._lock:
+            own = self._pending[agent_id]
+            if is_done:
+                own.popleft()
+            if own:
+                self._wait(agent_id)
+            else:
+                del self._pending[agent_id]
+            if not self._pending:
+                # nobody waits, so no agent has an advantage or a debt
+                self._finish.clear()
+                self._now = 0.0
+
+    def _wait(self, agent_id: str) -> None:
+        start = max(self._now, self._finish.get(agent_id, 0.0))
+        self._arrivals += 1
+        heapq.heappush(self._waiting, (start, self._arrivals, agent_id))
+
+
+_GROUP_VOXELS = 4096
+Check = Callable[[PendingUpdate], RoiSubset]
+"""Returns the message as it is stored. Raises GaussLiteError to refuse it."""
+Record = Callable[[RoiSubset, PutOutcome], None]
+"""Notes what a commit has stored."""
+
+
+class UpdateCommitter:
+    """Owns the queue. Messages are checked and recorded under the engine's lock, and committed without it.
+
+    A message with more than SLICE_VOXELS voxels is stored in several transactions. If one of them fails, the stored
+    part stays; it is a part of the agent's newest data, and sending the message again completes it. Thread-safe.
+    """
+
+    def __init__(self, store: FusionStore, lock: RLock, check: Check, record: Record) -> None:
+        self._store, self._lock, self._check, self._record = store, lock, check, record
+        self._queue = UpdateQueue()
+        self.committing = Lock()
+        """Held through a commit; who deletes an agent's data takes it before the engine's lock."""
+
+    def add(self, session_id: str, subset: RoiSubset) -> Future[PutOutcome]:
+        """Queue a message; the future has its outcome after a commit. Raises UnavailableError."""
+        update = PendingUpdate(session_id, subset)
+        self._queue.add(update)
+        return update.future
+
+    def commit(self) -> None:
+        """Commit the queued messages, group by group, until none waits."""
+        while self._queue.has_waiting:
+            with self.committing:
+                group = self._queue.take(_GROUP_VOXELS)
+                try:
+                    self._commit(group)
+                except Exception as error:
+                    # reaches the senders through their futures
+                    for update in group:
+                        _fail(update, error)
+                finally:
+                    for update in group:
+                        self._queue.put_back(update, update.future.done())
+
+    def _commit(self, group: list[PendingUpdate]) -> None:
+        checked: list[tuple[PendingUpdate, RoiSubset]] = []
+        with self._lock:
+            for update in group:
+                try:
+                    update.subset = self._check(update)
+                    checked.append((update, update.next_slice()))
+                except GaussLiteError as error:
+                    _fail(update, error)
+        outcomes = self._put(checked)
+        with self._lock:
+            for (_, part), outcome in zip(checked, outcomes, strict=True):
+                if outcome is not None:
+                    self._record(part, outcome)
+        for (update, _), outcome in zip(checked, outcomes, strict=True):
+            if outcome is not None and update.add_outcome(outcome):
+                update.future.set_result(update.outcome())
+
+    def _put(self, checked: list[tuple[PendingUpdate, RoiSubset]]) -> list[PutOutcome | None]:
+        """Store the messages; if the group fails, each alone, so that one too large for the disk fails alone."""
+        try:
+            return list(self._store.put_all([part for _, part in checked]))
+        except GaussLiteError:
+            return [self._put_alone(update, part) for update, part in checked]
+
+    def _put_alone(self, update: PendingUpdate, part: RoiSubset) -> PutOutcome | None:
+        try:
+            return self._store.put(part)
+        except GaussLiteError as error:
+            _fail(update, error)
+            return None
+
+
+def _fail(update: PendingUpdate, error: BaseException) -> None:
+    if not update.future.done():
+        update.future.set_exception(error)
+
+
+def require_within_quotas(subset: RoiSubset, store: FusionStore, quotas: Quotas) -> None:
+    """Raise QuotaError if the agent would have too many voxels (with tombstones) or Gaussians."""
+    stored, totals = store.stored(subset.agent_id, subset.batch.keys), store.totals(subset.agent_id)
+    # equal numbers count as newer: a larger content replaces the stored one, and a duplicate adds nothing
+    newer = stored.update_seqs <= subset.update_seq
+    added = subset.batch.counts[newer].sum(dtype=np.int64) - stored.counts[newer].sum(dtype=np.int64)
+    for name, value, limit in (
+        ("voxels", totals.voxels + int(np.count_nonzero(stored.update_seqs < 0)), quotas.voxels_per_agent),
+        ("Gaussians", totals.gaussians + int(added), quotas.gaussians_per_agent),
+    ):
+        if value > limit:
+            raise QuotaError(
+                f"agent {quote_name(subset.agent_id)}: expected at most {limit} {name} in all, got {value}"
+            )

@@ -1,0 +1,241 @@
+"""The pose of every mapped frame, by the odometry and in the map, and the mean correction between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.calibration.alignment import fit_pose
+from gausslite.calibration.errors import fit_exposure
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.errors import MapFileError
+from gausslite.domain.frame import MAX_COORDINATE_M, Frame
+from gausslite.domain.pose import CorrectionTrack, PoseCorrection, Trajectory, inverse, require_rigid, transform_of
+from gausslite.domain.recording import PoseExposurePrior
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
+from gausslite.mapping.keyframes import Keyframe, WindowView
+from gausslite.render.rasterizer import Rendering
+
+_MAX_POSES = 20_000
+"""Beyond this number, every second pose of the older half is removed: 5 MB."""
+_RECENT_POSES = 32
+"""Frames whose changes of correction give its uncertainty."""
+
+
+class _Pose(NamedTuple):
+    T_world_odometry: Float64[ndarray, "4 4"]
+    T_world_map: Float64[ndarray, "4 4"]
+
+    @property
+    def correction(self) -> Float64[ndarray, "6"]:
+        """Translation (m) of the camera and rotation vector (rad), both in world axes."""
+        R = self.T_world_map[:3, :3] @ self.T_world_odometry[:3, :3].T
+        return np.concatenate([self.T_world_map[:3, 3] - self.T_world_odometry[:3, 3], cv2.Rodrigues(R)[0].ravel()])
+
+
+class PoseHistory:
+    """Poses by frame, in the order of their first mapping; a frame that is refined again replaces its pose."""
+
+    def __init__(self) -> None:
+        self._poses: dict[tuple[int, int], _Pose] = {}
+        self._correction_sum = np.zeros(6)
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def record(self, odometry: Frame, T_world_map: Float64[ndarray, "4 4"]) -> None:
+        """Store the pose in the map of a frame, whose own pose is that of the odometry."""
+        key = (odometry.index, odometry.capture_time_ns)
+        earlier = self._poses.get(key)
+        pose = _Pose(odometry.T_world_camera if earlier is None else earlier.T_world_odometry, T_world_map)
+        if earlier is not None:
+            self._correction_sum -= earlier.correction
+        self._correction_sum += pose.correction
+        self._poses[key] = pose
+        if len(self._poses) > _MAX_POSES:
+            self._thin()
+
+    @property
+    def mean_correction(self) -> Float64[ndarray, "6"]:
+        """Mean over the mission of the camera's translation (m) and rotation vector (rad), in world axes."""
+        return self._correction_sum / max(len(self._poses), 1)
+
+    def latest(self) -> PoseCorrection | None:
+        """Return the correction of the newest frame; None before the first frame."""
+        if not self._poses:
+            return None
+        (_, time_ns), newest = next(reversed(self._poses.items()))
+        recent = np.array([pose.correction for pose in list(self._poses.values())[-_RECENT_POSES:]])
+        changes = np.diff(recent, axis=0) if len(recent) > 1 else np.zeros((1, 6))
+        translation_m, rotation_rad = (
+            float(np.sqrt(np.mean(np.square(changes[:, part])))) for part in (slice(3), slice(3, 6))
+        )
+        T_map_odometry = newest.T_world_map @ inverse(newest.T_world_odometry)
+        return PoseCorrection(time_ns, T_map_odometry, translation_m, float(np.degrees(rotation_rad)))
+
+    def corrections(self) -> CorrectionTrack | None:
+        """Return the latest estimate of every frame's correction, by time; None before the first frame."""
+        if not self._poses:
+            return None
+        times_ns, poses = self._by_time()
+        return CorrectionTrack(
+            times_ns, np.array([pose.T_world_map @ inverse(pose.T_world_odometry) for pose in poses])
+        )
+
+    def trajectory(self) -> Trajectory:
+        """Return the latest estimate of every frame's pose in the map, by time."""
+        times_ns, poses = self._by_time()
+        return Trajectory(times_ns / 1e9, np.array([pose.T_world_map for pose in poses]).reshape(-1, 4, 4))
+
+    def state(self) -> State:
+        """Return all poses as named arrays."""
+        return {
+            "frames": np.array(list(self._poses), np.int64).reshape(-1, 2),
+            "T_world_odometry": np.array([pose.T_world_odometry for pose in self._poses.values()]).reshape(-1, 4, 4),
+            "T_world_map": np.array([pose.T_world_map for pose in self._poses.values()]).reshape(-1, 4, 4),
+            "correction_sum": self._correction_sum,
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from another history's state. Raises MapFileError, PoseError."""
+        frames = get_array(state, "frames", (None, 2), np.int64)
+        shape = (len(frames), 4, 4)
+        T_world_odometry = get_array(state, "T_world_odometry", shape, np.float64)
+        T_world_map = get_array(state, "T_world_map", shape, np.float64)
+        correction_sum = get_array(state, "correction_sum", (6,), np.float64)
+        if len(frames) > _MAX_POSES:
+            raise MapFileError(f"state poses: expected at most {_MAX_POSES}, got {len(frames)}")
+        for T in (*T_world_odometry, *T_world_map):
+            require_rigid("state poses", T)
+            if np.abs(T[:3, 3]).max() > MAX_COORDINATE_M:
+                raise MapFileError(f"state poses: expected positions within {MAX_COORDINATE_M:g} m of the origin")
+        self._poses = {
+            (int(index), int(time_ns)): _Pose(odometry.copy(), in_map.copy())
+            for (index, time_ns), odometry, in_map in zip(frames, T_world_odometry, T_world_map, strict=True)
+        }
+        # the stored sum has the rounding errors of its history, which a bit-identical continuation needs
+        if not np.allclose(correction_sum, self._sum_corrections(), atol=1e-3):
+            raise MapFileError("state correction_sum: expected the sum over the poses, got another")
+        self._correction_sum = correction_sum.copy()
+
+    def _by_time(self) -> tuple[ndarray, list[_Pose]]:
+        by_time = sorted(self._poses.items(), key=lambda item: item[0][1])
+        return np.array([time_ns for (_, time_ns), _ in by_time], np.int64), [pose for _, pose in by_time]
+
+    def _thin(self) -> None:
+        older = list(self._poses)[: len(self._poses) // 2]
+        for key in older[1::2]:
+            del self._poses[key]
+        self._correction_sum = self._sum_corrections()
+
+    def _sum_corrections(self) -> Float64[ndarray, "6"]:
+        corrections = [pose.correction for pose in self._poses.values()]
+        total: Float64[ndarray, "6"] = np.sum(corrections or [np.zeros(6)], axis=0)
+        return total
+
+
+RenderMap = Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering]
+"""Renders the map from T_world_camera, with the camera's motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefinementSettings:
+    """How views are refined.
+
+    prior: standard deviations of pose and exposure errors. keyframes_per_frame: keyframes refined with each frame.
+    anchor_share: share of the mission's mean correction by which each fit moves back; 0 if the poses do not come from
+    an odometry.
+    """
+
+    prior: PoseExposurePrior
+    keyframes_per_frame: int
+    anchor_share: float
+
+
+class ViewRefiner:
+    """Refines views under the prior. It owns the pose history, the last pose correction and its place in the window.
+
+    Each frame is aligned to the map, and the map is trained on the aligned frames, so both could drift from the
+    odometry together. After each fit, the refined pose moves back by a share of the mission's mean correction.
+    """
+
+    def __init__(self, settings: RefinementSettings, render: RenderMap) -> None:
+        self._prior = settings.prior
+        self._settings = settings
+        self._render = render
+        self._history = PoseHistory()
+        self._T_odometry_refined = np.eye(4)
+        self._position = 0
+
+    @property
+    def enabled(self) -> bool:
+        """False if poses and colours are used as recorded."""
+        return not self._prior.is_exact
+
+    @property
+    def history(self) -> PoseHistory:
+        """The poses of all mapped frames."""
+        return self._history
+
+    def state(self) -> State:
+        """Return the pose history, the last pose correction and the position of the last refined keyframe."""
+        return {
+            "T_odometry_refined": self._T_odometry_refined,
+            "position": int_array(self._position),
+            **add_prefix("history", self._history.state()),
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from another refiner's state. Raises MapFileError, PoseError."""
+        T_odometry_refined = get_array(state, "T_odometry_refined", (4, 4), np.float64)
+        require_rigid("state T_odometry_refined", T_odometry_refined)
+        self._T_odometry_refined = T_odometry_refined.copy()
+        [self._position] = get_counts(state, "position", 1)
+        self._history.restore(select_prefix(state, "history"))
+
+    def refine(self, recorded: Frame) -> Frame:
+        """Return a new frame with refined pose and exposure. The search starts at the last frame's pose correction."""
+        initial = recorded.T_world_camera
+        if self._prior.has_pose_error:
+            initial = initial @ self._T_odometry_refined
+        frame = self._fit(recorded, initial)
+        self._T_odometry_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
+        return frame
+
+    def next_views(self, window: Sequence[WindowView]) -> list[WindowView]:
+        """Return the keyframes to refine with this frame, in rotation over the window."""
+        refinable = [view for view in window if view.keyframe.recorded is not None]
+        count = min(self._settings.keyframes_per_frame, len(refinable))
+        first = self._position + 1
+        self._position = (self._position + count) % max(len(refinable), 1)
+        return [refinable[position % len(refinable)] for position in range(first, first + count)]
+
+    def refine_keyframe(self, keyframe: Keyframe) -> Keyframe:
+        """Return the keyframe with its pose and exposure refined against the current map."""
+        if keyframe.recorded is None:
+            return keyframe
+        return replace(keyframe, frame=self._fit(keyframe.recorded, keyframe.frame.T_world_camera))
+
+    def _fit(self, recorded: Frame, T_world_rendered: Float64[ndarray, "4 4"]) -> Frame:
+        rendering = self._render(recorded.camera, T_world_rendered, recorded.motion)
+        T_world_camera = fit_pose(rendering, inverse(T_world_rendered), recorded, self._prior)
+        if self._prior.has_pose_error:
+            T_world_camera = self._anchored(recorded, T_world_camera)
+        exposure = fit_exposure(rendering, recorded, self._prior)
+        return replace(recorded, rgb=exposure.to_map(recorded.rgb), T_world_camera=T_world_camera)
+
+    def _anchored(self, recorded: Frame, T_world_camera: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+        """Return the pose moved back by a share of the mean correction, and store it in the history."""
+        self._history.record(recorded, T_world_camera)
+        back = -self._settings.anchor_share * self._history.mean_correction
+        anchored = T_world_camera.copy()
+        anchored[:3, :3] = transform_of(back)[:3, :3] @ T_world_camera[:3, :3]
+        anchored[:3, 3] += back[:3]
+        self._history.record(recorded, anchored)
+        return anchored

@@ -1,0 +1,287 @@
+"""Store the trainable Gaussians and their optimiser state in memory of fixed capacity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int16, Int64, UInt32
+from numpy import ndarray
+
+from gausslite.domain.checks import require_array, require_finite
+from gausslite.domain.errors import InvalidInputError, MapFileError, QuotaError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.state import State, get_array
+from gausslite.render.rasterizer import (
+    GRAD_2D_SUM,
+    LOG_SCALE,
+    MEAN,
+    OPACITY_LOGIT,
+    RGB,
+    ROW_WIDTH,
+    UPDATE_COUNT,
+    allocate_rows,
+    decode_opacities,
+    gaussians_to_rows,
+    rows_to_gaussians,
+)
+
+_COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
+    "rows": (ROW_WIDTH, np.float32),
+    "first_moment": (ROW_WIDTH, np.float32),
+    "second_moment": (ROW_WIDTH, np.float32),
+    "ema_rows": (ROW_WIDTH, np.float32),
+    "active": (None, np.bool_),
+    "kappa": (None, np.uint32),
+    "target": (None, np.int16),
+    "roi_evidence": (None, np.int16),
+}
+_MAX_LOG_SCALE = 80.0
+"""The exponential of a larger value is not a finite float32."""
+_MAX_MOMENT_RATIO, _MOMENT_TOLERANCE = 1e6, 1e-30
+"""Bounds of (first moment)² against the second. By the Cauchy-Schwarz inequality their ratio is at most
+(1 - b1)² / ((1 - b2) (1 - b1² / b2)): 53 for Adam's usual betas. The margin allows other betas; the tolerance, second
+moments that float32 rounds to 0."""
+_ROWS_IN_CACHE = 4096
+_MIN_UPDATES_PER_HORIZON = 8.0
+"""The EMA horizon of a row is at most its number of updates divided by this."""
+
+
+class SplatTable:
+    """Encoded parameters of the Gaussians, their EMA, Adam's two moments and per-Gaussian columns (Sec. III-A).
+
+    `count` never exceeds `capacity`, the cap of Sec. III-D.3. All arrays are views of the first `count` rows; `append`,
+    `append_rows` and `keep` invalidate earlier views.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        """Allocate an empty table. Raises InvalidInputError if capacity is below 1 or exceeds the memory."""
+        if capacity < 1:
+            raise InvalidInputError(f"table capacity: expected at least 1 Gaussian, got {capacity}")
+        self._capacity = capacity
+        self._count = 0
+        try:
+            self._rows, self._first_moment, self._second_moment = (allocate_rows(capacity) for _ in range(3))
+            self._ema_rows = allocate_rows(capacity)
+            self._active = np.zeros(capacity, np.bool_)
+            self._kappa = np.zeros(capacity, np.uint32)
+            self._target = np.zeros(capacity, np.int16)
+            self._roi_evidence = np.zeros(capacity, np.int16)
+        except (OSError, MemoryError, OverflowError, ValueError):
+            raise InvalidInputError(
+                f"max_gaussians: expected a table that fits in memory (270 bytes per Gaussian), got {capacity}"
+            ) from None
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def capacity(self) -> int:
+        """Maximum number of Gaussians."""
+        return self._capacity
+
+    @property
+    def count(self) -> int:
+        """Current number of Gaussians."""
+        return self._count
+
+    @property
+    def free_slots(self) -> int:
+        """Number of Gaussians that still fit."""
+        return self._capacity - self._count
+
+    @property
+    def table_bytes(self) -> int:
+        """Memory allocated for everything but the optimiser state."""
+        columns = (self._active, self._kappa, self._target, self._roi_evidence)
+        return self._rows.nbytes + self._ema_rows.nbytes + sum(column.nbytes for column in columns)
+
+    @property
+    def optimizer_bytes(self) -> int:
+        """Memory allocated for Adam's two moments."""
+        return self._first_moment.nbytes + self._second_moment.nbytes
+
+    @property
+    def rows(self) -> Float32[ndarray, "n 16"]:
+        """Encoded parameters, in the layout of `render.rasterizer`."""
+        return self._rows[: self._count]
+
+    @property
+    def first_moment(self) -> Float32[ndarray, "n 16"]:
+        """Adam's first moment; its columns 14 and 15 hold the density statistics."""
+        return self._first_moment[: self._count]
+
+    @property
+    def second_moment(self) -> Float32[ndarray, "n 16"]:
+        """Adam's second moment."""
+        return self._second_moment[: self._count]
+
+    @property
+    def ema_rows(self) -> Float32[ndarray, "n 16"]:
+        """Exponential moving average (EMA) of the rows at the last `update_ema`; of a new Gaussian, its row."""
+        return self._ema_rows[: self._count]
+
+    @property
+    def active(self) -> Bool[ndarray, " n"]:
+        """The paper's flag a: seeded inside the region of interest (ROI), or inside it after a task change."""
+        return self._active[: self._count]
+
+    @property
+    def kappa(self) -> UInt32[ndarray, " n"]:
+        """Number of active-phase iterations that trained each Gaussian."""
+        return self._kappa[: self._count]
+
+    @property
+    def target(self) -> Int16[ndarray, " n"]:
+        """Index into TaskGraph.targets, -1 for none."""
+        return self._target[: self._count]
+
+    @property
+    def roi_evidence(self) -> Int16[ndarray, " n"]:
+        """Number of views with the Gaussian inside the current ROI minus number of views with it outside.
+
+        A new Gaussian starts at 1 if active, else at -1.
+        """
+        return self._roi_evidence[: self._count]
+
+    @property
+    def means_m(self) -> Float32[ndarray, "n 3"]:
+        """Means in metres."""
+        return self.rows[:, MEAN]
+
+    @property
+    def opacities(self) -> Float32[ndarray, " n"]:
+        """Opacities in (0, 1)."""
+        return decode_opacities(self.rows)
+
+    def has_lower_opacity(self, opacity: float) -> Bool[ndarray, " n"]:
+        """Return True for each Gaussian whose opacity is lower than this value in (0, 1)."""
+        return self.rows[:, OPACITY_LOGIT] < math.log(opacity) - math.log1p(-opacity)
+
+    def most_transparent(self, ids: Int64[ndarray, " m"], count: int) -> Int64[ndarray, " k"]:
+        """Return up to `count` of these ascending ids: those of lowest opacity, and of equal ones the lowest ids."""
+        if count >= len(ids):
+            return ids
+        if count <= 0:
+            return ids[:0]
+        # logits separate opacities that are equal in float32
+        logits = self.rows[ids, OPACITY_LOGIT]
+        limit = np.partition(logits, count - 1)[count - 1]
+        below, equal = np.flatnonzero(logits < limit), np.flatnonzero(logits == limit)
+        chosen: Int64[ndarray, " k"] = ids[np.concatenate([below, equal[: count - len(below)]])]
+        return chosen
+
+    def make_isotropic(self) -> None:
+        """Set the three scales of each Gaussian to their geometric mean."""
+        log_scales = self.rows[:, LOG_SCALE]
+        log_scales[:] = log_scales.mean(axis=1, keepdims=True)
+
+    def clip_colours(self, lowest: float, highest: float) -> None:
+        """Clip all colour channels to this range."""
+        # one channel at a time: NumPy takes twice as long for three columns at once
+        for channel in self.rows[:, RGB].T:
+            np.clip(channel, lowest, highest, out=channel)
+
+    def append(self, gaussians: Gaussians) -> None:
+        """Add Gaussians with zero optimiser state. Raises QuotaError if they do not fit."""
+        self.append_rows(gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
+
+    def append_rows(
+        self,
+        rows: Float32[ndarray, "m 16"],
+        active: Bool[ndarray, " m"],
+        kappa: UInt32[ndarray, " m"],
+        target: Int16[ndarray, " m"],
+    ) -> None:
+        """Add encoded rows with zero optimiser state. Raises QuotaError if they do not fit."""
+        if len(rows) > self.free_slots:
+            raise QuotaError(f"table: expected at most {self.free_slots} more Gaussians, got {len(rows)}")
+        self._put(slice(self._count, self._count + len(rows)), rows, active, kappa, target)
+        self._count += len(rows)
+
+    def replace(self, ids: Int[ndarray, " m"], gaussians: Gaussians) -> None:
+        """Overwrite the Gaussians `ids` with these, with zero optimiser state."""
+        self._put(ids, gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
+
+    def keep(self, mask: Bool[ndarray, " n"]) -> None:
+        """Remove the Gaussians where mask is False; the others keep their optimiser state.
+
+        The last Gaussians, in their order, move to the rows of the removed ones, so that few rows move.
+        """
+        require_array("keep mask", mask, (self._count,), np.bool_)
+        kept = int(np.count_nonzero(mask))
+        vacant, moved = np.flatnonzero(~mask[:kept]), kept + np.flatnonzero(mask[kept:])
+        for name in _COLUMNS:
+            column = getattr(self, f"_{name}")
+            column[vacant] = column[moved]
+        self._count = kept
+
+    def state(self) -> State:
+        """Return all columns, as views."""
+        return {name: getattr(self, name) for name in _COLUMNS}
+
+    def restore(self, state: State) -> None:
+        """Replace the contents by a saved state. Raises QuotaError if it does not fit, MapFileError, ShapeError."""
+        rows = get_array(state, "rows", (None, ROW_WIDTH), np.float32)
+        if len(rows) > self._capacity:
+            raise QuotaError(f"max_gaussians: expected at least the {len(rows)} saved ones, got {self._capacity}")
+        columns = {
+            name: get_array(state, name, (len(rows),) if width is None else (len(rows), width), dtype)
+            for name, (width, dtype) in _COLUMNS.items()
+        }
+        for name in ("rows", "first_moment", "second_moment", "ema_rows"):
+            require_finite(f"state {name}", columns[name])
+        if not _is_reachable(columns):
+            raise MapFileError("state table: expected scales, EMA and moments that training can produce, got others")
+        for name, column in columns.items():
+            getattr(self, f"_{name}")[: len(rows)] = column
+        self._count = len(rows)
+
+    def update_ema(self, horizon_updates: float) -> None:
+        """Advance the EMA of all rows that changed since the last call.
+
+        The horizon of a row is `horizon_updates`, but at most an eighth of its number of updates: an earlier value must
+        not hold back a row that still moves far.
+        """
+        changed = np.flatnonzero(self.rows[:, UPDATE_COUNT] != self.ema_rows[:, UPDATE_COUNT])
+        for start in range(0, len(changed), _ROWS_IN_CACHE):
+            ids = changed[start : start + _ROWS_IN_CACHE]
+            rows, ema = self.rows.take(ids, axis=0), self.ema_rows.take(ids, axis=0)
+            horizon = np.minimum(np.float32(horizon_updates), rows[:, UPDATE_COUNT] / _MIN_UPDATES_PER_HORIZON)
+            weight = -np.expm1((ema[:, UPDATE_COUNT] - rows[:, UPDATE_COUNT]) / horizon)
+            ema += weight[:, None] * (rows - ema)
+            ema[:, UPDATE_COUNT] = rows[:, UPDATE_COUNT]
+            self.ema_rows[ids] = ema
+
+    def to_gaussians(self, ids: Int[ndarray, " m"] | None = None, use_ema: bool = False) -> Gaussians:
+        """Return copies of all Gaussians, or of these ids, as physical values; use_ema: of the EMA rows."""
+        chosen = np.arange(self._count) if ids is None else ids
+        columns = self.ema_rows if use_ema else self.rows, self.active, self.kappa, self.target
+        return rows_to_gaussians(*(column.take(chosen, axis=0) for column in columns))
+
+    def _put(
+        self,
+        place: slice | Int[ndarray, " m"],
+        rows: Float32[ndarray, "m 16"],
+        active: Bool[ndarray, " m"],
+        kappa: UInt32[ndarray, " m"],
+        target: Int16[ndarray, " m"],
+    ) -> None:
+        """Write new Gaussians, with zero optimiser state."""
+        self._rows[place] = rows
+        self._ema_rows[place] = rows
+        self._first_moment[place] = 0.0
+        self._second_moment[place] = 0.0
+        self._active[place], self._kappa[place], self._target[place] = active, kappa, target
+        self._roi_evidence[place] = np.where(active, 1, -1)
+
+
+def _is_reachable(columns: State) -> bool:
+    """Return False for values that training cannot produce and that would ruin the map in its first steps."""
+    rows, ema_rows = columns["rows"], columns["ema_rows"]
+    if max(values[:, LOG_SCALE].max(initial=-np.inf) for values in (rows, ema_rows)) > _MAX_LOG_SCALE:
+        return False
+    if (ema_rows[:, UPDATE_COUNT] < 0).any() or (ema_rows[:, UPDATE_COUNT] > rows[:, UPDATE_COUNT]).any():
+        return False
+    first, second = (columns[name][:, :GRAD_2D_SUM].astype(np.float64) for name in ("first_moment", "second_moment"))
+    return bool((second >= 0).all() and (np.square(first) <= _MAX_MOMENT_RATIO * second + _MOMENT_TOLERANCE).all())

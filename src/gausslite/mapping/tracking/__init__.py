@@ -1,1 +1,0 @@
-"""Track the camera against the map, for recordings and robots without a good odometry."""

@@ -1,0 +1,153 @@
+"""Record how the map grows during a mission, for the scrub over time of the live view."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.codec.run_files import MapSnapshot, write_map_history
+from gausslite.codec.state_file import write_atomic
+from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.frame import Frame
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.state import EvenHistory
+from gausslite.domain.task import TaskGraph
+from gausslite.mapping.poses import PoseHistory
+from gausslite.mission.build import EstimatorFactory
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
+
+_MAX_SNAPSHOTS, _LEAST_GAP_NS = 48, 250_000_000
+
+
+@dataclass(slots=True)
+class MapRecorder:
+    """Keeps at most 48 snapshots, at most 11 MB.
+
+    One takes about 25 ms. There are at most four a second of the recording, fewer in a longer mission.
+    """
+
+    _snapshots: EvenHistory[MapSnapshot] = field(default_factory=lambda: EvenHistory(_MAX_SNAPSHOTS, _LEAST_GAP_NS))
+
+    def record(self, poses: PoseHistory, gaussians: Callable[[], Gaussians]) -> None:
+        """Take a snapshot of the map after a frame, if one is due."""
+        latest = poses.latest()
+        if latest is None or not self._snapshots.is_due(latest.capture_time_ns):
+            return
+        # a map with a value that the codec refuses is still mapped further
+        with suppress(InvalidInputError):
+            snapshot = MapSnapshot.of(latest.capture_time_ns, gaussians())
+            self._snapshots.add(snapshot.time_ns, snapshot)
+
+    def write(self, folder: Path) -> None:
+        """Write map_history.safetensors, with the snapshots since the start of this run. Raises StorageError."""
+        write_map_history(folder, self._snapshots.states)
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSwitch:
+    """A new task, in natural language, from a frame index on."""
+
+    frame: int
+    text: str
+
+    @classmethod
+    def parse(cls, text: str) -> TaskSwitch:
+        """Return the switch written as "120:Find the mug". Raises InvalidInputError."""
+        number, colon, task = text.partition(":")
+        if not (colon and number.isascii() and number.isdigit() and len(number) < 10 and task.strip()):
+            raise InvalidInputError(f"task-at: expected a frame and a task such as '120:Find the mug', got {text!r}")
+        return cls(int(number), task.strip())
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSchedule:
+    """The first task of a mission (None without a task in natural language), and later ones by their first frame."""
+
+    first: TaskGraph | None
+    switches: tuple[tuple[int, TaskGraph], ...] = ()
+
+    def graphs(self) -> tuple[TaskGraph, ...]:
+        """Return all tasks."""
+        first = () if self.first is None else (self.first,)
+        return (*first, *(graph for _, graph in self.switches))
+
+    def at(self, frame_index: int) -> TaskGraph | None:
+        """Return the task of a frame."""
+        past = [(first_frame, graph) for first_frame, graph in self.switches if first_frame <= frame_index]
+        return max(past, key=lambda switch: switch[0])[1] if past else self.first
+
+
+class ScheduledTaskMapper:
+    """Process frames with a TaskMapper, and assign each scheduled task before its first frame."""
+
+    def __init__(
+        self, mapper: TaskMapper, schedule: TaskSchedule, estimators: EstimatorFactory, current: TaskGraph | None
+    ) -> None:
+        """Current is the task that the mapper has now."""
+        self._mapper = mapper
+        self._schedule = schedule
+        self._estimators = estimators
+        self._current = current
+
+    def process(self, frame: Frame) -> FrameOutcome:
+        """Process one frame for the task that is scheduled for it."""
+        graph = self._schedule.at(frame.index)
+        if graph is not None and self._current is not None and not graph.is_equivalent_to(self._current):
+            self._mapper.assign(self._estimators.build(graph))
+        self._current = graph
+        return self._mapper.process(frame)
+
+
+_FILE = "frames.csv"
+COLUMNS = ("frame", "seconds", "iterations", "gaussians", "roi_share")
+_MAX_ROWS = 100_000
+
+
+@dataclass(slots=True)
+class Timeline:
+    """The rows of one run; frames that were skipped have none.
+
+    An agent may run for weeks: whenever there are max_rows rows, every second one is removed.
+    """
+
+    max_rows: int = _MAX_ROWS
+    _rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, outcome: FrameOutcome) -> None:
+        """Add one frame."""
+        if outcome.skipped is None:
+            seconds = outcome.timing.seconds
+            self._rows.append((outcome.index, seconds, outcome.iterations, outcome.gaussians, outcome.roi_share))
+        if len(self._rows) >= self.max_rows:
+            del self._rows[1::2]
+
+    def write(self, folder: Path) -> None:
+        """Write frames.csv. Raises StorageError."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in self._rows)
+        write_atomic(folder / _FILE, text.getvalue().encode())
+
+
+def read_timeline(folder: Path) -> dict[str, Float64[ndarray, " n"]]:
+    """Return the columns of frames.csv by name; empty if the folder has none. Raises MapFileError."""
+    path = folder / _FILE
+    if not path.exists():
+        return {}
+    try:
+        header, *rows = csv.reader(path.read_text().splitlines())
+        values = np.array(rows, np.float64).reshape(len(rows), len(COLUMNS))
+    except (OSError, ValueError, csv.Error) as error:
+        raise MapFileError(f"{path}: expected the frames of a run, got an unreadable file: {error}") from error
+    if tuple(header) != COLUMNS or not np.isfinite(values).all():
+        raise MapFileError(f"{path}: expected finite columns {','.join(COLUMNS)}, got others")
+    return dict(zip(COLUMNS, values.T, strict=True))

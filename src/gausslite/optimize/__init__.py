@@ -1,1 +1,0 @@
-"""The trainable splat table, its encoding, learning rates and density control, for mapping and joint refinement."""

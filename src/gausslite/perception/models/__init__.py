@@ -1,1 +1,0 @@
-"""Model files: catalogue, download, checks, inspection, and the networks that they hold."""

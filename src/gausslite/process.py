@@ -1,0 +1,140 @@
+"""Write messages to stderr: one line each, without control characters."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from enum import StrEnum
+from importlib import import_module
+from types import FrameType, TracebackType
+from typing import Any
+
+from gausslite.domain.errors import InvalidInputError
+
+
+def printable(text: str) -> str:
+    """Return the text with control characters and bytes of other encodings escaped.
+
+    File names and texts of users can contain them; a terminal would execute escape sequences.
+    """
+    return "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode() for character in text
+    )
+
+
+def print_message(text: str) -> None:
+    """Print one line on stderr."""
+    print(printable(text), file=sys.stderr)
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class _QuietEnd:
+    """A signal handler that ends the process at once; during start-up nothing is open that needs closing."""
+
+    def __init__(self, program: str) -> None:
+        self._program = program
+
+    def __call__(self, number: int, _frame: FrameType | None) -> None:
+        os.write(2, f"{self._program}: interrupted while starting\n".encode())
+        os._exit(128 + number)
+
+
+def end_quietly_while_starting(program: str) -> None:
+    """End the process with code 130 on SIGINT and 143 on SIGTERM, until `raise_interrupts` is called.
+
+    Call it on the main thread.
+    """
+    for number in _SIGNALS:
+        signal.signal(number, _QuietEnd(program))
+
+
+def raise_interrupts() -> None:
+    """Let SIGINT raise KeyboardInterrupt and SIGTERM raise Terminated, unless another handler has been installed."""
+    if isinstance(signal.getsignal(signal.SIGINT), _QuietEnd):
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if isinstance(signal.getsignal(signal.SIGTERM), _QuietEnd):
+        signal.signal(signal.SIGTERM, _raise_terminated)
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, raised as Python raises KeyboardInterrupt for SIGINT."""
+
+
+def _raise_terminated(_number: int, _frame: FrameType | None) -> None:
+    raise Terminated
+
+
+class DeferredInterrupt:
+    """A context that records the first Ctrl-C or SIGTERM, so that the current step can be completed.
+
+    pending_exception: the exception that the signal stands for, None without a signal; the caller raises it after the
+    step. A second signal raises it at once. Only the main thread can handle signals; on other threads the context
+    changes nothing.
+    """
+
+    def __init__(self) -> None:
+        self.pending_exception: KeyboardInterrupt | None = None
+        self._on_main_thread = threading.current_thread() is threading.main_thread()
+        self._previous = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def __enter__(self) -> DeferredInterrupt:
+        if self._on_main_thread:
+            for number in _SIGNALS:
+                signal.signal(number, self._record)
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        if self._on_main_thread:
+            for number, handler in self._previous.items():
+                signal.signal(number, handler)
+
+    def _record(self, number: int, _frame: FrameType | None) -> None:
+        if self.pending_exception is not None:
+            raise self.pending_exception
+        self.pending_exception = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+
+
+class Sibling(StrEnum):
+    """A module of a package beside the core; what the core calls in it."""
+
+    SIMULATOR = "gausslite_sim.source"
+    """open_simulated."""
+    BAGS = "gausslite_ros.bag_source"
+    """open_bag."""
+    PAGES = "gausslite_view.pages"
+    """live_page, own_page, mission_view."""
+    REPORT = "gausslite_view.report"
+    """write_report."""
+    VIEW_COMMAND = "gausslite_view.view_command"
+    REPORT_COMMAND = "gausslite_view.report_command"
+    BENCH_COMMAND = "gausslite_bench.cli.main"
+
+
+def sibling(module: Sibling) -> Any:
+    """Return the module; it is loaded at the first call."""
+    return import_module(module)
+
+
+_SWITCHES = {"ORT_DISABLE_TELEMETRY": "1"}
+"""Variables that ONNX Runtime reads when it is loaded, also as a part of onnxruntime-genai."""
+
+
+def disable_telemetry() -> None:
+    """Set the variables for this process and its children."""
+    os.environ.update(_SWITCHES)
+
+
+def import_extra(package: str, extra: str, purpose: str) -> Any:
+    """Import a package of an extra. Raises InvalidInputError, which names the command that installs it."""
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise InvalidInputError(
+            f"{purpose}: expected the package {package!r}; install it with: pip install 'gausslite[{extra}]'"
+        ) from error

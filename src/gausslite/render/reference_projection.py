@@ -1,0 +1,302 @@
+"""The image of a moving camera: rows exposed one after the other, each for a while; differentiable, on any device."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from numpy import ndarray
+from torch import Tensor
+
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.render.rasterizer import (
+    LOG_SCALE,
+    MAX_READOUT_SHARE,
+    MEAN,
+    MIN_ROW_RATE,
+    NEAR_M,
+    OPACITY_LOGIT,
+    QUAT,
+    RGB,
+    TANGENT_MARGIN,
+    TILE_PX,
+)
+
+Covariances: TypeAlias = tuple[Tensor, Tensor, Tensor]
+"""var x, cov xy, var y of the splats in the image, px²."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageMotion:
+    """A camera with its motion, as tensors of one type on one device."""
+
+    camera: Camera
+    linear_m_s: Float[Tensor, "3"]
+    angular_rad_s: Float[Tensor, "3"]
+    readout_s: float
+    exposure_s: float
+
+    @classmethod
+    def of(
+        cls, camera: Camera, motion: CameraMotion | None, dtype: torch.dtype, device: torch.device | None = None
+    ) -> ImageMotion | None:
+        """Return the motion as tensors; None for a camera at rest."""
+        if motion is None or motion.is_still:
+            return None
+        velocities = (motion.twist.linear_m_s, motion.twist.angular_rad_s)
+        linear_m_s, angular_rad_s = (torch.tensor(velocity, dtype=dtype, device=device) for velocity in velocities)
+        return cls(camera, linear_m_s, angular_rad_s, motion.readout_s, motion.exposure_s)
+
+    def expose(self, points_m: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
+        """Return the points of the camera frame when their rows are exposed, and the time per row that they move.
+
+        A point crosses rows at the speed s, to first order. It is recorded in row y = y0 + s t, which is exposed at
+        t = readout (y / height - 1/2), so t = readout (y0 / height - 1/2) / (1 - s readout / height).
+        """
+        velocity = self._velocity(points_m)
+        inverse_z = 1.0 / points_m[:, 2]
+        tangent = points_m[:, 1] * inverse_z
+        rows_per_s = self.camera.fy_px * inverse_z * (velocity[:, 1] - tangent * velocity[:, 2])
+        readout_per_row = self.readout_s / self.camera.height_px
+        row_rate = (1.0 - rows_per_s * readout_per_row).clamp(min=MIN_ROW_RATE)
+        row = self.camera.fy_px * tangent + self.camera.cy_px
+        limit_s = MAX_READOUT_SHARE * abs(self.readout_s)
+        time_s = ((row * readout_per_row - 0.5 * self.readout_s) / row_rate).clamp(-limit_s, limit_s)
+        return points_m + time_s[:, None] * velocity, readout_per_row / row_rate
+
+    def image_velocity(self, points_m: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2"]:
+        """Return the velocity of the points' images in px/s: the Jacobian (clamped tangents) times their velocity."""
+        camera, velocity, z = self.camera, self._velocity(points_m), points_m[:, 2]
+        speeds = []
+        for axis, (focal_px, side_px) in enumerate(((camera.fx_px, camera.width_px), (camera.fy_px, camera.height_px))):
+            limit = TANGENT_MARGIN * 0.5 * side_px / focal_px
+            tangent = (points_m[:, axis] / z).clamp(-limit, limit)
+            speeds.append(focal_px / z * (velocity[:, axis] - tangent * velocity[:, 2]))
+        return torch.stack(speeds, dim=1)
+
+    def shear(
+        self, covariances: Covariances, image_velocity: Float[Tensor, "m 2"], s_per_row: Float[Tensor, " m"]
+    ) -> Covariances:
+        """Return the covariances of ellipses whose rows are exposed one after the other."""
+        variance_x, covariance, variance_y = covariances
+        sideways, stretch = s_per_row * image_velocity[:, 0], 1.0 + s_per_row * image_velocity[:, 1]
+        return (
+            variance_x + 2.0 * sideways * covariance + sideways * sideways * variance_y,
+            stretch * (covariance + sideways * variance_y),
+            stretch * stretch * variance_y,
+        )
+
+    def blur(
+        self, covariances: Covariances, image_velocity: Float[Tensor, "m 2"]
+    ) -> tuple[Covariances, Float[Tensor, " m"]]:
+        """Return the covariances stretched along the path of the exposure, and the share of the peak that remains.
+
+        The times of a pixel's exposure have the variance exposure² / 12. The integral of a splat over the image stays.
+        """
+        variance_x, covariance, variance_y = covariances
+        path_x, path_y = (image_velocity * (self.exposure_s / math.sqrt(12.0))).unbind(dim=1)
+        blurred = variance_x + path_x * path_x, covariance + path_x * path_y, variance_y + path_y * path_y
+        return blurred, torch.sqrt(determinants(covariances) / determinants(blurred))
+
+    def _velocity(self, points_m: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        """Return the velocity of world points in the camera frame: -(v + w x p)."""
+        angular_rad_s = self.angular_rad_s.expand_as(points_m)
+        velocity: Tensor = -(self.linear_m_s + torch.linalg.cross(angular_rad_s, points_m))
+        return velocity
+
+
+def determinants(covariances: Covariances) -> Float[Tensor, " m"]:
+    """Return the determinant of each covariance."""
+    variance_x, covariance, variance_y = covariances
+    return variance_x * variance_y - covariance * covariance
+
+
+LOW_PASS_PX2 = 0.3
+MIN_ALPHA = 1.0 / 255.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipses:
+    """The visible splats, nearest first (with a moving camera, at the middle of the readout).
+
+    conics: (a, b, c) of the inverse 2D covariance [[a, b], [b, c]].
+    half_box_px: half the bounding box of the ellipse alpha >= 1/255, without a gradient.
+    """
+
+    row_ids: Int64[Tensor, " m"]
+    means_px: Float64[Tensor, "m 2"]
+    conics: Float64[Tensor, "m 3"]
+    opacities: Float64[Tensor, " m"]
+    rgb: Float64[Tensor, "m 3"]
+    z_m: Float64[Tensor, " m"]
+    half_box_px: Float64[Tensor, "m 2"]
+
+    @property
+    def differentiable(self) -> tuple[Tensor, ...]:
+        """The columns with gradients."""
+        return self.means_px, self.conics, self.opacities, self.rgb, self.z_m
+
+    def detached(self) -> Ellipses:
+        """Return the same ellipses as leaves of a new graph."""
+        means_px, conics, opacities, rgb, z_m = (column.detach().requires_grad_() for column in self.differentiable)
+        return Ellipses(
+            row_ids=self.row_ids,
+            means_px=means_px,
+            conics=conics,
+            opacities=opacities,
+            rgb=rgb,
+            z_m=z_m,
+            half_box_px=self.half_box_px,
+        )
+
+    def take(self, chosen: Tensor) -> Ellipses:
+        """Return the ellipses at these positions, or where this mask is True, in the same order."""
+        return Ellipses(
+            row_ids=self.row_ids[chosen],
+            means_px=self.means_px[chosen],
+            conics=self.conics[chosen],
+            opacities=self.opacities[chosen],
+            rgb=self.rgb[chosen],
+            z_m=self.z_m[chosen],
+            half_box_px=self.half_box_px[chosen],
+        )
+
+
+def project(
+    rows: Float64[Tensor, "n 16"],
+    camera: Camera,
+    T_camera_world: Float64[Tensor, "4 4"],
+    ids: Int64[Tensor, " k"] | None = None,
+    tiles: Bool[ndarray, "th tw"] | None = None,
+    motion: ImageMotion | None = None,
+) -> Ellipses:
+    """Return the ellipses of the rows (of `ids`, if given) that can touch a pixel of `tiles`, nearest first."""
+    with torch.no_grad():
+        is_valid = torch.isfinite(rows[:, :14]).all(dim=1) & (rows[:, QUAT].abs().sum(dim=1) > 0)
+        row_ids = torch.nonzero(is_valid)[:, 0] if ids is None else ids[is_valid[ids]]
+        z_m = rows[row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
+        ellipses = _ellipses(rows, row_ids[z_m >= NEAR_M], camera, T_camera_world, motion)
+        ellipses = ellipses.take(ellipses.z_m >= NEAR_M)
+        finite = torch.isfinite(ellipses.half_box_px).all(dim=1) & torch.isfinite(ellipses.means_px).all(dim=1)
+        ellipses = ellipses.take(finite & (ellipses.opacities > MIN_ALPHA))
+        ellipses = ellipses.take(_touches_tiles(ellipses, camera, tiles))
+        # with a moving camera too, the order is that of the middle of the readout
+        middle_z_m = rows[ellipses.row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
+        row_ids = ellipses.row_ids[torch.argsort(middle_z_m, stable=True)]
+    # project again with gradients, only the rows that are not culled
+    return _ellipses(rows, row_ids, camera, T_camera_world, motion)
+
+
+def _ellipses(
+    rows: Float64[Tensor, "n 16"],
+    row_ids: Int64[Tensor, " m"],
+    camera: Camera,
+    T_camera_world: Float64[Tensor, "4 4"],
+    motion: ImageMotion | None,
+) -> Ellipses:
+    kept = rows[row_ids]
+    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    points = kept[:, MEAN] @ R.T + t
+    opacities = torch.sigmoid(kept[:, OPACITY_LOGIT])
+    if motion is None:
+        variance_x, covariance, variance_y = _low_passed(_covariances_px2(kept, points, R, camera))
+    else:
+        points, s_per_row = motion.expose(points)
+        velocity = motion.image_velocity(points)
+        covariances = motion.shear(_covariances_px2(kept, points, R, camera), velocity, s_per_row)
+        (variance_x, covariance, variance_y), peak = motion.blur(_low_passed(covariances), velocity)
+        opacities = opacities * peak
+    z = points[:, 2]
+    means_px = torch.stack(
+        [camera.fx_px * points[:, 0] / z + camera.cx_px, camera.fy_px * points[:, 1] / z + camera.cy_px], dim=1
+    )
+    determinant = determinants((variance_x, covariance, variance_y))
+    conics = torch.stack([variance_y, -covariance, variance_x], dim=1) / determinant[:, None]
+    # the boundary alpha = 1/255 is an ellipse at this squared Mahalanobis distance
+    reach = 2.0 * torch.log(opacities.detach() / MIN_ALPHA).clamp(min=0.0)
+    half_box_px = torch.sqrt(reach[:, None] * torch.stack([variance_x, variance_y], dim=1).detach())
+    return Ellipses(
+        row_ids=row_ids,
+        means_px=means_px,
+        conics=conics,
+        opacities=opacities,
+        rgb=kept[:, RGB],
+        z_m=z,
+        half_box_px=half_box_px,
+    )
+
+
+def _low_passed(covariances: Covariances) -> Covariances:
+    variance_x, covariance, variance_y = covariances
+    return variance_x + LOW_PASS_PX2, covariance, variance_y + LOW_PASS_PX2
+
+
+def _covariances_px2(
+    kept: Float64[Tensor, "m 16"], points: Float64[Tensor, "m 3"], R: Float64[Tensor, "3 3"], camera: Camera
+) -> Covariances:
+    """Return var x, cov xy, var y of J R Σ Rᵀ Jᵀ; J is evaluated at the clamped tangent."""
+    x, y, z = points.unbind(dim=1)
+    limit_x = TANGENT_MARGIN * 0.5 * camera.width_px / camera.fx_px
+    limit_y = TANGENT_MARGIN * 0.5 * camera.height_px / camera.fy_px
+    u, v = (x / z).clamp(-limit_x, limit_x), (y / z).clamp(-limit_y, limit_y)
+    zero = torch.zeros_like(z)
+    jacobian_x = torch.stack([camera.fx_px / z, zero, -camera.fx_px * u / z], dim=1)
+    jacobian_y = torch.stack([zero, camera.fy_px / z, -camera.fy_px * v / z], dim=1)
+    spread = R @ _rotations(kept[:, QUAT]) * torch.exp(kept[:, LOG_SCALE])[:, None, :]
+    spread_x = torch.einsum("mi,mij->mj", jacobian_x, spread)
+    spread_y = torch.einsum("mi,mij->mj", jacobian_y, spread)
+    return (spread_x * spread_x).sum(dim=1), (spread_x * spread_y).sum(dim=1), (spread_y * spread_y).sum(dim=1)
+
+
+def _rotations(quats_wxyz: Float64[Tensor, "m 4"]) -> Float64[Tensor, "m 3 3"]:
+    w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=1, keepdim=True)).unbind(dim=1)
+    entries = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(entries, dim=1).reshape(-1, 3, 3)
+
+
+def _touches_tiles(ellipses: Ellipses, camera: Camera, tiles: Bool[ndarray, "th tw"] | None) -> Bool[Tensor, " m"]:
+    """Return True where the bounding box contains a pixel centre of the tiles (None: of the image)."""
+    last = torch.tensor([camera.width_px - 1, camera.height_px - 1], dtype=torch.float64)
+    low = torch.ceil(ellipses.means_px - ellipses.half_box_px - 0.5).clamp(min=0.0)
+    high = torch.minimum(torch.floor(ellipses.means_px + ellipses.half_box_px - 0.5), last)
+    hit = (low <= high).all(dim=1)
+    if tiles is None:
+        return hit
+    # number of rendered tiles in the box, from four corners of a summed-area table
+    table = torch.from_numpy(np.pad(tiles.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))))
+    x0, y0 = (torch.minimum(low, last).long() // TILE_PX).unbind(dim=1)
+    x1, y1 = (high.clamp(min=0.0).long() // TILE_PX + 1).unbind(dim=1)
+    return hit & (table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0)
+
+
+def skew(v: Float64[Tensor, "3"]) -> Float64[Tensor, "3 3"]:
+    """Return the matrix of the cross product with v."""
+    zero = torch.zeros((), dtype=v.dtype)
+    x, y, z = v.unbind()
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+
+
+def apply_twist(T_camera_world: Float64[Tensor, "4 4"], twist: Float64[Tensor, "6"]) -> Float64[Tensor, "4 4"]:
+    """Return exp(twist) T_camera_world to first order; the derivative at twist 0 is exact."""
+    top = torch.cat([skew(twist[3:]), twist[:3, None]], dim=1)
+    generator = torch.cat([top, torch.zeros(1, 4, dtype=torch.float64)])
+    return T_camera_world + generator @ T_camera_world
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Return the numbers of tile rows and columns of the image."""
+    return math.ceil(camera.height_px / TILE_PX), math.ceil(camera.width_px / TILE_PX)

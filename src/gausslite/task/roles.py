@@ -1,0 +1,477 @@
+"""The state of one clause while its chunks are processed, and the test whether a noun names an object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from gausslite.domain.task import Predicate, Superlative, TargetRole
+from gausslite.task import lexicon
+from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
+from gausslite.task.graph_draft import GraphDraft, RelationTerms
+from gausslite.task.lexicon import SUPERLATIVES, word_set
+from gausslite.task.verbs import (
+    ATTACHING_VERBS,
+    AVOIDING_VERBS,
+    COVERING_VERBS,
+    DELIVERY_VERBS,
+    FETCHING_VERBS,
+    FILLING_VERBS,
+    GIVING_VERBS,
+    GO_VERBS,
+    HANDLING_VERBS,
+    INSPECTION_VERBS,
+    LOOKING_VERBS,
+    MOVING_VERBS,
+    PLACE_VERBS,
+    PUSHING_VERBS,
+    REACHING_VERBS,
+    SEARCH_VERBS,
+    STOPPING_VERBS,
+    TOOL_VERBS,
+)
+
+
+class Clause:
+    """The objects a verb acts on, the candidates for "it" (referents), and places still without an object.
+
+    places: the destinations or tools named last, which further places describe. terms: of the latest preposition.
+    superlative: "nearest" or "farthest" before the latest object. conjoined: the latest object followed
+    a conjunction. by_pronoun: the objects come from "it" or "them". adds_place: the preposition follows a conjunction.
+    route: the clause mentions a path. skip_of_phrase: the next "of" continues a noun that names no object.
+    """
+
+    def __init__(self, verb: str | None = None, referents: list[str] | None = None) -> None:
+        self.verb = verb
+        self.referents = referents or []
+        self.objects: list[str] = []
+        self.pending_places: list[tuple[RelationTerms, NounPhrase]] = []
+        self.last_relation: str | None = None
+        self.terms = RelationTerms("near")
+        self.places: list[str] = []
+        self.superlative: str | None = None
+        self.statement = False
+        self.conjoined = False
+        self.is_part = False
+        self.between = False
+        self.in_space = False
+        self.preposition = ""
+        self.adds_place = False
+        self.current_place = False
+        self.by_pronoun = False
+        self.follows_statement = False
+        self.route = False
+        self.skip_of_phrase = False
+        self.inherited_conjoined = False
+        self.inherited_preposition: str | None = None
+        self.nouns_since_negation = 0
+        self.verb_since_negation = False
+
+
+def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None, verb: str | None) -> bool:
+    """Return False for names of the robot, and for places, routes and measures that stand for another noun."""
+    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES:
+        return False
+    if noun.head in lexicon.TASK_NOUNS and pending is None:
+        return False
+    of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
+    compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
+    if compound and noun.head in lexicon.PLACES and not of_follows:
+        return True
+    if noun.head in lexicon.PHYSICAL_MEASURES and verb in HANDLING_VERBS and pending is None and not of_follows:
+        return True
+    unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
+    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):
+        return False
+    if noun.head in lexicon.BUILDINGS:
+        return pending != "inside" or bool(noun.words[1:])
+    if noun.head in lexicon.PLACES:
+        return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
+    if noun.head in lexicon.ROUTES and not compound:
+        return pending not in (None, "of", "for", "to")
+    if noun.head in lexicon.MEASURES and pending not in (None, "of"):
+        return not of_follows
+    return noun.head not in lexicon.MEASURES or ((noun.is_known or compound) and not of_follows)
+
+
+def with_shared_head(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:
+    """Return the adjective with the noun's head: in "red and blue mugs", "red" becomes "red mug"."""
+    words = adjective.words[:-1] if adjective.head in ("one", "ones") else adjective.words
+    return NounPhrase((*words, noun.head), adjective.has_determiner)
+
+
+class RelationAssigner:
+    """Add the relations of the current clause to a draft."""
+
+    def __init__(self, draft: GraphDraft) -> None:
+        self._draft = draft
+        self.clause = Clause()
+
+    def relate(self, relation: str, noun: NounPhrase) -> None:
+        """Relate the clause's objects to the noun; a place named before any object is kept for the next object."""
+        self.relate_by(RelationTerms(relation, self.clause.terms.negated, self.clause.terms.bounds), noun)
+
+    def relate_by(self, terms: RelationTerms, noun: NounPhrase) -> None:
+        """Relate the clause's objects by complete terms, as `relate` does."""
+        clause = self.clause
+        clause.last_relation = terms.relation
+        clause.in_space = self._is_context(terms, noun)
+        if not clause.objects:
+            clause.pending_places.append((terms, noun))
+        elif clause.in_space:
+            self._draft.add_context(noun.text)
+        else:
+            self._draft.add_relation(terms, clause.objects, noun.text)
+
+    def relate_places(self, terms: RelationTerms, noun: NounPhrase) -> None:
+        """Relate the destinations or tools named last: "put it on the table by the window"."""
+        if self._is_context(terms, noun):
+            self._draft.add_context(noun.text)
+        else:
+            self._draft.add_relation(terms, self.clause.places, noun.text)
+
+    def _is_context(self, terms: RelationTerms, noun: NounPhrase) -> bool:
+        is_context = terms.relation == "inside" and lexicon.is_space(noun.words)
+        if is_context and terms.negated:
+            self._draft.warnings.append(f"not in {noun.text!r}: a place is not evaluated, the exception is dropped")
+        return is_context
+
+    def is_extreme(self, pending: str) -> bool:
+        """Return True for "the nearest chair to", "the farthest cone from"."""
+        superlative = SUPERLATIVES.get(self.clause.superlative or "")
+        is_farthest = superlative is Superlative.FARTHEST and pending == "from"
+        return bool(self.clause.objects) and (is_farthest or (superlative is not None and pending == "to"))
+
+    def relate_extreme(self, noun: NounPhrase) -> None:
+        """Relate the clause's objects as the nearest or farthest to the noun."""
+        clause = self.clause
+        word = clause.superlative or ""
+        for phrase in list(clause.objects):
+            self.rename(phrase, " ".join(each for each in phrase.split() if each != word))
+        farthest = SUPERLATIVES[word] is Superlative.FARTHEST
+        clause.superlative = None
+        self.relate(Predicate.FARTHEST_FROM if farthest else Predicate.CLOSEST_TO, noun)
+
+    def rename(self, phrase: str, new: str) -> None:
+        """Change the description of an object that the sentence has named."""
+        self._draft.rename(phrase, new)
+        for phrases in (self.clause.objects, self.clause.referents, self.clause.places):
+            phrases[:] = [new if each == phrase else each for each in phrases]
+
+
+_ORIGIN_RELATIONS: Final = {f"from_{place}": place for place in ("on", "under", "inside", "behind", "near")}
+# after "on the table" these state the destination; other prepositions locate the table
+_FINAL_DESTINATIONS: Final = word_set("on inside")
+_DESTINATION_RELATIONS: Final = word_set("to on inside near under behind in_front_of above between left_of right_of")
+# both objects of these verbs are targets
+_PAIRING_VERBS: Final = word_set("compare swap exchange")
+_ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
+_PASSING_RELATIONS: Final = word_set("past beyond")
+
+
+class RoleAssigner:
+    """Add the nouns of each clause to a draft."""
+
+    def __init__(self, draft: GraphDraft) -> None:
+        self._draft = draft
+        self._relations = RelationAssigner(draft)
+
+    @property
+    def clause(self) -> Clause:
+        """The current clause."""
+        return self._relations.clause
+
+    def rename(self, phrase: str, new: str) -> None:
+        """Change the description of an object that the sentence has named."""
+        self._relations.rename(phrase, new)
+
+    def end_clause(self, verb: str | None) -> None:
+        """Start another clause. The places of a clause without objects ("look under the bed") become targets.
+
+        In "in the kitchen, find the mug" the place belongs to the following clause.
+        """
+        before = self.clause
+        if self._searches_for_referent():
+            self._search_places_for_referents(before)
+        elif not before.statement:
+            self._make_places_targets()
+        self._relations.clause = Clause(verb=verb, referents=before.objects or before.referents)
+        self.clause.pending_places, self.clause.follows_statement = before.pending_places, before.statement
+
+    def _searches_for_referent(self) -> bool:
+        clause = self.clause
+        places_only = clause.verb in SEARCH_VERBS and bool(clause.pending_places) and not clause.objects
+        return places_only and clause.follows_statement and bool(clause.referents)
+
+    def _search_places_for_referents(self, clause: Clause) -> None:
+        """Search the places for the referents, as in "I lost my wallet, look under the bed"."""
+        clause.objects = list(clause.referents)
+        self._draft.confirm_targets(clause.objects)
+        pending_places, clause.pending_places = clause.pending_places, []
+        for terms, noun in pending_places:
+            self._relations.relate_by(terms, noun)
+
+    def _make_places_targets(self) -> None:
+        pending_places, self.clause.pending_places = self.clause.pending_places, []
+        going = self.clause.verb in GO_VERBS | STOPPING_VERBS
+        for _, noun in pending_places:
+            self.target(noun, TargetRole.DESTINATION if going else TargetRole.OBJECT, conjoined=True)
+
+    def assign(self, noun: NounPhrase, pending: str | None, conjoined: bool, following: Sequence[Chunk]) -> None:
+        """Assign one noun, given its preposition, whether a conjunction precedes it, and the following chunks."""
+        clause, after = self.clause, following[0] if following else None
+        if pending == "of" and clause.skip_of_phrase:
+            pending, conjoined = clause.inherited_preposition, clause.inherited_conjoined
+            clause.skip_of_phrase, clause.inherited_preposition = False, None
+        if pending is None:
+            if conjoined and clause.last_relation is not None and self._is_second_anchor(noun, after):
+                self._add_anchor(clause.last_relation, noun)
+            elif self._is_recipient(following):
+                self._add_destination(noun)
+            else:
+                self.target(noun, self._role_of_object(), conjoined and clause.last_relation is None)
+            return
+        self.assign_by_preposition(pending, noun, following)
+
+    def assign_by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Chunk] = ()) -> None:
+        """Assign the noun's role relative to the clause's objects, by the preposition before it."""
+        clause = self.clause
+        if self._relations.is_extreme(pending):
+            self._relations.relate_extreme(noun)
+            return
+        if pending == "closer":
+            moves = clause.verb in DELIVERY_VERBS - FETCHING_VERBS | GO_VERBS and not clause.current_place
+            pending = "to" if moves else "closest_to"
+        handlers = {
+            "to": self._destination,
+            "for": self._assign_searched_object,
+            "of": self._assign_after_of,
+            "via": self._assign_waypoint,
+        }
+        if pending in handlers:
+            handlers[pending](noun)
+        elif pending == "when":
+            return
+        elif pending == "purpose":
+            self._assign_path_end(noun)
+        elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
+            self._relations.relate("near", noun)
+        elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS:
+            self._draft.add_target(noun.text)
+        elif clause.preposition in _ROUTE_PREPOSITIONS and clause.verb in DELIVERY_VERBS and not clause.objects:
+            self.target(noun, TargetRole.OBJECT)  # "lead me around the puddle"
+        elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
+            self.target(noun, TargetRole.OBJECT, conjoined=True)
+        elif pending == "with" and clause.terms.negated and clause.places:
+            self._draft.exclude(noun.text)  # "with the sponge, not with the towel"
+        elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
+            self._assign_loaded(noun)
+        elif pending == "with":
+            if (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
+                self._assign_after_with(noun)
+        elif pending == "from" or pending in _ORIGIN_RELATIONS:
+            self._assign_origin(pending, noun)
+        else:
+            self._assign_place(pending, noun, following)
+
+    def _assign_place(self, pending: str, noun: NounPhrase, following: Sequence[Chunk]) -> None:
+        """Assign a noun after a preposition of place: a destination, or where an object or a destination is."""
+        clause = self.clause
+        if clause.last_relation == "to" and clause.terms.negated and clause.adds_place:
+            self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
+        elif clause.last_relation in ("to", "with") and clause.places:
+            self._relations.relate_places(RelationTerms(pending, clause.terms.negated, clause.terms.bounds), noun)
+        elif self._is_destination(pending, following):
+            self._add_destination(noun)
+            clause.between = pending == "between"
+        elif pending == "far_from" and clause.verb in PUSHING_VERBS | DELIVERY_VERBS and not clause.current_place:
+            self._relations.relate("near", noun)  # "pull the chair away from the wall": it is there now
+        else:
+            if clause.pending_places and clause.verb in GO_VERBS | STOPPING_VERBS:
+                self._make_places_targets()  # "stop behind the car near the tree"
+            self._relations.relate(pending, noun)
+
+    def _assign_waypoint(self, noun: NounPhrase) -> None:
+        self.target(noun, TargetRole.OBJECT)
+        self.clause.route = True
+
+    def _assign_path_end(self, noun: NounPhrase) -> None:
+        """Make the end of a path a target; where a door leads or what a key opens is no target."""
+        if self.clause.route:
+            self.target(noun, TargetRole.DESTINATION)
+        else:
+            self.clause.last_relation = "with"
+
+    def _acts_on_people(self) -> bool:
+        return any(subject.split()[-1] in lexicon.PEOPLE for subject in self.clause.objects)
+
+    def _is_destination(self, pending: str, following: Sequence[Chunk]) -> bool:
+        """Return True if the preposition states where to put the objects: "put the mug on the desk"."""
+        clause = self.clause
+        if clause.by_pronoun and clause.verb in DELIVERY_VERBS and pending in _DESTINATION_RELATIONS:
+            return True
+        if clause.verb in PUSHING_VERBS and clause.objects and clause.preposition.startswith(("to the ", "on to")):
+            return True  # "move the mug to the left of the plate"
+        if clause.verb in ATTACHING_VERBS and not clause.current_place:
+            return self._is_final_place(pending, following)
+        return clause.verb in PLACE_VERBS and not clause.current_place and self._is_final_place(pending, following)
+
+    def _is_route_point(self, pending: str) -> bool:
+        return pending == "past" and self.clause.verb in GO_VERBS and bool(self.clause.objects)
+
+    def _add_anchor(self, relation: str, noun: NounPhrase) -> None:
+        if relation == "to":
+            self._add_destination(noun, conjoined=True)
+        elif relation == "with":
+            self._add_tool(noun, conjoined=True)
+        else:
+            self._relations.relate(relation, noun)
+
+    def _add_destination(self, noun: NounPhrase, conjoined: bool = False) -> None:
+        self._add_place(noun, TargetRole.DESTINATION, conjoined)
+        self.clause.last_relation = "to"
+
+    def _add_tool(self, noun: NounPhrase, conjoined: bool = False) -> None:
+        self._add_place(noun, TargetRole.TOOL, conjoined)
+        self.clause.last_relation = "with"
+
+    def _add_place(self, noun: NounPhrase, role: TargetRole, conjoined: bool) -> None:
+        self._draft.add_target(noun.text, role)
+        self.clause.places = [*self.clause.places, noun.text] if conjoined else [noun.text]
+
+    def make_tools(self, phrases: Sequence[str]) -> None:
+        """Make earlier objects tools: "take the sponge and wipe the table with it"."""
+        self._draft.roles.update(dict.fromkeys(phrases, TargetRole.TOOL))
+
+    def _assign_after_with(self, noun: NounPhrase) -> None:
+        """Assign the noun after "with": the hat of "find a man with a hat" is near him, a sponge is a tool."""
+        clause = self.clause
+        is_part = noun.head in lexicon.PARTS or noun.head in lexicon.CLOTHING
+        if noun.head in lexicon.BODY_PARTS and clause.objects and not self._are_people(clause.objects):
+            return  # "with both hands"
+        if clause.last_relation == "for":
+            return  # "for the man with the trolley"
+        if clause.last_relation == "to" and clause.places and (is_part or not self._may_be_tool(noun)):
+            self._relations.relate_places(RelationTerms("near"), noun)
+        elif (
+            clause.verb in LOOKING_VERBS
+            or is_part
+            or self._are_people(clause.objects)
+            or (clause.verb in FETCHING_VERBS and noun.head not in lexicon.HELD_TOOLS)
+        ):
+            self._relations.relate("near", noun)
+        else:
+            self._add_tool(noun)
+
+    def _may_be_tool(self, noun: NounPhrase) -> bool:
+        return self.clause.verb in TOOL_VERBS or noun.head in lexicon.HELD_TOOLS
+
+    def _assign_loaded(self, noun: NounPhrase) -> None:
+        """Make the noun the object and the objects so far destinations: "load the van with boxes"."""
+        places, self.clause.objects = self.clause.objects, []
+        self._draft.roles.update(dict.fromkeys(places, TargetRole.DESTINATION))
+        self.target(noun, TargetRole.OBJECT)
+
+    def _is_recipient(self, following: Sequence[Chunk]) -> bool:
+        """Return True for the first noun of "hand the nurse the towel", which states the destination."""
+        clause = self.clause
+        while len(following) > 1 and following[0].kind is ChunkKind.PREPOSITION and following[1].kind is ChunkKind.NOUN:
+            following = following[2:]  # "bring the man in the wheelchair a drink"
+        follows = bool(following) and following[0].kind is ChunkKind.NOUN
+        return follows and clause.verb in GIVING_VERBS and not clause.objects
+
+    def _is_final_place(self, pending: str, following: Sequence[Chunk]) -> bool:
+        """Return True if no later place is the destination; "on the table into the sink" goes to the sink."""
+        more = [chunk.word for chunk in following[:1] if chunk.kind is ChunkKind.PREPOSITION]
+        rooms = [chunk.noun for chunk in following[1:2] if chunk.noun and chunk.noun.head in lexicon.ROOMS]
+        final = "to" in more or (pending == "on" and bool(_FINAL_DESTINATIONS.intersection(more)) and not rooms)
+        return bool(self.clause.objects) and pending in _DESTINATION_RELATIONS and not final
+
+    def _is_second_anchor(self, noun: NounPhrase, after: Chunk | None) -> bool:
+        """Return True for the stove in "near the sink and the stove", not for a target of its own."""
+        if after is not None and after.kind is ChunkKind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
+            return False
+        if self.clause.last_relation == "between" or self.clause.between:
+            return True
+        if lexicon.is_space(noun.words) and self.clause.in_space:
+            return True
+        return noun.head in lexicon.COMMON_ANCHORS and self.clause.last_relation not in ("on", "inside", "with")
+
+    def _role_of_object(self) -> TargetRole:
+        """Return the role of a verb's direct object."""
+        if self.clause.verb in AVOIDING_VERBS:
+            return TargetRole.OBSTACLE
+        if self.clause.verb in REACHING_VERBS | STOPPING_VERBS:
+            return TargetRole.DESTINATION
+        return TargetRole.TOOL if self.clause.verb == "use" else TargetRole.OBJECT
+
+    def target(self, noun: NounPhrase, role: TargetRole, conjoined: bool = False) -> None:
+        """Make the noun a target and the clause's object; a conjoined noun is added to the objects."""
+        clause, phrase = self.clause, noun.text
+        if lexicon.is_space(noun.words) and role is TargetRole.OBJECT and clause.verb in COVERING_VERBS:
+            self._draft.add_context(phrase)  # "clean the kitchen": every object in it
+            phrase = "object"
+        self._draft.add_target(phrase, role, from_statement=clause.statement)
+        clause.objects = [*clause.objects, phrase] if conjoined else [phrase]
+        clause.conjoined, clause.by_pronoun = conjoined, False
+        clause.last_relation, clause.places = None, []
+        clause.superlative = noun.distance_superlative or (clause.superlative if conjoined else None)
+        clause.is_part = noun.head in lexicon.PARTS
+        pending_places, clause.pending_places = clause.pending_places, []
+        for terms, anchor in pending_places:
+            self._relations.relate_by(terms, anchor)
+
+    def _are_people(self, phrases: Sequence[str]) -> bool:
+        return any(phrase.split()[-1] in lexicon.PEOPLE for phrase in phrases)
+
+    def _destination(self, noun: NounPhrase) -> None:
+        clause = self.clause
+        if clause.verb in GO_VERBS | STOPPING_VERBS:
+            self._make_places_targets()  # "between the shelves to the exit"
+        if clause.route or not clause.objects or clause.verb in GO_VERBS - MOVING_VERBS:
+            going = clause.route or clause.verb is None or clause.verb in GO_VERBS | STOPPING_VERBS | DELIVERY_VERBS
+            role = TargetRole.DESTINATION if going else TargetRole.OBJECT
+            self.target(noun, role, conjoined=bool(clause.objects))
+            clause.route = False
+        else:
+            self._add_destination(noun)
+
+    def _assign_searched_object(self, noun: NounPhrase) -> None:
+        """Make the noun the target, near the searched places; a defect to inspect for is no object."""
+        clause = self.clause
+        if clause.objects and clause.verb in INSPECTION_VERBS and noun.head in lexicon.DEFECTS:
+            return
+        if clause.objects and clause.verb in SEARCH_VERBS:
+            places, clause.objects = clause.objects, []
+            self._draft.remove_targets(places)
+            self.target(noun, TargetRole.OBJECT)
+            for place in map(phrase_from_text, places):
+                if place.text != "object":  # a room is context
+                    self._relations.relate("inside" if place.head in lexicon.CONTAINERS else "near", place)
+        elif not clause.objects:
+            self.target(noun, TargetRole.OBJECT)
+        else:
+            clause.last_relation = "for"
+
+    def _assign_after_of(self, noun: NounPhrase) -> None:
+        clause = self.clause
+        if clause.pending_places:
+            return
+        if not clause.objects:
+            self.target(noun, self._role_of_object())
+        elif lexicon.is_space(noun.words):
+            self._draft.add_context(noun.text)
+        elif (clause.is_part or noun.has_determiner) and clause.last_relation is None:
+            self._relations.relate("near", noun)
+
+    def _assign_origin(self, pending: str, noun: NounPhrase) -> None:
+        going = self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.objects
+        if going or self.clause.last_relation == "with":
+            return
+        if pending in _ORIGIN_RELATIONS:
+            self._relations.relate(_ORIGIN_RELATIONS[pending], noun)
+        elif noun.head in lexicon.PEOPLE:
+            self._relations.relate("near", noun)
+        else:
+            encloses = noun.head in lexicon.CONTAINERS or lexicon.is_space(noun.words)
+            self._relations.relate("inside" if encloses else "on", noun)

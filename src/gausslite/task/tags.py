@@ -1,0 +1,277 @@
+"""Part-of-speech tags, and the tag sequence of least cost for a sentence (Viterbi)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import Final
+
+from gausslite.task import lexicon
+from gausslite.task.lexicon import UNCHANGED, is_attribute, singular, word_set
+from gausslite.task.tokens import PREPOSITIONS, split_bounds
+from gausslite.task.verbs import (
+    GO_VERBS,
+    SEARCH_VERBS,
+    TOOL_VERBS,
+    VERBS,
+    base_of_ed,
+    base_of_ing,
+    base_of_s,
+    verb_base,
+)
+
+
+class Tag(Enum):
+    """Parts of speech that the task parser distinguishes.
+
+    PARTICLE: the "up" of "pick up". INFINITIVE: "to". CLAUSE_BREAK: punctuation and words that start a clause.
+    INDEFINITE: "something", "who". ANAPHOR: "it", "this" without a noun.
+    """
+
+    NOUN = "n"
+    ADJECTIVE = "a"
+    DETERMINER = "d"
+    VERB = "v"
+    GERUND = "g"
+    PARTICIPLE = "e"
+    AUXILIARY = "x"
+    PREPOSITION = "p"
+    PARTICLE = "t"
+    INFINITIVE = "u"
+    CONJUNCTION = "c"
+    CLAUSE_BREAK = "s"
+    RELATIVE = "w"
+    PRONOUN = "o"
+    INDEFINITE = "i"
+    ANAPHOR = "k"
+    NEGATION = "q"
+
+    __hash__ = object.__hash__  # members are singletons, and Enum's own hash is slow
+
+
+# Cost of one tag (column) after another (row); "^" is the start and "." the end of the sentence. Chosen by hand:
+# 0 is frequent in English, 10 is occasional, 90 does not occur.
+_COSTS: Final = """
+   n  a  d  v  g  e  x  p  t  u  c  s  w  o  i  k  q  .
+^ 10 10  0  0 10 30  0 10 20 10 20 10 10  0  0 10  0  5
+n  8 20 30 20 10 10  5  0  5  5  0  0  0 20 30 30  0  0
+a  0  3 40 40  8 10 20  7 15 10  5  7 20 30 40 40 20  7
+d  0  0  5 90  7  7 60 20 60 30 30 30 40 50 40 60 40 20
+v  5  5  0 30  8 30 40  0  0  5  5  5 20  0  0  0 10  5
+g  7  7  0 50 30 30 30  0  0 10 10 10 20  5  3  0 20  5
+e  7  7  7 50 30 30 40  0  3 10  7  7 20 10 10 10 10  3
+x  5  0  0  0  0  0  5  0  5  0 20 20 20  0  0  0  0 10
+p  0  0  0 90 10 20 60 30 30 50 30 30 10  0  0  0 20 20
+t 10 10  0 30 30 30 20  0 10  5  0  0 20 10 10 20 10  0
+u 90 90 90  0 50 90  0 90 90 90 90 90 90 90 90 90 10 90
+c  5  5  0  5  7 15  5  5 20  5  0  0  5  3  5 10  0 10
+s  8  8  0  3  5 15  5  5 30 10  0  0  5  0  0 10  0  0
+w 25 15  0  0 30  7  0 20 40  5 20 20 20  0  3  0 10 20
+o 20 20 15  0 10  3  0  0  0  0  0  0 20 15 10 20  0  0
+i 40 20 30 10  7  5  0  0  5  3  0  0  0 10 40 40  0  0
+k 40 20 30 20 20 20  5  0  5  5  0  0 10 40 40 40 10  0
+q  5  5  0  0  0 10 10 10 30  5 20 20 20  5  0  0 20 20
+"""
+
+
+def _table(text: str) -> dict[Tag | None, dict[Tag | None, int]]:
+    """Return the costs by row and column tag; None is the start as a row and the end as a column."""
+    header, *rows = [line.split() for line in text.strip().splitlines()]
+    columns = [None if name == "." else Tag(name) for name in header]
+    return {None if row[0] == "^" else Tag(row[0]): dict(zip(columns, map(int, row[1:]), strict=True)) for row in rows}
+
+
+TRANSITION_COSTS: Final = _table(_COSTS)
+
+
+def best_tags(candidates: Sequence[Mapping[Tag, int]]) -> list[Tag]:
+    """Return one tag per word that minimises the sum of word costs and transition costs (Viterbi)."""
+    paths: dict[Tag | None, int] = {None: 0}
+    backpointers: list[dict[Tag, Tag | None]] = []
+    for options in candidates:
+        reached: dict[Tag | None, int] = {}
+        origins: dict[Tag, Tag | None] = {}
+        for tag, own_cost in options.items():
+            cost, origin = min(
+                ((path_cost + TRANSITION_COSTS[before][tag], before) for before, path_cost in paths.items()), key=_cost
+            )
+            reached[tag], origins[tag] = cost + own_cost, origin
+        paths = reached
+        backpointers.append(origins)
+    last = min(paths, key=lambda tag: paths[tag] + TRANSITION_COSTS[tag][None])
+    found: list[Tag] = []
+    for origins in reversed(backpointers):
+        if last is not None:
+            found.append(last)
+            last = origins[last]
+    return found[::-1]
+
+
+def _cost(pair: tuple[int, Tag | None]) -> int:
+    return pair[0]
+
+
+Options = dict[Tag, int]
+
+# one line for words with the same possible tags; the digits after a tag are its cost
+_CLOSED_LINES: Final = (
+    ("d0", "a an the my your his our their its every whose no"),
+    ("d0 o3", "her"),
+    ("d0 k2", "this these those"),
+    ("d0 k4 w0 s13", "that"),
+    ("d0 w0", "which"),
+    ("d0 n3", "one"),
+    ("d0 t15", "all both each more most"),
+    ("d0 s3", "first second third last next"),
+    ("d5 a0 n9", "half"),
+    ("k0", "it them"),
+    ("o0", "i me you he him she we us they myself yourself itself themselves himself herself mine yours"),
+    (
+        "x0",
+        "is are was were be been being am could would should will shall may might must does did has had having ought",
+    ),
+    ("x4 n0", "can"),
+    ("a0 p2", "closest nearest"),
+    ("x0 v15", "do have"),
+    ("v0", "let lets"),
+    ("i3 w0", "who"),
+    ("w0", "whom where how why"),
+    ("s0 w5", "when"),
+    ("s0", ". ; : ! ? then while if whether because unless although though once as than"),
+    ("s0 p2", "before after until since"),
+    ("c0", "and or , / & plus but + ( )"),
+    ("p0 u0", "to"),
+    ("t0", "away out apart ahead forward forwards backward backwards upstairs downstairs aside"),
+    ("t0 n8 a5 v15", "back"),
+    ("t0 p20", "up down"),
+    ("t0 p3", "off"),
+    ("t3 p2", "around"),
+    ("t0 p2", "outside"),
+    ("p0 t5", "over inside"),
+    ("p0 t10", "in on under below above behind along through past across by near"),
+    ("p0 g0", "touching facing surrounding"),
+    ("p3 v0", "like"),
+    ("a0 e3 n14 t20", "left"),
+    ("a0 n14 t8", "right"),
+    ("n0", "ones everywhere"),
+    ("i0 d8", "what whatever"),
+)
+# "go stand", "help clean": the second verb is the instruction
+_LEADING_VERBS: Final = word_set("go come help")
+_NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
+_MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
+_USUALLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | word_set("stop hand")
+_NEVER_NOUNS: Final = GO_VERBS | word_set(
+    "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
+    "know think eat sit seem contain include become lose forget boil"
+)
+_POSSESSIVES: Final = ("'s", "s'")
+_NOUNS: Final = (
+    lexicon.NOUNS
+    | lexicon.PLACES
+    | lexicon.ROUTES
+    | lexicon.MEASURES
+    | lexicon.PARTS
+    | lexicon.ADDRESSEES
+    | lexicon.COMPOUND_GERUNDS
+)
+_ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most")
+_VERB_ENDINGS: Final = ("ize", "ise", "ify", "ate")
+_VERB_OPENINGS: Final = ("re", "un", "dis", "de", "over", "pre", "mis")
+
+
+def _options(line: str) -> Options:
+    return {Tag(each[0]): int(each[1:]) for each in line.split()}
+
+
+_CLOSED: Final[dict[str, Options]] = (
+    {word: {Tag.PREPOSITION: 0} for word in PREPOSITIONS}
+    | {" ".join(negation): {Tag.NEGATION: 0} for negation in lexicon.NEGATIONS}
+    | {word: {Tag.DETERMINER: 0} for word in lexicon.DETERMINERS}
+    | {word: {Tag.INDEFINITE: 0} for word in lexicon.INDEFINITE_PRONOUNS}
+    | {word: _options(line) for line, listed in _CLOSED_LINES for word in listed.split()}
+)
+
+
+def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
+    """Return the words with their part-of-speech tags; adverbs are dropped, because no graph needs them."""
+    kept = [unit for unit in units if not is_adverb(unit)]
+    neighbours = zip(["", *kept], kept, [*kept[1:], ""], strict=False)
+    return list(zip(kept, best_tags([_tag_options(*three) for three in neighbours]), strict=True))
+
+
+def is_adverb(word: str) -> bool:
+    """Return True for "carefully", "please" and "clockwise"."""
+    if word in lexicon.ADVERBS:
+        return True
+    ending = word.endswith(("ly", "wise", "wards"))
+    return ending and not (word in lexicon.ADJECTIVES or singular(word) in _NOUNS or word in VERBS or word in _CLOSED)
+
+
+def _tag_options(before: str, word: str, after: str) -> Options:
+    if before in _LEADING_VERBS | _NEGATED_COMMANDS and word in VERBS:
+        return {Tag.VERB: 0}
+    if (word, after) in lexicon.COMPOUND_OPENERS:
+        return {Tag.ADJECTIVE: 0}
+    if before == "without" and base_of_ing(word) is not None:
+        return {Tag.GERUND: 0}
+    if word == "one" and after in _MODALS_AFTER_ONE:
+        return {Tag.PRONOUN: 0}
+    if after == "of" and word in ("one", "half"):
+        return {Tag.DETERMINER: 0} if word == "one" else {Tag.NOUN: 0}
+    closed = _CLOSED.get(split_bounds(word)[0])
+    if closed is not None:
+        return closed
+    if word[0].isdigit():
+        return {Tag.DETERMINER: 0, Tag.NOUN: 5}
+    if word.endswith(_POSSESSIVES) and len(word) > 3:
+        return {Tag.ADJECTIVE: 0, Tag.DETERMINER: 0}
+    is_noun = singular(word) in _NOUNS or word in _NOUNS or word in UNCHANGED
+    options = _verb_options(before, word, is_noun)
+    if word in lexicon.ADJECTIVES or is_attribute(word):
+        options[Tag.ADJECTIVE] = 0
+    if is_noun:
+        options[Tag.NOUN] = 5 if before == "to" and word in _USUALLY_VERBS else 0
+    elif options:
+        options.setdefault(Tag.NOUN, _noun_cost_of_verb(before, word))
+    else:
+        options = {
+            Tag.NOUN: 5,
+            Tag.ADJECTIVE: 3 if word.endswith(_ADJECTIVE_ENDINGS) else 20 if word.endswith("s") else 12,
+            Tag.VERB: 40,
+        }
+    return options
+
+
+def _noun_cost_of_verb(before: str, word: str) -> int:
+    """Return the cost of a known verb as a noun, which is low after another noun: "a stop button"."""
+    if word in lexicon.ADJECTIVES or not before or before in _CLOSED or verb_base(word) in _NEVER_NOUNS:
+        return 30
+    return 20 if word.endswith("s") else 12
+
+
+def _verb_options(before: str, word: str, is_noun: bool) -> Options:
+    """Return the tags of the word as a verb form, known or by its ending."""
+    options: Options = {}
+    if word in VERBS:
+        usual = not is_noun or (word in _USUALLY_VERBS and (before == "to" or (before == "and" and word in GO_VERBS)))
+        options[Tag.VERB] = 0 if usual else 5 if word in _USUALLY_VERBS else 12
+        if before in _NOUNS:  # "the cup bring": a singular noun is not the verb's subject
+            options[Tag.VERB] += 8
+    elif base_of_s(word) is not None:
+        options[Tag.VERB] = 2 if not is_noun else 8 if base_of_s(word) in _USUALLY_VERBS else 18
+    elif not is_noun and (word.endswith(_VERB_ENDINGS) or _prefixed(word)):
+        options[Tag.VERB] = 5
+    if base_of_ing(word) is not None:
+        options[Tag.GERUND] = 10 if is_noun else 0
+    elif word.endswith("ing") and len(word) > 5 and not is_noun:
+        options |= {Tag.GERUND: 5, Tag.NOUN: 6}
+    if base_of_ed(word) is not None:
+        options[Tag.PARTICIPLE] = 8 if is_noun else 0
+    elif word.endswith("ed") and len(word) > 4 and not is_noun:
+        options[Tag.PARTICIPLE] = 3
+    return options
+
+
+def _prefixed(word: str) -> bool:
+    return any(word.startswith(opening) and word[len(opening) :] in VERBS for opening in _VERB_OPENINGS)

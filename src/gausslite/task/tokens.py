@@ -1,0 +1,322 @@
+"""Find distances such as "within 2 m of" and "half a metre behind", and replace each by one marker word."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+from gausslite.task import lexicon
+from gausslite.task.lexicon import COLOURS, COMPARATIVES
+
+_NUMBERS: Final = {
+    "a quarter of a": 0.25, "half a": 0.5, "half an": 0.5, "half": 0.5, "a couple of": 2.0, "a": 1.0, "an": 1.0,
+    "one": 1.0, "two": 2.0, "three": 3.0, "four": 4.0, "five": 5.0, "six": 6.0, "seven": 7.0, "eight": 8.0,
+    "nine": 9.0, "ten": 10.0, "twelve": 12.0, "fifteen": 15.0, "twenty": 20.0,
+}  # fmt: skip
+# metres by the first letters of a unit
+_UNITS_M: Final = (
+    ("centi", 0.01), ("cm", 0.01), ("milli", 0.001), ("mm", 0.001), ("f", 0.3048), ("in", 0.0254), ("y", 0.9144),
+    ("step", 0.75), ("pace", 0.75), ("m", 1.0),
+)  # fmt: skip
+_VALUE: Final = rf"(?:\d{{1,4}}(?:[.,]\d{{1,3}})?|{'|'.join(sorted(_NUMBERS, key=len, reverse=True))})(?: and a half)?"
+_UNIT: Final = (
+    r"(?:centimet(?:er|re)s?|cms?|millimet(?:er|re)s?|mm|met(?:er|re)s?|m|feet|foot|ft|inch(?:es)?|yards?|paces?|"
+    r"steps?)"
+)
+_MAX: Final = (
+    r"within|inside|less than|at most|up to|under|below|a maximum of|max(?:imum)?|(?:closer|nearer) than|"
+    r"(?:no|not) (?:more|further|farther|greater)(?: away)? than|not over|(?:no|not) beyond"
+)
+_MIN: Final = (
+    r"at least|more than|over|above|beyond|a minimum of|min(?:imum)?|(?:further|farther)(?: away)? than|"
+    r"outside(?: of)?|"
+    r"(?:no|not) (?:less|closer|nearer)(?: away)? than"
+)
+_ABOUT: Final = r"about|around|roughly|approximately|approx|some|exactly|nearly|almost|just|only|circa"
+# other prepositions that a distance can bound
+_BOUNDED: Final = r"behind|in front|left|right|to the|above|below|under|underneath|beneath|over|inside|on the"
+_DISTANCE: Final = re.compile(
+    rf"\b(?:at a distance of )?(?:(?P<max>{_MAX})|(?P<min>{_MIN}))?(?: ?\b(?:{_ABOUT}))? ?"
+    rf"(?:\bbetween )?\b(?:(?P<low>{_VALUE})(?: ?{_UNIT})?(?: ?- ?| to | and | or ))?(?P<value>{_VALUE}) ?{_UNIT}\b"
+    rf"(?P<half> and a half)?(?: or (?P<or>less|more))?(?: (?:away|apart|off|distant))?"
+    rf"(?: (?P<link>from|of|to)\b(?! the (?:left|right))|(?= (?:{_BOUNDED})\b))"
+)
+_UNIT_AFTER: Final = re.compile(rf"{_VALUE} ?(?P<unit>{_UNIT})\b")
+_VAGUE: Final = re.compile(
+    r"\b(?:a few|several|some|many|various|a number of) (?:met(?:er|re)s?|feet|steps?|paces?|yards?|inch(?:es)?|"
+    r"centimet(?:er|re)s?)(?: away)? from\b|\b(?:at )?(?:some|a|a certain|a short|a safe|a little) "
+    r"(?:distance|way)(?: away)? from\b"
+)
+# after a number or a unit, a minus sign is a range: "2 -3 m"
+_NEGATIVE: Final = re.compile(
+    rf"(?:\b(?:{_MAX}|{_MIN}|{_ABOUT}) )*(?:(?<![\w])(?<![\dm] )[-\u2212](?=\d)|\bminus ){_VALUE} ?{_UNIT}\b"
+    rf"(?: (?:away|apart|off|distant))?(?: (?:of|from|to)\b)?"
+)
+_MARKER: Final = re.compile(r"(at|bound)distance_(x|\d+)_(x|\d+)")
+VAGUE_MARKER: Final = "vaguedistance"
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Bounds of a distance; None where there is none. stands_alone: the marker is a preposition itself, "2 m from"."""
+
+    min_m: float | None = None
+    max_m: float | None = None
+    stands_alone: bool = False
+
+
+UNBOUNDED: Final = Bounds()
+
+
+def mark_distances(text: str) -> str:
+    """Return the text with every distance to something replaced by a marker word.
+
+    A negative distance, which nothing has, becomes the marker of a distance without a number.
+    """
+    return _DISTANCE.sub(_marker, _NEGATIVE.sub(f" {VAGUE_MARKER} ", _VAGUE.sub(f" {VAGUE_MARKER} ", text)))
+
+
+def bounds_of(marker: str) -> Bounds | None:
+    """Return the bounds of a marker word; None for other words."""
+    match = _MARKER.fullmatch(marker)
+    if match is None:
+        return None
+    low_m, high_m = (None if text == "x" else int(text) / 100 for text in match.groups()[1:])
+    return Bounds(low_m, high_m, match[1] == "at")
+
+
+def _marker(match: re.Match[str]) -> str:
+    link, bounded = match["link"], match["max"] or match["min"] or ""
+    if (link == "of" and not bounded.startswith(("within", "inside", "outside"))) or (
+        link == "to" and "er than" not in bounded
+    ):
+        return match[0]
+    unit = _UNIT_AFTER.search(match[0], match.start("value") - match.start())
+    scale_m = next(metres for start, metres in _UNITS_M if unit is not None and unit["unit"].startswith(start))
+    value_m = (_number(match["value"]) + 0.5 * (match["half"] is not None)) * scale_m
+    low_m = value_m if match["low"] is None else _number(match["low"]) * scale_m
+    is_max = match["max"] is not None or match["or"] == "less"
+    is_min = match["min"] is not None or match["or"] == "more"
+    low = "x" if is_max else f"{100 * low_m:.0f}"
+    high = "x" if is_min else f"{100 * value_m:.0f}"
+    return f" {'at' if link else 'bound'}distance_{low}_{high} "
+
+
+def _number(text: str) -> float:
+    whole, and_a_half, _ = text.partition(" and a half")
+    value = _NUMBERS[whole] if whole in _NUMBERS else float(whole.replace(",", "."))
+    return value + 0.5 * bool(and_a_half)
+
+
+_NUMBER: Final = r"(?:a few|a couple of|several|some|at least|about|one|two|three|four|five|half an?|a|\d+)"
+_LENGTH: Final = r"(?:met(?:er|re)s?|feet|foot|steps?|cm|m|inch(?:es)?|paces?|yards?|centimet(?:er|re)s?)"
+_IDIOMS_DISTANCE: Final = rf"{_NUMBER}(?: (?:one|two|three|a|\d+))? {_LENGTH}"
+_PLAIN: Final = {
+    # short forms
+    r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
+    r"(you|we|they)'re": r"\1 are",
+    r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
+    rf"at (?:least|most)(?= (?:one|two|three|four|five|six|seven|eight|nine|ten|\d+) (?!{_LENGTH}\b))": "",
+    r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
+    r"let's": "let us",
+    # a double negation is a request
+    r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
+    r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
+        "handle"
+    ),
+    r"(on|in|inside|under|near|behind|at|above) neither (.{2,40}?) nor(?: \1)?": r"not \1 \2 and not \1",
+    r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor (on|in|inside|under|near|behind|at|above)": (
+        r"not \1 \2 and not \3"
+    ),
+    r"face[ -](?:down|up)": "",
+    r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)": "i see",
+    r"back(?= where\b)": "",
+    r"(?:so|as|very|quite|too) well": "",
+    r"reach(?:ing)? for": "grab",
+    r"(?:head|make|leave|set off|set out) for(?= (?:the|a|an|my|that|this)\b)": "go to",
+    r"(there|where|what|who)s": r"\1 is",
+    r"(where|how|what|who)'d": r"\1 did",
+    r"u": "you",
+    r"take (?:a|two|three|\d+) (?:\w+ )?steps?": "go",
+    r"sth|smth": "something",
+    r"(?:step|task|item|phase) \d+ ?[:.)]": ";",
+    r"(?:there is )?no need to": "do not",
+    r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
+    r"gimme": "give me",
+    r"lemme": "let me",
+    r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
+    r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
+    # light verbs, whose noun carries the meaning
+    r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
+    r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
+    r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
+    r"(?:take|make) (?:a )?note of|take stock of": "look at",
+    r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
+    r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
+    r"(?:take|get) (?:good )?(?:care|hold) of": "handle",
+    r"(?:make|find) (?:your|its) way(?= (?:to|towards?|into|through|past|out|back)\b)": "go",
+    r"be careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|take care not to": "do not",
+    r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
+    r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
+    r"keep (?:your|a safe|some|a) distance (?:from|to)": "avoid",
+    rf"(?:keep|stay|remain) (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
+    r"not (?:\w+ )?far (?:away )?from": "near",
+    r"(?:farthest|furthest|most distant) away(?! from)|most distant(?! from)": "farthest",
+    r"with no(?= \w)": "without",
+    r"(?:ground|first|second|third|fourth|top|upper|lower|next|\d+(?:st|nd|rd|th)) floor\b"
+    r"(?! (?:tile|lamp|mat|plan|board))": "storey",
+    r"(\w+)-colou?red": r"\1",
+    r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
+    r"right(?= (?:next|beside|behind|under|above|in front|by|inside|at|below|between|on top)\b)": "",
+    r"in (?:a|one) (?:\w+ )?(?:row|line|pile|stack|heap|circle)": "",
+    r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
+    r"give (?:\w+ )?priority to|prioriti[sz]e|spend (?:\w+ )*?(?:time|effort|budget) on": "look at",
+    r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
+    r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
+    r"(?:with the exception|to the exclusion) of|other than|but for": "except",
+    r"(everything|everyone|all|anything) but": r"\1 except",
+    r"as well as|along with|together with|in addition to|and also|plus": "and",
+    r"in between": "between",
+    r"((?:every|all|any) (?:\w+ ){0,2}\w+) but(?= (?:the|a|an|my|this|that|those) )": r"\1 except",
+    # "give the table a wipe": the last noun carries the meaning
+    r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
+}
+_IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
+_COLOUR: Final = "|".join(sorted(COLOURS))
+# one object with two colours: "a black and white cat", but not "the red and blue mugs"
+_TWO_COLOURS: Final = re.compile(
+    rf"\b(?:(?<=\ba )|(?<=\bthe )|(?<=\bthat ))({_COLOUR}) and ({_COLOUR})(?= \w*[^s\W]\b)"
+)
+# no graph states a comparison; comparatives of distance ("further than 2 m from") are no comparisons of objects
+_COMPARISON: Final = re.compile(
+    rf"\b(?:{'|'.join(sorted(COMPARATIVES))}) than (?:(?:the|an?|my|your|this|that|its|all|any) )*[\w.]+"
+    rf"(?: (?:{_LENGTH}|kg|others?|ones?|high|tall|wide|long)\b)*"
+)
+_ARROW: Final = re.compile(r"\s*(?:->|=>|\u2192)\s*")
+_LEAVE_ALONE: Final = re.compile(
+    r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
+    r"|be|for (?:now|later)|where (?:it is|they are))\b"
+)
+
+
+def comparisons(text: str) -> list[str]:
+    """Return the comparisons of a normalised text, such as "taller than one metre", which no graph states."""
+    return [match[0] for match in _COMPARISON.finditer(text)]
+
+
+def replace_idioms(text: str) -> str:
+    """Return a normalised sentence with idioms replaced."""
+    text = _ARROW.sub(" to ", text)
+    text = _LEAVE_ALONE.sub(r"do not touch \1", text)
+    for idiom, plain in _IDIOMS:
+        text = idiom.sub(plain, text)
+    text = _COMPARISON.sub("", text)
+    return mark_distances(_TWO_COLOURS.sub(r"\1-and-\2", text))
+
+
+# a relation that is not a Predicate becomes `near`, with a warning; prepositions are separated by "|"
+_BY_RELATION: Final = {
+    "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
+    "connected to|in the vicinity of|next|surrounding|along|close by|by the side of|"
+    "at the side of|right next to|in reach of|within reach of|leaning on|leaning against|at the end of|"
+    "at the foot of|at the base of|at the edge of|on either side of|on both sides of|within arm's reach of|"
+    "within easy reach of|tied to|chained to|hooked to|leashed to|plugged into|propped against|"
+    "resting against",
+    "closer": "closer to",
+    "on": "on|all over|scattered over|spread over|"
+    "on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to|"
+    "on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|nailed to|screwed to|"
+    "bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|mounted to|"
+    "hung up on|hanging off",
+    "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
+    "farthest_from": "farthest from|furthest from|farthest to|farthest away from|furthest away from|most distant from|"
+    "furthest to",
+    "far_from": "far from|away from|far away from|clear of|far off",
+    "at_distance": VAGUE_MARKER,
+    "inside": "in|inside|inside of|within|in the middle of|in the center of|in the centre of|in the corner of",
+    "under": "under|underneath|beneath|below|underneath of",
+    "above": "above|over",
+    "behind": "behind|in back of|at the back of|in the back of|to the rear of|at the rear of|on the other side of|"
+    "on the far side of|round the back of|around the back of",
+    "in_front_of": "in front of|at the front of|before the front of|ahead of",
+    "left_of": "left of|to the left of|on the left of|on the left side of|to the left side of|left to|"
+    "on the left-hand side of|on the left hand side of|at the left of|left side of",
+    "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|right to|"
+    "on the right-hand side of|on the right hand side of|at the right of|right side of",
+    "between": "between|in between|among|amongst|amid",
+    "opposite": "opposite|opposite to|across from|facing|opposite of",
+    "outside": "outside|outside of|out in front of",
+    "beyond": "beyond",
+    "past": "past|through|across|via|up|down",
+    "when": "before|after|during|like|until|since|despite|per",
+    "from": "from",
+    "from_on": "off|off of|from the top of|from on top of|from atop",
+    "from_under": "out from under|out from underneath|from under|from underneath|from below|from beneath",
+    "from_inside": "out of|from inside|from within|from inside of|from out of",
+    "from_behind": "from behind|out from behind",
+    "from_near": "from near|from beside|from next to",
+    "to": "to|into|onto|toward|towards|up to|over to|back to|all the way to|down to|inside to|out to",
+    "for": "for",
+    "of": "of",
+    "with": "with|using|by means of|by using",
+}
+PREPOSITIONS: Final = {words: relation for relation, line in _BY_RELATION.items() for words in line.split("|")}
+
+
+_TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")
+_BOUNDS_SIGN: Final = "@"  # no token contains it
+_UNITS: Final = [
+    *(tuple(preposition.split()) for preposition in PREPOSITIONS if " " in preposition),
+    *(negation for negation in lexicon.NEGATIONS if len(negation) > 1),
+]
+# by their first word, the longest first
+_COMPOUNDS: Final = {
+    first: sorted((unit for unit in _UNITS if unit[0] == first), key=len, reverse=True)
+    for first in {unit[0] for unit in _UNITS}
+}
+
+
+def tokenize(text: str) -> list[str]:
+    """Return the lower-case words, the numbers and the relevant punctuation of a text without idioms."""
+    return _TOKEN.findall(replace_idioms(text))
+
+
+def lexical_units(text: str) -> list[str]:
+    """Return the tokens of a text, with multi-word prepositions and negations merged."""
+    tokens = tokenize(text)
+    units: list[str] = []
+    start = 0
+    bounds = ""
+    while start < len(tokens):
+        marked = bounds_of(tokens[start])
+        if marked is not None:
+            bounds = f"{_BOUNDS_SIGN}{tokens[start]}"
+            if marked.stands_alone:
+                units.append(f"near{bounds}")
+                bounds = ""
+            start += 1
+            continue
+        compounds = _COMPOUNDS.get(tokens[start], ())
+        length = next((len(unit) for unit in compounds if tuple(tokens[start : start + len(unit)]) == unit), 1)
+        if length > 1 and tokens[start + length - 1] == "to" and _begins_preposition(tokens, start + length - 1):
+            length -= 1  # "not to the left of"
+        unit = " ".join(tokens[start : start + length])
+        units.append(unit + bounds if unit in PREPOSITIONS else unit)
+        bounds = ""
+        start += length
+    return units
+
+
+def split_bounds(unit: str) -> tuple[str, Bounds | None]:
+    """Return a preposition without its distance, and the distance."""
+    text, _, marker = unit.partition(_BOUNDS_SIGN)
+    return text, bounds_of(marker)
+
+
+def _begins_preposition(tokens: list[str], start: int) -> bool:
+    """Return True if a preposition of several words begins here."""
+    compounds = _COMPOUNDS.get(tokens[start], ())
+    return any(
+        " ".join(unit) in PREPOSITIONS and tuple(tokens[start : start + len(unit)]) == unit for unit in compounds
+    )

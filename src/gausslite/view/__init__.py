@@ -1,1 +1,0 @@
-"""A page in the browser that shows maps, runs, agents and fusion servers."""

@@ -1,0 +1,138 @@
+"""Call the services from one asyncio loop, with any bytes: load generators and fuzzing do."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator, Sequence
+
+import grpc
+
+from gausslite.domain.errors import CodecError
+from gausslite.v1 import agent_service_pb2, fusion_service_pb2, parser_service_pb2
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.wire.channel import require_callable
+
+ENDED_WHILE_SENDING = "ENDED_WHILE_SENDING"
+_LOCAL_ERROR = "Internal error from Core"
+"""What grpc.aio makes up when the server has ended a call and a message cannot be written any more."""
+_MODULES = (agent_service_pb2, fusion_service_pb2, parser_service_pb2)
+
+
+def service_methods() -> dict[str, dict[str, bool]]:
+    """Return the methods of each service, by its full name, and whether a method takes a stream of requests."""
+    services = [each for module in _MODULES for each in module.DESCRIPTOR.services_by_name.values()]
+    return {each.full_name: {method.name: method.client_streaming for method in each.methods} for each in services}
+
+
+class RawCalls:
+    """Owns a connection to one service; an asynchronous context manager. Raises InvalidInputError for its address."""
+
+    def __init__(self, address: str, service: str) -> None:
+        require_callable("RawCalls address", address)
+        self._service = service
+        self._channel = grpc.aio.insecure_channel(address)
+
+    async def __aenter__(self) -> RawCalls:
+        return self
+
+    async def __aexit__(self, *exception: object) -> None:
+        await self._channel.close(None)
+
+    async def call(self, method: str, messages: Sequence[bytes], timeout_s: float) -> str:
+        """Send the messages; returns OK after the first answer or a good end, else the name of the status code.
+
+        ENDED_WHILE_SENDING: the server has refused one of the messages, but its code has not arrived.
+        """
+
+        async def requests() -> AsyncIterator[bytes]:
+            for message in messages:
+                yield message
+
+        # without serializers the bytes are sent as they are; on the wire, every kind of method is a pair of streams
+        call = self._channel.stream_stream(f"/{self._service}/{method}")(  # type: ignore[call-arg]
+            requests(), timeout=timeout_s
+        )
+        try:
+            async for _ in call:
+                break
+        except grpc.aio.AioRpcError as error:
+            return ENDED_WHILE_SENDING if error.details() == _LOCAL_ERROR else str(error.code().name)
+        finally:
+            call.cancel()
+        return grpc.StatusCode.OK.name
+
+
+def is_stored(outcome: pb.SubsetOutcome) -> bool:
+    """Return whether the server has the updates of a message, or newer ones of the same voxels."""
+    return outcome.status in (pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE)
+
+
+class UpdateStream:
+    """One agent's stream. The methods raise grpc.aio.AioRpcError if the server ends it."""
+
+    def __init__(self, stub: pb_grpc.FusionServiceAsyncStub, session_id: str) -> None:
+        self._stub, self._session_id = stub, session_id
+        # without an iterator, the caller writes
+        self._call = stub.ContributeSubsets()  # type: ignore[call-arg]
+        self._sequence = 0
+
+    async def send(self, subset: bytes) -> None:
+        """Send an encoded subset and wait for its acknowledgement. Raises CodecError if it is not accepted."""
+        self._sequence += 1
+        await self._call.write(self._request(subset, self._sequence))
+        response = await self._call.read()
+        if not isinstance(response, pb.ContributeSubsetsResponse):
+            raise CodecError(f"subset {self._sequence}: expected an acknowledgement, got the end of the stream")
+        if response.outcomes[0].status != pb.SUBSET_STATUS_ACCEPTED:
+            raise CodecError(f"subset {self._sequence}: {response.outcomes[0].message or 'not accepted'}")
+
+    async def resend(self, subsets: Sequence[bytes]) -> int:
+        """Send messages of the past again, in this order; returns how many got an outcome before the stream ended."""
+        count = 0
+        with contextlib.suppress(grpc.RpcError):
+            for subset in subsets:
+                self._sequence += 1
+                await self._call.write(self._request(subset, self._sequence))
+                if not isinstance(await self._call.read(), pb.ContributeSubsetsResponse):
+                    break
+                count += 1
+            await self.close()
+        return count
+
+    async def close(self) -> None:
+        """End the stream."""
+        await self._call.done_writing()
+
+    async def resend_forever(self, subset: bytes) -> None:
+        """Send the same subset as fast as flow control lets it pass, without waiting for acknowledgements."""
+
+        async def requests() -> AsyncIterator[pb.ContributeSubsetsRequest]:
+            while True:
+                self._sequence += 1
+                yield self._request(subset, self._sequence)
+
+        async for _ in self._stub.ContributeSubsets(requests()):
+            pass
+
+    def _request(self, subset: bytes, sequence: int) -> pb.ContributeSubsetsRequest:
+        return pb.ContributeSubsetsRequest(session_id=self._session_id, sequence=sequence, subset=subset)
+
+
+class UpdateStreams:
+    """Owns the connection; an asynchronous context manager. Raises InvalidInputError for a malformed address."""
+
+    def __init__(self, address: str) -> None:
+        require_callable("UpdateStreams address", address)
+        self._channel = grpc.aio.insecure_channel(address)
+        self._stub = pb_grpc.FusionServiceStub(self._channel)
+
+    async def __aenter__(self) -> UpdateStreams:
+        return self
+
+    async def __aexit__(self, *exception: object) -> None:
+        await self._channel.close(None)
+
+    def open(self, session_id: str) -> UpdateStream:
+        """Return a new stream of a session."""
+        return UpdateStream(self._stub, session_id)

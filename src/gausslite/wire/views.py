@@ -1,0 +1,201 @@
+"""What a robot sees, for a person: the newest keyframe with its region, and the camera's path, as a message."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, UInt8
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera
+from gausslite.domain.checks import require_name
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.relevance import DetectedBox, DetectedImage
+from gausslite.v1 import agent_service_pb2 as agent_pb
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import geometry_pb2
+from gausslite.wire.convert import (
+    MAX_IMAGE_PX,
+    camera_from_message,
+    camera_to_message,
+    decode_colour,
+    decode_mask,
+    encode_colour,
+    encode_mask,
+    transform_from_message,
+    transform_to_message,
+)
+
+MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraView:
+    """The newest keyframe, its pose, and the poses of all frames and keyframes, in the map.
+
+    roi: True in the task's region. times_ns: the capture times of the path, oldest first. detected: what the detector
+    found in the image on which it ran last; None without a detector.
+    """
+
+    rgb: UInt8[ndarray, "h w 3"]
+    roi: Bool[ndarray, "h w"]
+    camera: Camera
+    frame_index: int
+    T_world_camera: Float64[ndarray, "4 4"]
+    times_ns: Int64[ndarray, " t"]
+    path: Float64[ndarray, "t 4 4"]
+    keyframes: Float64[ndarray, "k 4 4"]
+    detected: DetectedImage | None = None
+
+
+def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewResponse:
+    """Encode a view with a JPEG; long paths are thinned evenly. An agent without keyframes has an empty view."""
+    if view is None:
+        return agent_pb.GetCameraViewResponse()
+    return agent_pb.GetCameraViewResponse(
+        colour_jpeg=encode_colour(view.rgb),
+        region_png=encode_mask(view.roi),
+        camera=camera_to_message(view.camera),
+        frame_index=view.frame_index,
+        t_world_camera=transform_to_message(view.T_world_camera),
+        path=[
+            agent_pb.StampedPose(
+                capture_time_ns=int(view.times_ns[i]), t_world_camera=transform_to_message(view.path[i])
+            )
+            for i in _evenly(len(view.path), MAX_POSES)
+        ],
+        keyframes=[transform_to_message(view.keyframes[i]) for i in _evenly(len(view.keyframes), MAX_KEYFRAMES)],
+        detected=None if view.detected is None else _detected_to_message(view.detected),
+    )
+
+
+def camera_view_from_message(message: agent_pb.GetCameraViewResponse) -> CameraView | None:
+    """Decode a view; None for an agent without keyframes. Raises InvalidInputError, PoseError."""
+    if not message.colour_jpeg:
+        return None
+    for name, count, highest in (
+        ("path", len(message.path), MAX_POSES),
+        ("keyframes", len(message.keyframes), MAX_KEYFRAMES),
+    ):
+        if count > highest:
+            raise InvalidInputError(f"camera view {name}: expected at most {highest} poses, got {count}")
+    camera = camera_from_message(message.camera)
+    return CameraView(
+        rgb=decode_colour(message.colour_jpeg, camera.width_px, camera.height_px),
+        roi=decode_mask(message.region_png, camera.width_px, camera.height_px),
+        camera=camera,
+        frame_index=message.frame_index,
+        T_world_camera=transform_from_message("camera view t_world_camera", message.t_world_camera),
+        times_ns=np.array([each.capture_time_ns for each in message.path], np.int64),
+        path=_poses("camera view path", [each.t_world_camera for each in message.path]),
+        keyframes=_poses("camera view keyframes", list(message.keyframes)),
+        detected=_detected_from_message(message.detected) if message.HasField("detected") else None,
+    )
+
+
+def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
+    height_px, width_px = detected.rgb.shape[:2]
+    boxes = sorted(detected.boxes, key=lambda each: -each.score)[:MAX_BOXES]
+    return agent_pb.DetectedImage(
+        frame_index=detected.index,
+        colour_jpeg=encode_colour(detected.rgb),
+        width_px=width_px,
+        height_px=height_px,
+        boxes=[
+            agent_pb.DetectedBox(
+                phrase=each.phrase,
+                score=each.score,
+                left_px=each.box_px[0],
+                top_px=each.box_px[1],
+                right_px=each.box_px[2],
+                bottom_px=each.box_px[3],
+                is_weak=each.is_weak,
+            )
+            for each in boxes
+        ],
+    )
+
+
+def _detected_from_message(message: agent_pb.DetectedImage) -> DetectedImage:
+    if not 0 < message.width_px * message.height_px <= MAX_IMAGE_PX:
+        size = f"{message.width_px}x{message.height_px}"
+        raise InvalidInputError(f"detected image: expected 1 to {MAX_IMAGE_PX} pixels, got {size}")
+    if len(message.boxes) > MAX_BOXES:
+        raise InvalidInputError(f"detected boxes: expected at most {MAX_BOXES}, got {len(message.boxes)}")
+    boxes = []
+    for each in message.boxes:
+        require_name("detected phrase", each.phrase)
+        box_px = each.left_px, each.top_px, each.right_px, each.bottom_px
+        if not all(math.isfinite(value) for value in (*box_px, each.score)):
+            raise InvalidInputError("detected boxes: expected finite numbers, got others")
+        boxes.append(DetectedBox(each.phrase, each.score, box_px, is_weak=each.is_weak))
+    rgb = decode_colour(message.colour_jpeg, message.width_px, message.height_px)
+    return DetectedImage(message.frame_index, rgb, tuple(boxes))
+
+
+def _poses(name: str, messages: list[geometry_pb2.RigidTransform]) -> Float64[ndarray, "n 4 4"]:
+    return np.array([transform_from_message(name, each) for each in messages], np.float64).reshape(-1, 4, 4)
+
+
+def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:
+    """Return the positions of at most this many of `count` values, evenly spaced, with the first and the last."""
+    positions: Int64[ndarray, " n"] = np.unique(np.linspace(0, max(count - 1, 0), min(count, highest)).astype(np.int64))
+    return positions
+
+
+class ChangeNotifier:
+    """Subscribe, read the state, then wait on the subscription: so no change is missed. Use it on the event loop."""
+
+    def __init__(self) -> None:
+        self._next_change = asyncio.Event()
+
+    def subscribe(self) -> asyncio.Event:
+        """Return an event that the next `notify` sets."""
+        return self._next_change
+
+    def notify(self) -> None:
+        """Wake all subscribers."""
+        self._next_change.set()
+        self._next_change = asyncio.Event()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredKeyframe:
+    """A keyframe with its frame index. T_world_camera: in the fused map's frame, None if the agent's does not fit.
+
+    indices: of all keyframes that the server has of the agent, ascending. roi: True in the task's region, None if the
+    agent did not send it.
+    """
+
+    index: int
+    capture_time_ns: int
+    rgb: UInt8[ndarray, "h w 3"]
+    camera: Camera
+    T_world_camera: Float64[ndarray, "4 4"] | None
+    indices: tuple[int, ...]
+    roi: Bool[ndarray, "h w"] | None = None
+
+
+def region_from_png(data: bytes, camera: Camera) -> Bool[ndarray, "h w"] | None:
+    """Decode the region of a keyframe; None for empty bytes. Raises InvalidInputError."""
+    return decode_mask(data, camera.width_px, camera.height_px) if data else None
+
+
+def stored_keyframe_from_message(message: pb.GetKeyframeResponse) -> StoredKeyframe | None:
+    """Decode a keyframe; None if the server has none of the agent. Raises InvalidInputError, PoseError."""
+    if not message.colour:
+        return None
+    camera = camera_from_message(message.camera)
+    has_pose = message.HasField("t_world_camera")
+    return StoredKeyframe(
+        index=message.index,
+        capture_time_ns=message.capture_time_ns,
+        rgb=decode_colour(message.colour, camera.width_px, camera.height_px),
+        camera=camera,
+        T_world_camera=transform_from_message("keyframe t_world_camera", message.t_world_camera) if has_pose else None,
+        indices=tuple(message.indices),
+        roi=region_from_png(message.region_png, camera),
+    )

@@ -1,0 +1,335 @@
+"""The camera's poses in a bag: from tf between a world frame and the camera, or from a topic of poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.datasets.files import FolderCamera
+from gausslite.datasets.folder import FIRST_VIEW_UP, PoseTrack
+from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.errors import DatasetError
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
+from gausslite.domain.relevance import Region
+from gausslite_ros.bag_file import BagAddress, BagFile, BagOptions, MessageKey, StampedMessage
+from gausslite_ros.cameras import FrameConverter, RgbdCamera, join_cameras, optical_pose
+from gausslite_ros.messages import camera_of, frame_name, quaternion_of, stamp_ns, translation_of
+from gausslite_ros.topics import (
+    ImageTopic,
+    choose_colour,
+    choose_depth,
+    choose_info,
+    depth_units_per_metre,
+    image_topics,
+    stream_transforms,
+)
+from gausslite_ros.transforms import TransformTree, seconds, track_of, transforms_of
+
+TF, TF_STATIC = "/tf", "/tf_static"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_POSE_TYPES = (
+    _ODOMETRY,
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+_WORLD_FRAMES = ("odom", "map", "world")
+"""Preferred in this order: odometry is continuous, localisation in a map is corrected in jumps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TreePoses:
+    """Poses of a camera in a world frame, from the transforms between them."""
+
+    tree: TransformTree
+    world: str
+    camera: str
+
+    def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
+        """Return T_world_camera; None without transforms near this time. Raises DatasetError, PoseError."""
+        return self.tree.at(self.world, self.camera, time_s)
+
+    def __str__(self) -> str:
+        """Return where the poses come from."""
+        return f"tf {self.world} → {self.camera}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopicPoses:
+    """Poses of a body over time from a topic, and the fixed transform from the camera to the body."""
+
+    track: PoseTrack
+    tree: TransformTree
+    body: str
+    camera: str
+
+    def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
+        """Return T_world_camera; None without a pose near this time. Raises DatasetError, PoseError."""
+        T_world_body = self.track.at(time_s)
+        if T_world_body is None or self.body == self.camera:
+            return T_world_body
+        T_body_camera = self.tree.at(self.body, self.camera, time_s)
+        return None if T_body_camera is None else T_world_body @ T_body_camera
+
+    def __str__(self) -> str:
+        """Return where the poses come from."""
+        return f"{self.track.location}, the pose of {self.body}"
+
+
+CameraPoses = TreePoses | TopicPoses
+
+
+def read_tree(bag: BagFile) -> TransformTree:
+    """Return the frames of /tf_static and /tf, or of a RealSense recording. Raises DatasetError."""
+    transforms = stream_transforms(bag)
+    for topic, static in ((TF_STATIC, True), (TF, False)):
+        for message in bag.messages(topic):
+            transforms += transforms_of(message.transforms, static)
+    return TransformTree(transforms)
+
+
+def choose_poses(bag: BagFile, tree: TransformTree, camera: str, options: BagOptions) -> CameraPoses | None:
+    """Return the poses of the camera; None if the bag has none.
+
+    The first source that the bag has is used: odom=; tf to frame=; tf to the first of odom, map, world and the root
+    that the camera moves in; the only odometry topic. Raises DatasetError if the choice is not clear, and for frames
+    that are not connected.
+    """
+    if options.odom:
+        return _topic_poses(bag, tree, camera, options, options.odom)
+    if options.frame:
+        tree.require_path(options.frame, camera)
+        return TreePoses(tree, options.frame, camera)
+    ancestors = tree.ancestors(camera)
+    for world in (*(name for name in _WORLD_FRAMES if name in ancestors), ancestors[-1]):
+        if tree.changes_over_time(world, camera):
+            return TreePoses(tree, world, camera)
+    topics = [topic for topic, message_type in bag.types.items() if message_type == _ODOMETRY]
+    if len(topics) > 1:
+        raise DatasetError(
+            f"{bag.path}: {len(topics)} topics have odometry: {', '.join(topics)}; choose one with odom=TOPIC"
+        )
+    return _topic_poses(bag, tree, camera, options, topics[0]) if topics else None
+
+
+def _topic_poses(bag: BagFile, tree: TransformTree, camera: str, options: BagOptions, topic: str) -> TopicPoses:
+    message_type = bag.types.get(topic)
+    if message_type not in _POSE_TYPES:
+        known = [name for name, found in bag.types.items() if found in _POSE_TYPES]
+        raise DatasetError(f"{bag.path}: odom={topic}: expected a topic of poses, one of {known or 'none'}")
+    poses = {}
+    body = options.body
+    for message in bag.messages(topic):
+        poses[stamp_ns(message.header)] = _pose(message)
+        if not body:
+            body = frame_name(getattr(message, "child_frame_id", ""))
+    if not poses:
+        raise DatasetError(f"{bag.path}: {topic}: expected poses, got no message")
+    # a pose without the name of its frame is taken for the camera's own
+    body = body or camera
+    if body != camera:
+        tree.require_path(body, camera)
+    return TopicPoses(track_of(f"{bag.path}: {topic}", poses), tree, body, camera)
+
+
+def _pose(message: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return translation and quaternion (x y z w) of a message of any type of poses."""
+    if hasattr(message, "transform"):
+        return translation_of(message.transform.translation), quaternion_of(message.transform.rotation)
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    return translation_of(pose.position), quaternion_of(pose.orientation)
+
+
+_WORLD_UP = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Match:
+    number: int
+    stamp_ns: int
+    colour: MessageKey
+    depth: MessageKey
+    T_world_camera: Float64[ndarray, "4 4"]
+
+
+def open_bag(spec: str, up_axis: UpAxis | None, require_poses: bool) -> BagSource | None:
+    """Return the sequence of "bag:PATH?color=TOPIC&...", or of a path that is a bag; None for other sources.
+
+    Raises DatasetError, PoseError, InvalidInputError.
+    """
+    address = BagAddress.parse(spec)
+    return None if address is None else BagSource(address, up_axis, require_poses)
+
+
+class BagSource:
+    """The frames of a bag's colour topic, each with the nearest depth image and the camera's pose at its stamp.
+
+    Depth images that are not aligned to colour are registered to it. Colour images without depth or pose are excluded.
+    Frame numbers are the positions of the colour images by their stamps, from 0. World frames of ROS have z up.
+    Raises DatasetError, PoseError, InvalidInputError.
+    """
+
+    def __init__(self, address: BagAddress, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
+        self._bag = BagFile(address.path)
+        self._options = address.options
+        topics = image_topics(self._bag)
+        self._colour = choose_colour(self._bag, topics, address.options)
+        self._depth = choose_depth(self._bag, topics, self._colour, address.options)
+        tree = read_tree(self._bag)
+        camera_frame = address.options.camera or self._colour.frame
+        poses = choose_poses(self._bag, tree, camera_frame, address.options)
+        if poses is None and require_poses:
+            raise DatasetError(
+                f"{address.path}: expected poses: tf between a world frame and {camera_frame!r}, or an odometry topic, "
+                f"got none"
+            )
+        self._poses = poses
+        self._require_poses = require_poses
+        colours, depths = self._bag.stamps(self._colour.name), self._bag.stamps(self._depth.name)
+        self._cameras = self._read_cameras(tree, colours[0].stamp_ns)
+        units_per_metre = depth_units_per_metre(self._bag, self._depth.name)
+        self._converter = FrameConverter(self._cameras, self._colour.name, self._depth.name, units_per_metre)
+        self._matches, self._recorded = self._associate(colours, depths), len(colours)
+        tolerance = f"{1000 * self._options.tolerance_s:g} ms"
+        require_frames(address.path, len(self._matches), f"a colour image with a pose, and depth within {tolerance}")
+        self._up_axis = unit_up_axis(up_axis or (_WORLD_UP if poses is not None else FIRST_VIEW_UP))
+
+    @property
+    def name(self) -> str:
+        """Name of the file or folder, without the ending of a bag."""
+        path = self._bag.path.resolve()
+        return path.name if path.is_dir() else path.stem
+
+    @property
+    def description(self) -> str:
+        """Which topics and poses are used, for a message to the user."""
+        depth = "aligned" if self._cameras.depth is None else "registered to colour here"
+        poses = "none" if self._poses is None else str(self._poses)
+        return f"color={self._colour.name}, depth={self._depth.name} ({depth}), poses: {poses}"
+
+    @property
+    def camera(self) -> Camera:
+        """Colour camera."""
+        return self._cameras.camera
+
+    @property
+    def lens(self) -> Lens | None:
+        """Lens of camera_info for aligned depth; None if colour is undistorted here to register depth to it."""
+        return self._cameras.lens
+
+    @property
+    def up_axis(self) -> UpAxis:
+        """z, as in world frames of ROS, unless the caller gives another; without poses, up in a level first view."""
+        return self._up_axis
+
+    @property
+    def depth_registered(self) -> bool:
+        """True: depth is aligned as recorded, or registered here."""
+        return True
+
+    @property
+    def camera_ideal(self) -> bool:
+        """False: a recording may have any camera."""
+        return False
+
+    @property
+    def poses_exact(self) -> bool:
+        """False: poses of transforms and of odometry have errors."""
+        return False
+
+    @property
+    def world_frame(self) -> str:
+        """Name of the bag."""
+        return self.name
+
+    @property
+    def regions_file(self) -> Path | None:
+        """None: a bag has no regions."""
+        return None
+
+    @property
+    def excluded_frames(self) -> str:
+        """Message on the colour images without depth or pose at their stamp."""
+        reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
+        return excluded_frames_note(self._recorded - len(self), self._recorded, reason)
+
+    def __len__(self) -> int:
+        return len(self._matches)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        """Return the frame at position i. Raises DatasetError."""
+        require_position(self.name, i, len(self))
+        match = self._matches[i]
+        messages = self._bag.read(match.colour), self._bag.read(match.depth)
+        location = str(self._bag.path)
+        return self._converter.frame(location, match.number, messages, match.stamp_ns, match.T_world_camera, size)
+
+    def indices(self) -> Sequence[int]:
+        """Return the positions of the colour images in their topic, from 0."""
+        return [match.number for match in self._matches]
+
+    def trajectory(self) -> Trajectory:
+        """Return the interpolated pose of every colour image."""
+        times_s = seconds(match.stamp_ns for match in self._matches)
+        return Trajectory(times_s, np.array([match.T_world_camera for match in self._matches]))
+
+    def regions(self) -> Mapping[str, Region]:
+        """Return no regions."""
+        return {}
+
+    def _read_cameras(self, tree: TransformTree, first_ns: int) -> RgbdCamera:
+        options = self._options
+        colour = self._read_camera(self._colour, options.color_info, "color_info")
+        if self._depth.frame == self._colour.frame and not options.depth_info:
+            T_colour_depth = np.eye(4)
+            depth = self._read_aligned_camera()
+        else:
+            depth = self._read_camera(self._depth, options.depth_info, "depth_info")
+            T = tree.at(options.camera or self._colour.frame, self._depth.frame, first_ns / 10**9)
+            if T is None:
+                raise DatasetError(
+                    f"{self._bag.path}: tf: no transform from {self._depth.frame!r} to {self._colour.frame!r} at the "
+                    "time of the first colour image; expected it in /tf_static"
+                )
+            T_colour_depth = T
+        return join_cameras(colour, depth, T_colour_depth, options.axes)
+
+    def _read_camera(self, image: ImageTopic, named: str, option: str) -> FolderCamera:
+        topic = choose_info(self._bag, image, named, option)
+        message = self._bag.first(topic)
+        location = f"{self._bag.path}: {topic}"
+        if message is None:
+            raise DatasetError(f"{location}: expected a camera_info message, got none")
+        return camera_of(location, message, image.camera_name)
+
+    def _read_aligned_camera(self) -> FolderCamera | None:
+        """Return the camera of depth with the colour camera's frame; None if the bag does not state it."""
+        try:
+            topic = choose_info(self._bag, self._depth, "", "depth_info")
+        except DatasetError:
+            return None
+        return self._read_camera(self._depth, topic, "depth_info")
+
+    def _associate(self, colours: Sequence[StampedMessage], depths: Sequence[StampedMessage]) -> list[_Match]:
+        """Return the colour images with depth and a pose; without poses they get the identity if none is required."""
+        depth_ns = np.array([depth.stamp_ns for depth in depths], np.int64)
+        matches = []
+        for number, colour in enumerate(colours):
+            nearest = int(np.abs(depth_ns - colour.stamp_ns).argmin())
+            lag_s = abs(int(depth_ns[nearest]) - colour.stamp_ns) / 10**9
+            T = None if self._poses is None else self._poses.at(colour.stamp_ns / 10**9)
+            if T is not None:
+                T = optical_pose(T, self._options.axes)
+            elif not self._require_poses:
+                T = np.eye(4)
+            if lag_s <= self._options.tolerance_s and T is not None:
+                matches.append(_Match(number, colour.stamp_ns, colour.key, depths[nearest].key, T))
+        return matches

@@ -1,0 +1,134 @@
+"""Convert a colour and a depth message, with the camera's pose, to a frame: for bags and for live topics alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
+
+from gausslite.datasets.corrected import undistort_colour, undistort_depth
+from gausslite.datasets.files import FolderCamera, RgbdImage, resize_rgbd
+from gausslite.datasets.registered_source import register_depth
+from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.errors import DatasetError
+from gausslite.domain.frame import Frame
+from gausslite_ros.messages import (
+    CompressedImageMessage,
+    decode_colour,
+    decode_compressed_colour,
+    decode_compressed_depth,
+    decode_depth,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RgbdCamera:
+    """The colour camera, and the depth camera if its images have to be registered.
+
+    depth: None for depth images that are aligned to colour. T_colour_depth: p_colour = T_colour_depth @ p_depth.
+    """
+
+    colour: FolderCamera
+    depth: FolderCamera | None
+    T_colour_depth: Float64[ndarray, "4 4"]
+
+    @classmethod
+    def of(
+        cls, colour: FolderCamera, depth: FolderCamera | None, T_colour_depth: Float64[ndarray, "4 4"]
+    ) -> RgbdCamera:
+        """Return the pair; depth with the colour camera's pose, size and intrinsics is aligned. depth None: aligned."""
+        same_pose = np.allclose(T_colour_depth, np.eye(4), atol=1e-9)
+        if depth is not None and same_pose and depth.camera == colour.camera:
+            depth = None
+        return cls(colour, depth, T_colour_depth)
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the joined images."""
+        return self.colour.camera
+
+    @property
+    def lens(self) -> Lens | None:
+        """Lens of the joined images; None for registered ones, whose colour is undistorted."""
+        return self.colour.lens if self.depth is None else None
+
+    def join(self, location: str, rgb: UInt8[ndarray, "h w 3"], depth_m: Float32[ndarray, "hd wd"]) -> RgbdImage:
+        """Return both images in the colour camera. Raises DatasetError with the location for images of other sizes."""
+        depth_camera = self.colour if self.depth is None else self.depth
+        _require_size(f"{location}: colour", rgb, self.camera)
+        _require_size(f"{location}: depth", depth_m, depth_camera.camera)
+        if self.depth is None:
+            return RgbdImage(rgb, depth_m, self.camera)
+        if self.colour.lens is not None:
+            rgb = undistort_colour(rgb, self.camera, self.colour.lens)
+        if self.depth.lens is not None:
+            depth_m = undistort_depth(depth_m, self.depth.camera, self.depth.lens)
+        return RgbdImage(rgb, register_depth(depth_m, self.depth.camera, self.camera, self.T_colour_depth), self.camera)
+
+
+def _require_size(location: str, image: ndarray, camera: Camera) -> None:
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width_px, camera.height_px):
+        expected = f"{camera.width_px}x{camera.height_px}"
+        raise DatasetError(f"{location}: expected the size of its camera_info, {expected}, got {width}x{height}")
+
+
+_BODY_TO_OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""T_body_optical: a body's axes point forward, left and up; an optical frame's right, down and forward (REP 103)."""
+
+
+def join_cameras(
+    colour: FolderCamera, depth: FolderCamera | None, T_colour_depth: Float64[ndarray, "4 4"], axes: str
+) -> RgbdCamera:
+    """Return the pair of cameras; depth None: aligned. axes: convention of the transform, "optical" or "body"."""
+    if axes == "body":
+        T_colour_depth = _BODY_TO_OPTICAL.T @ T_colour_depth @ _BODY_TO_OPTICAL
+    return RgbdCamera.of(colour, depth, T_colour_depth)
+
+
+def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[ndarray, "4 4"]:
+    """Return the pose with optical axes of a camera frame whose axes are "optical" or "body"."""
+    return T_world_camera @ _BODY_TO_OPTICAL if axes == "body" else T_world_camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameConverter:
+    """The cameras of a colour and a depth topic, and the units per metre of 16-bit depth."""
+
+    cameras: RgbdCamera
+    colour_topic: str
+    depth_topic: str
+    units_per_metre: float
+
+    def frame(
+        self,
+        location: str,
+        number: int,
+        messages: tuple[Any, Any],
+        stamp_ns: int,
+        T_world_camera: Float64[ndarray, "4 4"],
+        size: tuple[int, int] | None = None,
+    ) -> Frame:
+        """Return the frame of the colour and the depth message, resized. Raises DatasetError with the location."""
+        location = f"{location}: message at {stamp_ns / 1e9:.9f} s"
+        rgb = _colour_image(f"{location}: {self.colour_topic}", messages[0])
+        depth_m = _depth_image(f"{location}: {self.depth_topic}", messages[1], self.units_per_metre)
+        image = resize_rgbd(self.cameras.join(location, rgb, depth_m), size)
+        # to the precision of a float64 in seconds, as in folders: keyframes are chosen by their times
+        time_ns = round(stamp_ns / 10**9 * 1e9)
+        return Frame(
+            number, time_ns, image.rgb, image.depth_m, image.camera, T_world_camera, recorded_rgb=image.recorded_rgb
+        )
+
+
+def _colour_image(location: str, message: Any) -> UInt8[ndarray, "h w 3"]:
+    compressed = isinstance(message, CompressedImageMessage)
+    return decode_compressed_colour(location, message) if compressed else decode_colour(location, message)
+
+
+def _depth_image(location: str, message: Any, units_per_metre: float) -> Float32[ndarray, "h w"]:
+    compressed = isinstance(message, CompressedImageMessage)
+    return (decode_compressed_depth if compressed else decode_depth)(location, message, units_per_metre)

@@ -1,0 +1,328 @@
+"""Convert camera_info messages to the camera and lens of an image topic."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Iterable, Sequence
+from enum import Enum
+from typing import Any, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
+from numpy.typing import NDArray
+
+from gausslite.datasets.files import FolderCamera, decode_image, lens_of, require_pixel_count
+from gausslite.domain.camera import FileIntrinsics
+from gausslite.domain.errors import DatasetError
+
+_MAX_NAME_CHARACTERS = 256
+
+
+@runtime_checkable
+class Header(Protocol):
+    """std_msgs/Header."""
+
+    stamp: Any
+    frame_id: str
+
+
+@runtime_checkable
+class ImageMessage(Protocol):
+    """sensor_msgs/Image."""
+
+    header: Any
+    height: int
+    width: int
+    encoding: str
+    is_bigendian: int
+    step: int
+    data: Any
+
+
+@runtime_checkable
+class CompressedImageMessage(Protocol):
+    """sensor_msgs/CompressedImage."""
+
+    header: Any
+    format: str
+    data: Any
+
+
+@runtime_checkable
+class TransformMessage(Protocol):
+    """geometry_msgs/TransformStamped: the pose of the child frame in the header's frame."""
+
+    header: Any
+    child_frame_id: str
+    transform: Any
+
+
+def stamp_ns(header: Header) -> int:
+    """Return a header's time in nanoseconds."""
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def frame_name(name: str) -> str:
+    """Return the name of a frame without the slash with which old systems begin it. Raises DatasetError."""
+    if len(name) > _MAX_NAME_CHARACTERS:
+        raise DatasetError(f"frame_id: expected at most {_MAX_NAME_CHARACTERS} characters, got {len(name)}")
+    return name.removeprefix("/")
+
+
+def translation_of(vector: Any) -> tuple[float, float, float]:
+    """Return a geometry_msgs/Vector3 or Point in metres."""
+    return float(vector.x), float(vector.y), float(vector.z)
+
+
+def quaternion_of(rotation: Any) -> tuple[float, float, float, float]:
+    """Return a geometry_msgs/Quaternion in the order x y z w."""
+    return float(rotation.x), float(rotation.y), float(rotation.z), float(rotation.w)
+
+
+def float_field(message: Any, lower_case_name: str) -> Sequence[float]:
+    """Return a field of numbers of camera_info: ROS 1 writes its name in upper case, ROS 2 in lower case."""
+    values: Iterable[float] = getattr(message, lower_case_name, None)  # type: ignore[assignment]
+    if values is None:
+        values = getattr(message, lower_case_name.upper())
+    return [float(value) for value in values]
+
+
+_LENS_COEFFICIENTS = 8
+_SDK_MODELS = {
+    "brown conrady": "plumb_bob",
+    "modified brown conrady": "plumb_bob",
+    "inverse brown conrady": "plumb_bob",
+    "kannala brandt4": "equidistant",
+}
+"""The camera's own ROS driver publishes these models under these names."""
+
+
+def camera_of(location: str, info: Any, image_topic: str) -> FolderCamera:
+    """Return the camera of a topic's images, and its lens if they are distorted.
+
+    A topic whose last part begins with image_rect has rectified images: the
+    projection matrix P describes them, without distortion. Binning and region of interest of the message are applied.
+    Raises DatasetError with the location.
+    """
+    if _is_rectified(image_topic):
+        values = float_field(info, "p")
+        fx, cx, fy, cy = (values[i] for i in (0, 2, 5, 6)) if len(values) == 12 else (0.0,) * 4
+        coefficients: list[float] = []
+    else:
+        fx = fy = cx = cy = 0.0
+        coefficients = list(float_field(info, "d"))
+    if fx == 0.0:
+        values = float_field(info, "k")
+        if len(values) != 9 or values[0] == 0.0:
+            raise DatasetError(f"{location}: expected an intrinsic matrix K, got zeros; is the camera calibrated?")
+        fx, cx, fy, cy = (values[i] for i in (0, 2, 4, 5))
+    binning = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+    roi_size = int(info.roi.width), int(info.roi.height)
+    size = roi_size if all(roi_size) else (int(info.width), int(info.height))
+    cx, cy = cx - int(info.roi.x_offset), cy - int(info.roi.y_offset)
+    intrinsics = FileIntrinsics(
+        fx / binning[0], fy / binning[1], (cx + 0.5) / binning[0] - 0.5, (cy + 0.5) / binning[1] - 0.5
+    )
+    lens = lens_of(location, _model_name(str(info.distortion_model)), _known_coefficients(location, coefficients))
+    return FolderCamera(intrinsics.camera(location, size[0] // binning[0], size[1] // binning[1]), lens=lens)
+
+
+def _is_rectified(image_topic: str) -> bool:
+    return any(part.startswith("image_rect") for part in image_topic.split("/"))
+
+
+def _model_name(name: str) -> str:
+    """Return ROS's name of a distortion model, also for the names of the RealSense SDK."""
+    return _SDK_MODELS.get(name.lower().replace("_", " "), name)
+
+
+def _known_coefficients(location: str, coefficients: list[float]) -> list[float]:
+    """Return at most 8 coefficients; OpenCV's further ones (thin prism, tilt) must be zero."""
+    if any(coefficients[_LENS_COEFFICIENTS:]):
+        raise DatasetError(
+            f"{location}: expected a lens of at most {_LENS_COEFFICIENTS} coefficients, got {len(coefficients)}; "
+            "rectify the images with image_proc, and use image_rect_color"
+        )
+    return coefficients[:_LENS_COEFFICIENTS]
+
+
+_MILLIMETRES_PER_METRE = 1000.0
+_SUFFIX_BYTES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
+_DEPTH_HEADER = struct.Struct("<iff")
+"""compressedDepth: a format number and the two quantisation parameters stand before the PNG."""
+
+# OpenCV names a Bayer pattern after its second row and column, ROS after its first
+_CONVERSION_CODES = {
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "YUYV": (2, cv2.COLOR_YUV2RGB_YUY2),
+}
+"""Bytes per pixel of an encoding, and OpenCV's conversion of it to RGB."""
+_CHANNEL_ORDERS = {
+    "rgb8": (3, (0, 1, 2)),
+    "bgr8": (3, (2, 1, 0)),
+    "8UC3": (3, (2, 1, 0)),
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+}
+"""Bytes per pixel of an encoding, and the places of red, green and blue."""
+_COLOUR_ENCODINGS = (*_CHANNEL_ORDERS, *_CONVERSION_CODES)
+_GREY = ("mono8", "8UC1")
+
+
+class ImageKind(Enum):
+    """What a topic's images show."""
+
+    COLOUR = "colour"
+    GREY = "grey"
+    DEPTH = "depth"
+    OTHER = "other"
+
+
+def kind_of_encoding(encoding: str) -> ImageKind:
+    """Return what images of this encoding of sensor_msgs/Image show."""
+    if encoding in ("16UC1", "32FC1"):
+        return ImageKind.DEPTH
+    if encoding in _GREY:
+        return ImageKind.GREY
+    return ImageKind.COLOUR if encoding in _COLOUR_ENCODINGS else ImageKind.OTHER
+
+
+def kind_of_format(text: str) -> ImageKind:
+    """Return what images of this format of sensor_msgs/CompressedImage show, such as "rgb8; jpeg compressed bgr8"."""
+    encoding = text.partition(";")[0].strip()
+    if "compressedDepth" in text or encoding in ("16UC1", "32FC1"):
+        return ImageKind.DEPTH
+    if encoding in _GREY:
+        return ImageKind.GREY
+    known = any(name in text.lower() for name in ("jpeg", "jpg", "png"))
+    return ImageKind.COLOUR if known and encoding != "mono16" else ImageKind.OTHER
+
+
+def decode_colour(location: str, message: ImageMessage) -> UInt8[ndarray, "h w 3"]:
+    """Return an image message as RGB. Raises DatasetError with the location for other encodings and wrong sizes."""
+    encoding = message.encoding
+    if encoding in _CHANNEL_ORDERS:
+        channels, order = _CHANNEL_ORDERS[encoding]
+        return np.ascontiguousarray(_pixels(location, message, np.dtype(np.uint8), channels)[..., order])
+    if encoding not in _CONVERSION_CODES:
+        known = ", ".join(_COLOUR_ENCODINGS)
+        raise DatasetError(f"{location}: encoding: expected one of {known}, got {encoding[:40]!r}")
+    channels, code = _CONVERSION_CODES[encoding]
+    try:
+        rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(_pixels(location, message, np.dtype(np.uint8), channels), code)
+    except cv2.error:
+        size = f"{message.width}x{message.height}"
+        raise DatasetError(f"{location}: {encoding}: expected an even width and height, got {size}") from None
+    return rgb
+
+
+def decode_depth(
+    location: str, message: ImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
+) -> Float32[ndarray, "h w"]:
+    """Return depth in metres, 0 where invalid, of 32FC1 in metres or 16-bit integers in these units.
+
+    Raises DatasetError with the location.
+    """
+    dtype = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}.get(message.encoding)
+    if dtype is None:
+        raise DatasetError(f"{location}: encoding: expected depth as 16UC1 or 32FC1, got {message.encoding[:40]!r}")
+    image = _pixels(location, message, np.dtype(dtype), 1)
+    return _in_metres(image, units_per_metre)
+
+
+def decode_compressed_colour(location: str, message: CompressedImageMessage) -> UInt8[ndarray, "h w 3"]:
+    """Return a JPEG or PNG image as RGB. Raises DatasetError with the location."""
+    image = _decode(location, bytes(message.data), cv2.IMREAD_COLOR)
+    if image.dtype != np.uint8:
+        raise DatasetError(f"{location}: expected an image of 8 bits per channel, got {image.dtype}")
+    encoding = message.format.partition(";")[0].strip()
+    if encoding.startswith("bayer_") and encoding in _CONVERSION_CODES:
+        # the pattern is compressed as a grey image
+        mosaic = np.ascontiguousarray(image[..., 0])
+        return np.asarray(cv2.cvtColor(mosaic, _CONVERSION_CODES[encoding][1]))
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def decode_compressed_depth(
+    location: str, message: CompressedImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
+) -> Float32[ndarray, "h w"]:
+    """Return depth in metres, 0 where invalid, of a 16-bit PNG, with the header of compressedDepth or without.
+
+    32FC1 images are stored as quantised inverse depths: depth = A / (value - B). Raises DatasetError with the location.
+    """
+    data = bytes(message.data)
+    if "compressedDepth" not in message.format:
+        return _in_metres(_decode_16_bit(location, data), units_per_metre)
+    if "rvl" in message.format.lower():
+        raise DatasetError(
+            f"{location}: expected compressedDepth with PNG, got RVL; record with format png, or raw depth"
+        )
+    if len(data) <= _DEPTH_HEADER.size:
+        raise DatasetError(
+            f"{location}: expected a header of {_DEPTH_HEADER.size} bytes and a PNG, got {len(data)} bytes"
+        )
+    _, a, b = _DEPTH_HEADER.unpack_from(data)
+    image = _decode_16_bit(location, data[_DEPTH_HEADER.size :])
+    if message.format.partition(";")[0].strip() != "32FC1":
+        return _in_metres(image, units_per_metre)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        depth_m = np.float32(a) / (image.astype(np.float32) - np.float32(b))
+    depth_m[image == 0] = 0.0
+    return _valid(depth_m)
+
+
+def _pixels(location: str, message: ImageMessage, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+    """Return the pixels of a raw image in this machine's byte order. The sizes are checked first."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    require_pixel_count(location, width, height)
+    row_bytes = width * channels * dtype.itemsize
+    if step < row_bytes:
+        raise DatasetError(f"{location}: step: expected at least {row_bytes} bytes a row, got {step}")
+    data = np.frombuffer(message.data, np.uint8)
+    if len(data) < step * (height - 1) + row_bytes:
+        raise DatasetError(f"{location}: data: expected {height} rows of {step} bytes, got {len(data)} bytes")
+    rows = np.lib.stride_tricks.as_strided(data, (height, row_bytes), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(dtype)
+    if bool(message.is_bigendian) != (sys.byteorder == "big"):
+        pixels = pixels.byteswap()
+    return pixels.reshape((height, width, channels) if channels > 1 else (height, width))
+
+
+def _decode(location: str, data: bytes, flags: int) -> NDArray[Any]:
+    suffix = next((suffix for start, suffix in _SUFFIX_BYTES.items() if data.startswith(start)), None)
+    if suffix is None:
+        raise DatasetError(f"{location}: data: expected a JPEG or a PNG, got other bytes")
+    return decode_image(location, data, suffix, flags)
+
+
+def _decode_16_bit(location: str, data: bytes) -> NDArray[Any]:
+    image = _decode(location, data, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise DatasetError(
+            f"{location}: expected a 16-bit PNG of one channel, got {image.dtype} of shape {image.shape}"
+        )
+    return image
+
+
+def _in_metres(image: NDArray[Any], units_per_metre: float) -> Float32[ndarray, "h w"]:
+    if image.dtype == np.float32:
+        return _valid(image.copy())
+    return image.astype(np.float32) / np.float32(units_per_metre)
+
+
+def _valid(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+    """Set NaN, infinite and negative depths to 0."""
+    depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
+    return depth_m

@@ -1,0 +1,200 @@
+"""The tree of coordinate frames that tf messages state, with poses interpolated in time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.datasets.folder import PoseTrack, is_lost
+from gausslite.domain.errors import DatasetError
+from gausslite.domain.pose import inverse
+from gausslite_ros.messages import TransformMessage, frame_name, quaternion_of, stamp_ns, translation_of
+
+MAX_GAP_S = 1.0
+"""Longest time between two transforms to interpolate: slow localisation nodes publish map → odom once a second."""
+_MAX_LAG_S = 0.010
+_MAX_DEPTH = 64
+_MAX_LISTED = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """One measured pose of a child frame in its parent, at a time; None for one that holds at all times."""
+
+    parent: str
+    child: str
+    time_ns: int | None
+    translation_m: tuple[float, float, float]
+    quat_xyzw: tuple[float, float, float, float]
+
+
+def transforms_of(messages: Iterable[TransformMessage], static: bool) -> list[Transform]:
+    """Return the transforms of one tf message; static: those of /tf_static."""
+    return [
+        Transform(
+            frame_name(message.header.frame_id),
+            frame_name(message.child_frame_id),
+            None if static else stamp_ns(message.header),
+            translation_of(message.transform.translation),
+            quaternion_of(message.transform.rotation),
+        )
+        for message in messages
+    ]
+
+
+def seconds(times_ns: Iterable[int]) -> Float64[ndarray, " n"]:
+    """Return the nearest float64 of each time in seconds, as if its decimal text were read."""
+    return np.array([time_ns / 10**9 for time_ns in times_ns])
+
+
+class TransformTree:
+    """Frames with the pose of each in its parent frame, static or over time.
+
+    Between two stamps at most MAX_GAP_S apart, a pose is interpolated (lerp and slerp). A transform of both kinds is
+    static. Transforms without a finite number are left out.
+    """
+
+    def __init__(self, transforms: Iterable[Transform]) -> None:
+        grouped: dict[tuple[str, str], list[Transform]] = {}
+        for transform in transforms:
+            if not is_lost(np.array((*transform.translation_m, *transform.quat_xyzw))):
+                grouped.setdefault((transform.child, transform.parent), []).append(transform)
+        self._tracks: dict[str, dict[str, PoseTrack]] = {}
+        self._static: set[tuple[str, str]] = set()
+        for (child, parent), measured in grouped.items():
+            fixed = [transform for transform in measured if transform.time_ns is None]
+            if fixed:
+                self._static.add((child, parent))
+            track = _track(f"tf {parent} → {child}", fixed[-1:] or measured)
+            self._tracks.setdefault(child, {})[parent] = track
+
+    @property
+    def frames(self) -> list[str]:
+        """All frames, sorted."""
+        return sorted(set(self._tracks).union(*self._tracks.values()))
+
+    def ancestors(self, frame: str) -> list[str]:
+        """Return the frame and its parents up to the root. Raises DatasetError for a frame with two parents."""
+        chain = [frame]
+        while chain[-1] in self._tracks:
+            parents = list(self._tracks[chain[-1]])
+            if len(parents) > 1:
+                raise DatasetError(f"tf: {chain[-1]}: expected one parent frame, got {', '.join(sorted(parents))}")
+            if parents[0] in chain or len(chain) > _MAX_DEPTH:
+                raise DatasetError(f"tf: {frame}: expected a tree of frames, got a loop or a chain over {_MAX_DEPTH}")
+            chain.append(parents[0])
+        return chain
+
+    def changes_over_time(self, ancestor: str, frame: str) -> bool:
+        """True if a transform between a frame and one of its ancestors changes over time."""
+        chain = self.ancestors(frame)
+        return any(link not in self._static for link in pairwise(chain[: chain.index(ancestor) + 1]))
+
+    def require_path(self, target: str, source: str) -> None:
+        """Raise DatasetError unless the transforms connect two frames."""
+        if target == source or self.ancestors(target)[-1] == self.ancestors(source)[-1]:
+            return
+        frames = self.frames
+        known = ", ".join(frames[:_MAX_LISTED]) + (" ..." if len(frames) > _MAX_LISTED else "")
+        raise DatasetError(
+            f"tf: no transform between {target!r} and {source!r}; expected it in /tf_static or /tf, "
+            f"which have {'the frames ' + known if frames else 'no transforms'}"
+        )
+
+    def last_time_s(self, target: str, source: str) -> float:
+        """Return the time until which all moving transforms between two frames are known; infinite if none moves.
+
+        Raises DatasetError.
+        """
+        self.require_path(target, source)
+        up_target, up_source = self.ancestors(target), self.ancestors(source)
+        common = next(frame for frame in up_source if frame in up_target)
+        links = [link for chain in (up_target, up_source) for link in pairwise(chain[: chain.index(common) + 1])]
+        moving = [self._tracks[child][parent] for child, parent in links if (child, parent) not in self._static]
+        return min((float(track.times_s[-1]) for track in moving), default=np.inf)
+
+    def at(self, target: str, source: str, time_s: float) -> Float64[ndarray, "4 4"] | None:
+        """Return T_target_source at a time; None if a transform has no pose near it. Raises DatasetError, PoseError."""
+        self.require_path(target, source)
+        up_target, up_source = self.ancestors(target), self.ancestors(source)
+        common = next(frame for frame in up_source if frame in up_target)
+        T_common_source = self._chain(up_source[: up_source.index(common) + 1], time_s)
+        T_common_target = self._chain(up_target[: up_target.index(common) + 1], time_s)
+        if T_common_source is None or T_common_target is None:
+            return None
+        return T_common_source if target == common else inverse(T_common_target) @ T_common_source
+
+    def _chain(self, upwards: list[str], time_s: float) -> Float64[ndarray, "4 4"] | None:
+        """Return the pose of the first frame in the last, through the frames between them."""
+        T: Float64[ndarray, "4 4"] | None = None
+        for child, parent in pairwise(upwards):
+            T_parent_child = self._tracks[child][parent].at(time_s)
+            if T_parent_child is None:
+                return None
+            T = T_parent_child if T is None else T_parent_child @ T
+        return np.eye(4) if T is None else T
+
+
+def track_of(location: str, poses: Mapping[int, tuple[tuple[float, ...], tuple[float, ...]]]) -> PoseTrack:
+    """Return poses over time; poses: translation and quaternion (x y z w) by time in nanoseconds."""
+    times_ns = sorted(poses)
+    translations_m = np.array([poses[time_ns][0] for time_ns in times_ns], np.float64)
+    quats_xyzw = np.array([poses[time_ns][1] for time_ns in times_ns], np.float64)
+    return PoseTrack(location, seconds(times_ns), translations_m, quats_xyzw, MAX_GAP_S, _MAX_LAG_S)
+
+
+def _track(location: str, measured: list[Transform]) -> PoseTrack:
+    if measured[0].time_ns is None:
+        pose = np.array([measured[0].translation_m]), np.array([measured[0].quat_xyzw])
+        return PoseTrack(location, np.zeros(1), *pose, MAX_GAP_S, np.inf)
+    return track_of(location, {t.time_ns: (t.translation_m, t.quat_xyzw) for t in measured if t.time_ns is not None})
+
+
+_MAX_FRAMES = 10_000
+
+
+class TransformWindow:
+    """Keeps static transforms, and others until they are `keep_s` older than the latest of the same two frames."""
+
+    def __init__(self, keep_s: float) -> None:
+        self._keep_ns = round(keep_s * 1e9)
+        self._by_child: dict[str, dict[str, deque[Transform]]] = {}
+
+    def add(self, transforms: Iterable[Transform]) -> None:
+        """Add measured transforms. A static one replaces the others of its frames; frames over 10,000 are ignored."""
+        for transform in transforms:
+            if transform.child not in self._by_child and len(self._by_child) >= _MAX_FRAMES:
+                continue
+            kept = self._by_child.setdefault(transform.child, {}).setdefault(transform.parent, deque())
+            if transform.time_ns is None:
+                kept.clear()
+            elif kept and kept[0].time_ns is None:
+                continue
+            kept.append(transform)
+            while self._is_old(kept[0], transform):
+                kept.popleft()
+
+    def tree(self, frames: Iterable[str]) -> TransformTree:
+        """Return the frames from these up to their roots, with the transforms between them."""
+        chosen: list[Transform] = []
+        waiting, seen = list(frames), set[str]()
+        while waiting:
+            frame = waiting.pop()
+            if frame in seen:
+                continue
+            seen.add(frame)
+            for parent, kept in self._by_child.get(frame, {}).items():
+                chosen += kept
+                waiting.append(parent)
+        return TransformTree(chosen)
+
+    def _is_old(self, first: Transform, latest: Transform) -> bool:
+        if first.time_ns is None or latest.time_ns is None:
+            return False
+        return latest.time_ns - first.time_ns > self._keep_ns

@@ -1,0 +1,317 @@
+"""Colour Gaussians by what they record: their RGB, kappa, the agent that sent them, or the object that they show."""
+
+from __future__ import annotations
+
+import colorsys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int, Int64, UInt8, UInt32
+from numpy import ndarray
+
+from gausslite.codec.run_files import KeyframeView
+from gausslite.domain.checks import require_array
+from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.voxels import VoxelBatch, empty_batch
+from gausslite.wire.convert import MapUpdate
+
+NO_AGENT = -1
+
+
+@dataclass(frozen=True, slots=True)
+class AgentPath:
+    """The keyframes of one agent of a team, oldest first, in the fused map's frame. colour_index: of the agent."""
+
+    agent: str
+    colour_index: int
+    keyframes: tuple[KeyframeView, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewContents:
+    """A map and what belongs to it.
+
+    agent: for each Gaussian an index into agents, NO_AGENT if unknown. targets: noun phrases by Gaussians.target; empty
+    for a map of several tasks. T_world_camera: the trajectory, in time order. times_ns: its capture times. paths: those
+    of a team's agents. state_ns: the time of this state; without it the trajectory's end.
+    """
+
+    gaussians: Gaussians
+    agent: Int64[ndarray, " n"]
+    agents: tuple[str, ...] = ()
+    targets: tuple[str, ...] = ()
+    objects: tuple[ObjectLandmark, ...] = ()
+    times_ns: Int64[ndarray, " t"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    T_world_camera: Float64[ndarray, "t 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    keyframes: Sequence[KeyframeView] = ()
+    paths: tuple[AgentPath, ...] = ()
+    state_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        require_array("agent", self.agent, (len(self.gaussians),), np.int64)
+        require_array("times_ns", self.times_ns, (None,), np.int64)
+        require_array("T_world_camera", self.T_world_camera, (len(self.times_ns), 4, 4), np.float64)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """The time of this state; None if it is unknown."""
+        if self.state_ns is not None:
+            return self.state_ns
+        return int(self.times_ns[-1]) if len(self.times_ns) else None
+
+    @classmethod
+    def of_one_agent(cls, gaussians: Gaussians, agent_id: str = "") -> ViewContents:
+        """Return the map of one agent; without a name its Gaussians have no agent."""
+        index, agents = (0, (agent_id,)) if agent_id else (NO_AGENT, ())
+        return cls(gaussians, np.full(len(gaussians), index, np.int64), agents)
+
+
+UNASSIGNED_RGB = (110, 110, 118)
+"""Colour of Gaussians without agent or object."""
+_GOLDEN_RATIO = 0.618034
+_FIRST_HUE = 0.08
+
+
+class ColourMode(StrEnum):
+    """What the colour of a Gaussian means."""
+
+    RGB = "RGB"
+    KAPPA = "kappa"
+    AGENT = "agent"
+    OBJECT = "object"
+
+
+def colours_of(contents: ViewContents, mode: ColourMode) -> UInt8[ndarray, "n 3"]:
+    """Return the colour of each Gaussian."""
+    gaussians = contents.gaussians
+    match mode:
+        case ColourMode.RGB:
+            rgb: UInt8[ndarray, "n 3"] = (np.clip(gaussians.rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
+            return rgb
+        case ColourMode.KAPPA:
+            return _kappa_colours(gaussians.kappa)
+        case ColourMode.AGENT:
+            return _category_colours(contents.agent)
+        case ColourMode.OBJECT:
+            return _category_colours(gaussians.target)
+
+
+def legend_of(contents: ViewContents, mode: ColourMode) -> list[tuple[str, tuple[int, int, int]]]:
+    """Return the names and colours that explain a mode; empty for RGB."""
+    match mode:
+        case ColourMode.RGB:
+            return []
+        case ColourMode.KAPPA:
+            highest = int(contents.gaussians.kappa.max(initial=0))
+            # the colours are logarithmic in kappa, so are the values of the legend
+            values = np.unique(np.expm1(np.linspace(0, np.log1p(highest), 5)).round().astype(np.uint32))
+            return [(f"kappa {v}", _as_rgb(c)) for v, c in zip(values, _kappa_colours(values, highest), strict=True)]
+        case ColourMode.AGENT:
+            return _category_legend(contents.agents, contents.agent)
+        case ColourMode.OBJECT:
+            return _category_legend(contents.targets, contents.gaussians.target)
+
+
+def category_colour(index: int) -> tuple[int, int, int]:
+    """Return the colour of an agent or object; neighbouring indices have clearly different hues."""
+    red, green, blue = colorsys.hsv_to_rgb((_FIRST_HUE + index * _GOLDEN_RATIO) % 1.0, 0.75, 0.95)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def _kappa_colours(kappa: UInt32[ndarray, " n"], highest: int | None = None) -> UInt8[ndarray, "n 3"]:
+    top = np.log1p(float(kappa.max(initial=0) if highest is None else highest))
+    levels = np.log1p(kappa.astype(np.float64)) / max(top, 1e-9)
+    image = (255 * levels + 0.5).astype(np.uint8).reshape(-1, 1)
+    if not len(image):
+        return np.zeros((0, 3), np.uint8)
+    colours: UInt8[ndarray, "n 3"] = cv2.applyColorMap(image, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1].copy()
+    return colours
+
+
+def _category_colours(indices: Int[ndarray, " n"]) -> UInt8[ndarray, "n 3"]:
+    count = int(indices.max(initial=NO_AGENT)) + 1
+    palette = np.array([*(category_colour(index) for index in range(count)), UNASSIGNED_RGB], np.uint8)
+    # index -1 is the palette's last entry
+    colours: UInt8[ndarray, "n 3"] = palette[np.maximum(indices, -1)]
+    return colours
+
+
+def _category_legend(names: Sequence[str], indices: Int[ndarray, " n"]) -> list[tuple[str, tuple[int, int, int]]]:
+    present = [int(index) for index in np.unique(indices) if index >= 0]
+    entries = [(names[i] if i < len(names) else f"number {i}", category_colour(i)) for i in present]
+    return entries if len(indices) and indices.min() >= 0 else [*entries, ("none", UNASSIGNED_RGB)]
+
+
+def _as_rgb(colour: UInt8[ndarray, "3"]) -> tuple[int, int, int]:
+    return int(colour[0]), int(colour[1]), int(colour[2])
+
+
+DEFAULT_LIMIT = 150_000
+_LEVEL_OF_DETAIL_GOLDEN_RATIO = 0.618033988749895
+_LEAST_OPACITY = 1e-3
+
+
+def spread_order(gaussians: Gaussians) -> Int64[ndarray, " n"]:
+    """Return all indices so that each prefix is spread evenly over the map, opaque Gaussians first.
+
+    The task's region (active) and the background take turns until one of them is used up.
+    """
+    # multiples of the golden ratio, modulo 1, are evenly spread over the memory order, which follows space
+    priority = ((np.arange(1, len(gaussians) + 1) * _LEVEL_OF_DETAIL_GOLDEN_RATIO) % 1.0) / np.maximum(
+        gaussians.opacities.astype(np.float64), _LEAST_OPACITY
+    )
+    turn = np.empty(len(gaussians), np.int64)
+    for part in (np.flatnonzero(gaussians.active), np.flatnonzero(~gaussians.active)):
+        turn[part[np.argsort(priority[part], kind="stable")]] = np.arange(len(part))
+    order: Int64[ndarray, " n"] = np.argsort(turn, kind="stable")
+    return order
+
+
+def covariances_m2(gaussians: Gaussians) -> Float32[ndarray, "n 3 3"]:
+    """Return R diag(scales²) Rᵀ of each Gaussian, in square metres (Sec. III-A)."""
+    quats = gaussians.quats_wxyz / np.maximum(np.linalg.norm(gaussians.quats_wxyz, axis=1, keepdims=True), 1e-12)
+    w, x, y, z = quats.T
+    rotations = np.stack(
+        [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ],
+        axis=1,
+    ).reshape(-1, 3, 3)
+    scaled = rotations * gaussians.scales_m[:, None, :]
+    covariances: Float32[ndarray, "n 3 3"] = scaled @ scaled.transpose(0, 2, 1)
+    return covariances
+
+
+_RETRY_S = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FollowedMap:
+    """A service's map at one revision. winners: the agent of each voxel, by key; empty for the map of one agent."""
+
+    revision: int
+    batch: VoxelBatch
+    winners: dict[int, str]
+
+    def contents(self, targets: dict[str, tuple[str, ...]]) -> ViewContents:
+        """Return the map for the page. targets: the target nouns of the task of each agent of the mission.
+
+        The `target` of a Gaussian counts within its agent's task; here it gets an index into the nouns of all tasks.
+        """
+        agents = tuple(sorted({*self.winners.values(), *targets}))
+        nouns = tuple(dict.fromkeys(noun for agent in agents for noun in targets.get(agent, ())))
+        by_voxel = [
+            agents.index(self.winners[key]) if key in self.winners else NO_AGENT for key in self.batch.keys.tolist()
+        ]
+        agent = np.repeat(np.array(by_voxel, np.int64), self.batch.counts)
+        gaussians = self.batch.gaussians
+        target = np.full(len(gaussians), -1, np.int16)
+        for index, name in enumerate(agents):
+            for number, noun in enumerate(targets.get(name, ())):
+                target[(agent == index) & (gaussians.target == number)] = nouns.index(noun)
+        return ViewContents(replace(gaussians, target=target), agent, agents, nouns)
+
+
+class MapFollower:
+    """Owns the thread that reads a map's updates, and connects again after an error."""
+
+    def __init__(self, watch: Callable[[], Iterator[MapUpdate]]) -> None:
+        self._watch = watch
+        self._lock = threading.Lock()
+        self._newest: FollowedMap | None = None
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="map-follower", daemon=True)
+        self._thread.start()
+
+    def newest(self) -> FollowedMap | None:
+        """Return the newest complete revision, None before the first."""
+        with self._lock:
+            return self._newest
+
+    def close(self) -> None:
+        """End the thread. Close the client first, which ends its wait for updates."""
+        self._stopped.set()
+        self._thread.join(_RETRY_S)
+
+    def _run(self) -> None:
+        while not self._stopped.is_set():
+            try:
+                self._follow()
+            except (GaussLiteError, ValueError):  # ValueError: the channel has been closed
+                self._stopped.wait(_RETRY_S)
+
+    def _follow(self) -> None:
+        batch, winners = empty_batch(), dict[int, str]()
+        for update in self._watch():
+            if update.snapshot and update.first:
+                winners = {}
+            batch = update.apply_to(batch)
+            if update.batch is not None and update.winners:
+                winners.update(zip(update.batch.keys.tolist(), update.winners, strict=True))
+            if update.last:
+                with self._lock:
+                    self._newest = FollowedMap(update.revision, batch, dict(winners))
+            if self._stopped.is_set():
+                return
+
+
+_BEHIND_M = 0.6
+_BESIDE, _ABOVE = 0.5, 0.4
+"""Distances from the map's centre along the horizontal axes and upwards, as shares of its extent."""
+_MIN_EXTENT_M = 0.1
+"""Of a map that is a point: the camera is never at the point that it looks at."""
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class StartView:
+    """Camera position, point that it looks at, and the up direction, in the world's frame."""
+
+    position_m: Vector
+    look_at_m: Vector
+    up: Vector
+
+
+def start_view(contents: ViewContents) -> StartView:
+    """Return the start view of a map with Gaussians: a map without a trajectory, as a team's, is seen from beside."""
+    poses = [keyframe.T_world_camera for keyframe in contents.keyframes] or list(contents.T_world_camera)
+    up = _up(poses)
+    low, centre, high = np.percentile(contents.gaussians.means_m.astype(np.float64), (5, 50, 95), axis=0)
+    if not len(contents.times_ns):
+        low = np.min([low, *(each.extent_m.min_m for each in contents.objects)], axis=0)
+        high = np.max([high, *(each.extent_m.max_m for each in contents.objects)], axis=0)
+        centre = 0.5 * (low + high)
+        first_axis, second_axis = np.eye(3)[np.flatnonzero(up == 0)]
+        offset = _BESIDE * (first_axis - second_axis) + _ABOVE * up
+        extent_m = max(_MIN_EXTENT_M, float(np.linalg.norm(high - low)))
+        return StartView(_vector(centre + extent_m * offset), _vector(centre), _vector(up))
+    first = poses[0]
+    forward = first[:3, 2]
+    position = first[:3, 3] - _BEHIND_M * forward + 0.5 * _BEHIND_M * up
+    distance_m = max(1.0, float(np.dot(centre - first[:3, 3], forward)))
+    return StartView(_vector(position), _vector(first[:3, 3] + distance_m * forward), _vector(up))
+
+
+def _up(poses: Sequence[Float64[ndarray, "4 4"]]) -> Float64[ndarray, "3"]:
+    """Return the axis of the world that is closest to up in the cameras' images, z without cameras."""
+    snapped = np.zeros(3)
+    if not len(poses):
+        snapped[2] = 1.0
+        return snapped
+    # images have y down, so the mean of the cameras' -y is up
+    up = -np.mean([pose[:3, 1] for pose in poses], axis=0)
+    axis = int(np.argmax(np.abs(up)))
+    snapped[axis] = 1.0 if up[axis] >= 0 else -1.0
+    return snapped
+
+
+def _vector(values: np.ndarray) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])

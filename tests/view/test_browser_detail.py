@@ -1,0 +1,119 @@
+"""A browser first gets a small set of splats, then as many as it draws fast enough."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import open_browser
+from sample_gaussians import plain_gaussians, random_gaussians
+
+from gausslite_view import splats as browser_detail
+from gausslite_view.contents import ViewContents, spread_order
+from gausslite_view.splats import PREVIEW_COUNT, RESPONSE_LIMIT_S, BrowserDetail, next_count
+
+pytest.importorskip("viser")
+from gausslite_view.pages import open_page
+
+COUNT_DRAWN = """
+(() => {
+  window.drawn = [];
+  const draw = WebGL2RenderingContext.prototype.drawElementsInstanced;
+  WebGL2RenderingContext.prototype.drawElementsInstanced = function (...call) {
+    window.drawn.push(call[4]);
+    return draw.apply(this, call);
+  };
+})()
+"""
+
+
+def points(count):
+    """Return small splats far from the camera, which draw fast also in software."""
+    rng = np.random.default_rng(3)
+    means_m = rng.uniform(-1, 1, (count, 3)) + np.array([0, 0, 6])
+    return plain_gaussians(means_m, opacities=0.9, scales_m=0.01)
+
+
+def test_a_fast_browser_takes_the_next_step_and_ends_with_all():
+    assert next_count(PREVIEW_COUNT, 150_000, 0.02) > PREVIEW_COUNT
+    assert next_count(100_000, 150_000, 0.02) == 150_000
+    assert next_count(150_000, 150_000, 0.02) == 150_000
+
+
+def test_a_slow_browser_keeps_what_it_has():
+    assert next_count(PREVIEW_COUNT, 150_000, RESPONSE_LIMIT_S) == PREVIEW_COUNT
+
+
+def test_each_prefix_of_the_order_covers_the_map_and_half_of_it_the_region():
+    gaussians = random_gaussians(4000)
+    active = np.arange(4000) < 400
+    gaussians = replace(gaussians, active=active, opacities=np.full(4000, 0.5, np.float32))
+    order = spread_order(gaussians)
+    assert sorted(order.tolist()) == list(range(4000))
+    first = order[:400]
+    assert np.count_nonzero(active[first]) == 200
+    background = np.sort(first[first >= 400])
+    assert np.diff(background).max() < 5 * 3600 / 200
+
+
+def test_opaque_gaussians_come_first():
+    gaussians = plain_gaussians(np.zeros((100, 3)), opacities=np.where(np.arange(100) < 50, 0.01, 0.9))
+    assert spread_order(gaussians)[:40].min() >= 50
+
+
+def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_more_when_it_is_fast(monkeypatch):
+    monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 0.0)
+    monkeypatch.setattr(browser_detail, "_RETRY_S", 0.01)
+    page = open_page(0, "test")
+    try:
+        page.show(ViewContents.of_one_agent(points(3 * PREVIEW_COUNT)))
+        with open_browser() as browser:
+            browser.add_init_script(COUNT_DRAWN)
+            tab = browser.new_page()
+            tab.goto(page.url)
+            tab.get_by_text(f"This browser draws {PREVIEW_COUNT:,} of them").wait_for()
+            tab.wait_for_function("window.drawn.length > 0")
+            assert set(tab.evaluate("window.drawn")) == {PREVIEW_COUNT}
+            page._adapts.value = False
+            tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
+            page._adapts.value = True
+            tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT}")
+            # the next trial finds that the browser has become fast
+            monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
+            tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
+            page.show(ViewContents.of_one_agent(points(PREVIEW_COUNT // 2)))
+            tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT // 2}")
+    finally:
+        page.close()
+
+
+def test_a_browser_that_leaves_while_its_answer_is_used_ends_the_thread_quietly(monkeypatch):
+    measured, has_left = threading.Event(), threading.Event()
+    failures: list[object] = []
+
+    def answer_then_leave(_: BrowserDetail) -> float:
+        measured.set()
+        has_left.wait()
+        return 2 * RESPONSE_LIMIT_S
+
+    monkeypatch.setattr(BrowserDetail, "_response_s", answer_then_leave)
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+    page = open_page(0, "test")
+    try:
+        page.show(ViewContents.of_one_agent(points(3 * PREVIEW_COUNT)))
+        with open_browser() as browser:
+            tab = browser.new_page()
+            tab.goto(page.url)
+            while not measured.is_set():  # the browser needs this thread to load the page
+                tab.wait_for_timeout(50)
+            worker = next(thread for thread in threading.enumerate() if thread.name == "browser-detail")
+        while page.server.get_clients():
+            pass
+        has_left.set()
+        worker.join()
+        assert not failures
+    finally:
+        has_left.set()
+        page.close()
