@@ -15,13 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCE_FOLDERS = (ROOT / "src", *sorted((ROOT / "services").glob("*")))
 GENERATED = "gausslite.v1"
 STUDIES = ("gausslite_sim", "gausslite_bench")
-BESIDE_THE_CORE = (
-    "gausslite_view",
-    "gausslite.report",
-    "gausslite_ros",
-    "gausslite_view.view_command",
-    "gausslite_view.report_command",
-)
+BESIDE_THE_CORE = ("gausslite_view", "gausslite_ros")
 SERVICES = ("gausslite_agent", "gausslite_fusion_server", "gausslite_parser")
 MAY_USE_ARGPARSE = (
     "gausslite.cli",
@@ -38,7 +32,7 @@ CLIENTS = (
 )
 SERVERS = ("gausslite.wire.server", *SERVICES)
 ROW_COLUMNS = ("MEAN", "QUAT", "LOG_SCALE", "OPACITY_LOGIT", "RGB", "UPDATE_COUNT")
-MAY_USE_ROW_ENCODING = ("gausslite.optimize", "gausslite.render")
+MAY_USE_ROW_ENCODING = ("gausslite.mapping.density", "gausslite.mapping.splat_table", "gausslite.render")
 HEAVY = ("torch", "onnxruntime", "onnx", "embreex", "matplotlib", "scipy.spatial", "gausslite.render._kernels")
 
 

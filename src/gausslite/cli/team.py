@@ -75,7 +75,7 @@ if __name__ == "__main__":
 _MAX_DRAIN_S = 86_400.0
 
 
-def configure_end(parser: argparse.ArgumentParser) -> None:
+def configure_end(parser: CommandParser) -> None:
     """Add the options of `gausslite end`."""
     add_address(parser, "the agent")
     parser.add_argument(
@@ -103,7 +103,7 @@ def run_end(options: argparse.Namespace) -> int:
     return 1 if response.voxels_waiting or response.keyframes_waiting else 0
 
 
-def configure_evict(parser: argparse.ArgumentParser) -> None:
+def configure_evict(parser: CommandParser) -> None:
     """Add the options of `gausslite evict`."""
     add_address(parser, "the fusion server")
     parser.add_argument("agent", metavar="AGENT", help="id of the agent, as `gausslite status` prints it")
@@ -123,7 +123,7 @@ def run_evict(options: argparse.Namespace) -> int:
     return 0
 
 
-def configure_unban(parser: argparse.ArgumentParser) -> None:
+def configure_unban(parser: CommandParser) -> None:
     """Add the options of `gausslite unban`."""
     add_address(parser, "the fusion server")
     parser.add_argument("agent", metavar="AGENT", help="id of the banned agent, as `gausslite status` prints it")
@@ -146,7 +146,7 @@ def run_unban(options: argparse.Namespace) -> int:
 _STRATEGIES = ("vote", "refined", "concatenation")
 
 
-def configure_fetch(parser: argparse.ArgumentParser) -> None:
+def configure_fetch(parser: CommandParser) -> None:
     """Add the options of `gausslite fetch`."""
     add_address(parser, "the fusion server")
     add = parser.add_argument
@@ -174,7 +174,7 @@ def run_fetch(options: argparse.Namespace) -> int:
 _MAX_ITERATIONS, _MAX_SEED = 1_000_000, (1 << 63) - 1
 
 
-def configure_refine(parser: argparse.ArgumentParser) -> None:
+def configure_refine(parser: CommandParser) -> None:
     """Add the options of `gausslite refine`."""
     add_address(parser, "the fusion server")
     add = parser.add_argument
@@ -220,7 +220,7 @@ def run_refine(options: argparse.Namespace) -> int:
 _STATE_PREFIX = "AGENT_STATE_"
 
 
-def configure_status(parser: argparse.ArgumentParser) -> None:
+def configure_status(parser: CommandParser) -> None:
     """Add the options of `gausslite status`."""
     add_address(parser, "an agent or a fusion server")
     add_json(parser)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from gausslite.config.values import Plain, require_plain
 from gausslite.domain.checks import require_instance
@@ -99,12 +99,12 @@ def options_of(settings_class: Any) -> Mapping[str, OptionField]:
 
 def build(settings_class: type[Settings], options: Namespace, **given: Any) -> Settings:
     """Return the settings of these options; `given` has the values of fields that are no option's."""
-    for name, field_type, declared, _ in _fields_of(settings_class):
+    for name, field_type, declared, _ in _fields_of(cast(Any, settings_class)):
         if name in given:
             continue
         if declared is not None:
             given[name] = getattr(options, (declared.key or name).replace("-", "_"))
-        elif is_dataclass(field_type) and isinstance(field_type, type) and options_of(field_type):
+        elif is_dataclass(field_type) and isinstance(field_type, type) and options_of(cast(Any, field_type)):
             given[name] = build(field_type, options)
     return settings_class(**given)
 
@@ -112,11 +112,11 @@ def build(settings_class: type[Settings], options: Namespace, **given: Any) -> S
 def plain_options(settings: Any) -> dict[str, Plain]:
     """Return the values of a file from which `build` makes these settings."""
     plain: dict[str, Plain] = {}
-    for name, _, declared, _ in _fields_of(type(settings)):
+    for name, _, declared, _ in _fields_of(cast(Any, type(settings))):
         value = getattr(settings, name)
         if declared is not None:
             key = declared.key or name.replace("_", "-")
-            plain[key] = as_plain(options_of(type(settings))[key].to_plain(value))
+            plain[key] = as_plain(options_of(cast(Any, type(settings)))[key].to_plain(value))
         elif is_dataclass(value):
             plain |= plain_options(value)
     return plain
@@ -134,7 +134,7 @@ def as_plain(value: Any) -> Plain:
 
 def check_options(settings: Any) -> None:
     """Raise InvalidInputError for a field whose type, range or choice is not that of its option."""
-    for name, field_type, declared, default in _fields_of(type(settings)):
+    for name, field_type, declared, default in _fields_of(cast(Any, type(settings))):
         value = getattr(settings, name)
         if declared is None or (value is None and default is None):
             continue

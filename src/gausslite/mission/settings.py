@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import types
-from argparse import Namespace
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from enum import Enum, StrEnum
@@ -39,7 +38,7 @@ from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.training import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
-from gausslite.perception.relevance_tracker import RelevanceTrackerSettings
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.choose import BACKENDS
 from gausslite.render.cpu import MAX_THREADS, choose_threads
 
@@ -336,7 +335,7 @@ class PerceptionSettings:
         return replace(self, threads=1, asynchronous=True, detection_time_s=detection_time_s)
 
 
-def _iterations_of_policy(options: Namespace) -> int | None:
+def _iterations_of_policy(options: object) -> int | None:
     """Return the iterations per frame of the chosen policy; None at a rate."""
     if getattr(options, "rate", None) is not None:
         return None
