@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64, Int, Int64, UInt8, UInt32
 from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
-from gausslite.domain.checks import require_array
+from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark

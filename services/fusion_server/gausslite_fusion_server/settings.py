@@ -9,8 +9,9 @@ from pathlib import Path
 
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option
+from gausslite.config.plain_values import without_password
 from gausslite.config.program import Program, parse_options
-from gausslite.config.values import read_path, without_password
+from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.limits import FusionSettings

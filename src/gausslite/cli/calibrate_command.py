@@ -9,7 +9,8 @@ from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues,
 from gausslite.cli.progress import progress_bar
 from gausslite.cli.source_options import open_recorded
 from gausslite.codec.state_file import write_atomic
-from gausslite.config.values import read_correction, read_up_axis, to_toml
+from gausslite.config.plain_values import to_toml
+from gausslite.config.values import read_correction, read_up_axis
 from gausslite.mission.results import CALIBRATION_FILE, as_text, prepare_file
 
 _STEPS = 3

@@ -30,8 +30,9 @@ from gausslite.codec.ply import read_ply
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option, plain_options
+from gausslite.config.plain_values import Plain
 from gausslite.config.program import Program
-from gausslite.config.values import VOXEL_SIZE, Plain, read_text
+from gausslite.config.values import VOXEL_SIZE, read_text
 from gausslite.datasets.open import default_world_frame
 from gausslite.domain.checks import require_name
 from gausslite.domain.voxels import VoxelGrid

@@ -26,8 +26,8 @@ from gausslite.cli.source_options import (
     stated_values,
 )
 from gausslite.codec.state_file import write_atomic
+from gausslite.config.plain_values import Plain, to_toml
 from gausslite.config.program import without_options
-from gausslite.config.values import Plain, to_toml
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.source import HeldOutSplit, frame_size, select_frames

@@ -11,7 +11,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec.columns import Column, PositionPrecision
-from gausslite.domain.checks import require_finite
+from gausslite.domain.arrays import require_finite
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch

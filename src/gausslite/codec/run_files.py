@@ -13,8 +13,8 @@ from numpy import ndarray
 
 from gausslite.codec.state_file import read_png, read_state, write_atomic, write_png, write_state
 from gausslite.codec.subset_codec import CodecLimits, decode_subset, encode_subset
+from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera
-from gausslite.domain.checks import require_array
 from gausslite.domain.errors import GaussLiteError, MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians, choose_gaussians
 from gausslite.domain.pose import require_rigid

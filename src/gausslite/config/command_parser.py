@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from gausslite.config.option import suggestion
-from gausslite.config.values import describe_range, is_within, read_plain
+from gausslite.config.plain_values import describe_range, is_within, read_plain
 from gausslite.domain.errors import InvalidInputError
 from gausslite.process import printable
 

@@ -11,7 +11,7 @@ from enum import Enum
 from functools import cache
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from gausslite.config.values import Plain, require_plain
+from gausslite.config.plain_values import Plain, require_plain
 from gausslite.domain.checks import require_instance
 
 _OPTION = "option"

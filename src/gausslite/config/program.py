@@ -19,7 +19,7 @@ from typing import Any
 
 from gausslite.config.command_parser import PARSER, CommandParser
 from gausslite.config.option import Option, OptionField, as_plain, nearest, options_of, suggestion
-from gausslite.config.values import Plain, describe_range, is_within, read_plain, to_toml, without_password
+from gausslite.config.plain_values import Plain, describe_range, is_within, read_plain, to_toml, without_password
 from gausslite.domain.errors import GaussLiteError, InvalidInputError
 
 PREFIX = "GAUSSLITE_"

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.checks import require_array, require_whole
+from gausslite.domain.arrays import require_array
+from gausslite.domain.checks import require_whole
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.pose import Twist
 

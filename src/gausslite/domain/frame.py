@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
+from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.checks import require_array, require_whole
+from gausslite.domain.checks import require_whole
 from gausslite.domain.errors import InvalidInputError, PoseError
 from gausslite.domain.pose import require_rigid
 

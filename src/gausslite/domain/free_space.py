@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.checks import require_array
+from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64, Int16, Int64, UInt32
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.domain.checks import require_array
+from gausslite.domain.arrays import require_array
 from gausslite.domain.pose import transform_points
 
 

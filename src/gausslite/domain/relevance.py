@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int16, Int64, UInt8
 from numpy import ndarray
 
+from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import back_project, project
-from gausslite.domain.checks import require_array
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points

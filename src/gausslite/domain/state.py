@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gausslite.domain.checks import require_array
+from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError, MapFileError
 
 _State = TypeVar("_State")

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt32, UInt64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.domain.checks import require_array
+from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 from numpy import ndarray
 
-from gausslite.domain.checks import require_array
+from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.domain.pose import Trajectory
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
-from gausslite.domain.checks import require_array
+from gausslite.domain.arrays import require_array
 from gausslite.domain.frame import Frame
 from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_per_segment
 

@@ -12,8 +12,8 @@ from numpy import ndarray
 
 from gausslite.calibration.alignment import fit_pose
 from gausslite.calibration.errors import fit_exposure
+from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.checks import require_array
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.checks import require_array
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int64, UInt32
 from numpy import ndarray
 
-from gausslite.domain.checks import require_array, require_finite
+from gausslite.domain.arrays import require_array, require_finite
 from gausslite.domain.errors import InvalidInputError, MapFileError, QuotaError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.state import State, get_array

@@ -13,8 +13,8 @@ from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.calibration.alignment import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
+from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion, MotionModel, lift
-from gausslite.domain.checks import require_array
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import (

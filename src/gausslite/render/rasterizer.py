@@ -42,8 +42,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int16, UInt8, UInt32
 from numpy import ndarray
 
+from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.checks import require_array
 from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.domain.gaussians import Gaussians
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from gausslite.config.values import read_numbers, split_names
+from gausslite.config.plain_values import split_names
+from gausslite.config.values import read_numbers
 
 
 def read_image_sizes(text: str) -> tuple[tuple[int, int], ...]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gausslite.cli.progress import print_above_bar
 from gausslite.codec.state_file import write_atomic
-from gausslite.config.values import split_names
+from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import write_json
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.state_file import write_atomic
-from gausslite.config.values import split_names
+from gausslite.config.plain_values import split_names
 from gausslite.mission.results import as_text, prepare_folder, write_json
 from gausslite_bench.cli.study_options import add_study_options, scene_plans
 from gausslite_bench.codec.formats import codec_formats

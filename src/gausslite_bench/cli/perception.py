@@ -18,8 +18,8 @@ from gausslite.cli.source_options import (
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
+from gausslite.config.plain_values import split_names
 from gausslite.config.program import Program
-from gausslite.config.values import split_names
 from gausslite.datasets.source import Source, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import NounMatch, head_of, same_kind

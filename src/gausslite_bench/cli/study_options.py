@@ -13,8 +13,9 @@ from gausslite.cli.source_options import (
     open_recorded,
     stated_values,
 )
+from gausslite.config.plain_values import split_names
 from gausslite.config.program import add_flags
-from gausslite.config.values import NONE, PRIOR_FORM, read_prior, read_up_axis, split_names
+from gausslite.config.values import NONE, PRIOR_FORM, read_prior, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.source import downscaled_size
 from gausslite.domain.errors import InvalidInputError

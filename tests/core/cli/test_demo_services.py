@@ -18,7 +18,7 @@ from gausslite.cli.demo_services import (
     watch_missions,
 )
 from gausslite.config.option import plain_options
-from gausslite.config.values import to_toml
+from gausslite.config.plain_values import to_toml
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.mapping.training import SkippableStage

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, check_options, option, plain_options
+from gausslite.config.plain_values import to_toml
 from gausslite.config.program import Program, parse_options, without_options
-from gausslite.config.values import to_toml
 from gausslite.domain.errors import InvalidInputError
 
 
