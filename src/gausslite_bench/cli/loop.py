@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from gausslite.cli.map_inputs import choose_roi
+from gausslite.cli.map_inputs import choose_roi, mission_settings
 from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import (
     RecordingOptions,
@@ -20,7 +20,6 @@ from gausslite.config.option import build, option
 from gausslite.config.program import Program
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.views import HeldOutView
@@ -66,7 +65,7 @@ def configure_loop(parser: CommandParser) -> None:
         *(LoopOptions, RecordingOptions, SourceSettings, TaskSettings, PerceptionSettings, MissionSettings),
         flags="frames size task detector roi objects policy max-gaussians iterations rate seed loop unlimited json",
         positional="source",
-        omit=("pose-prior", "camera-correction", "test-every"),
+        omit=("test-every",),
         defaults={"source": _HOME},
     ).add_to(parser)
     parser.set_defaults(run=run_loop)
@@ -76,8 +75,9 @@ def run_loop(options: argparse.Namespace) -> int:
     """Map the sequence and print the time of each stage. Reading frames is not counted."""
     if options.source == _HOME and options.policy == TASK and not _has_task(options):
         options.task = _HOME_TASK
-    stated = stated_values(options.register_depth, CameraCorrection(), options.pose_prior)
-    source = calibrate_with_messages(options.source, open_recorded(options.source, options.up), stated).source
+    stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
+    calibration = calibrate_with_messages(options.source, open_recorded(options.source, options.up), stated)
+    source, options.pose_prior = calibration.source, calibration.pose_prior
     positions: Sequence[int] = select_frames(source, options.frames)
     held_out: Sequence[int] = ()
     if options.unlimited is not None:
@@ -148,17 +148,13 @@ def _memory_line(memory: MemoryTrend) -> str:
     )
 
 
-def _mission_settings(options: argparse.Namespace) -> MissionSettings:
-    return build(MissionSettings, options, pose_prior=PoseExposurePrior())
-
-
 def _estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
     """Return the relevance estimator of the options: for a task, for regions, or for a uniform map."""
     roi = choose_roi(options, source)
     if not isinstance(roi, TaskGraph):
         return region_estimator(roi)
     return EstimatorFactory(
-        build(PerceptionSettings, options).at_rate(_mission_settings(options)), lambda: SceneInfo.of(source)
+        build(PerceptionSettings, options).at_rate(mission_settings(options)), lambda: SceneInfo.of(source)
     ).build(roi)
 
 
@@ -166,7 +162,7 @@ def _run_mapping(
     options: argparse.Namespace, source: Source, positions: Sequence[int], rasterizer: Rasterizer
 ) -> tuple[LoopBench, list[FrameCost], MemoryTrend | None]:
     """Return the loop after these positions, the cost of each frame, and with --loop the memory trend."""
-    settings, size = _mission_settings(options), frame_size(options.size, source)
+    settings, size = mission_settings(options), frame_size(options.size, source)
     mapper = GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed)
     bench = LoopBench(_estimator(options, source), mapper, VoxelGrid(), settings.scheduler_settings)
     log = CostLog()
@@ -195,7 +191,7 @@ def _gap(
     """Map the same frames again with --unlimited iterations and score both maps on the held-out frames."""
     size = frame_size(options.size, source)
     unlimited = _without_rate(options)
-    loop = LoopBench(_estimator(unlimited, source), build_mapper(_mission_settings(unlimited)), VoxelGrid())
+    loop = LoopBench(_estimator(unlimited, source), build_mapper(mission_settings(unlimited)), VoxelGrid())
     with MappingBar(len(positions), "unlimited") as bar:
         loop.run(FrameStream(source, positions, size).frames(), bar.count)
     regions = selected_regions(options, source)
@@ -210,7 +206,7 @@ def _without_rate(options: argparse.Namespace) -> argparse.Namespace:
 
 def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[int]) -> None:
     """Check before two runs that their maps can be compared. Raises InvalidInputError, DatasetError."""
-    _mission_settings(_without_rate(options))
+    mission_settings(_without_rate(options))
     if not held_out:
         raise InvalidInputError("--unlimited: expected at least 8 frames, so that one is held out; got fewer")
     regions, size = selected_regions(options, source), frame_size(options.size, source)

@@ -50,7 +50,7 @@ def test_an_unknown_option_is_one_line_that_names_the_help_of_its_command(
     with pytest.raises(SystemExit) as ended:
         main(list(arguments))
     assert ended.value.code == 2
-    expected = f"{program}: unrecognized arguments: --jsn; see `{program} --help`\n"
+    expected = f"{program}: unrecognized arguments: --jsn; did you mean --json?; see `{program} --help`\n"
     assert capsys.readouterr().err == expected
 
 

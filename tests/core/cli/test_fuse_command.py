@@ -47,7 +47,7 @@ def test_maps_of_different_world_frames_are_refused(
     assert fuse(*maps, tmp_path / "fused.ply") == 2
     [line] = capsys.readouterr().err.splitlines()
     assert f"expected one world frame, got 'map' in {maps[0]}, 'odom' in {maps[1]}; if the poses share" in line
-    assert "map both with the same --world-frame NAME" in line
+    assert "map both with the same --set world-frame=NAME" in line
     assert not (tmp_path / "fused.ply").exists()
 
 

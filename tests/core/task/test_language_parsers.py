@@ -220,7 +220,7 @@ def test_the_prompts_own_examples_are_graphs_by_its_own_schema():
         ({"backend": Backend.HTTP}, "expected --llm-model"),
         ({"backend": Backend.ONNX}, "expected --llm-model"),
         ({"backend": Backend.HTTP, "model": "m"}, "expected --llm-url"),
-        ({"timeout_s": float("nan")}, "up to 600 seconds"),
+        ({"timeout_s": float("nan")}, "expected 0.001 to 600 s, got nan"),
         ({"backend": Backend.HTTP, "model": "m", "url": "ftp://host"}, "backend http url"),
         ({"backend": Backend.HTTP, "model": "m", "url": "http://me:secret@host/v1"}, "no user, password"),
         ({"backend": Backend.HTTP, "model": "m", "url": "http://host", "api_key": "a\nb"}, "backend http key"),
