@@ -21,7 +21,7 @@ from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
 from gausslite_view.contents import ViewContents
-from gausslite_view.pages import read_contents
+from gausslite_view.run_contents import read_contents
 
 _JPEG_QUALITY = 88
 # HTML does not allow these characters, not even escaped

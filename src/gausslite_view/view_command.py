@@ -15,7 +15,8 @@ from gausslite.config.program import add_flags
 from gausslite.process import print_message
 from gausslite.wire.security import TlsFiles
 from gausslite_view.contents import DEFAULT_LIMIT
-from gausslite_view.pages import open_page, read_contents, read_past
+from gausslite_view.pages import open_page
+from gausslite_view.run_contents import read_contents, read_past
 
 _DEFAULT_PORT = 8099
 

@@ -19,8 +19,9 @@ ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
 NEED_AN_EXTRA = {
     "torch": ("gausslite.render.reference", "gausslite.render.cuda"),
-    "ray": ("gausslite.cluster",),
-    "viser": ("gausslite_view",),
+    "psycopg": ("gausslite.fusion.postgres_",),
+    "rclpy": ("gausslite_ros.node",),
+    "viser": ("gausslite_view", "gausslite_bench.view_rates"),
 }
 """Modules that are imported where an option chooses them, by the package that they need."""
 
@@ -56,7 +57,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     required = _import_names(_installed_closure(project["dependencies"]))
     sim = _import_names(_installed_closure(project["optional-dependencies"]["sim"])) - required
-    visible = required | {"gausslite", "gausslite_sim", "gausslite_bench", "gausslite_agent"}
+    visible = required | {"gausslite", "gausslite_sim", "gausslite_bench", "gausslite_view", "gausslite_ros", "gausslite_agent"}
     hidden = {name for name in packages_distributions() if name.isidentifier()} - visible
     out = tmp_path_factory.mktemp("minimal")
     done = subprocess.run(

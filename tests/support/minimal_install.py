@@ -17,7 +17,7 @@ from pathlib import Path
 
 import sitecustomize
 
-PACKAGES = ("gausslite", "gausslite_sim", "gausslite_bench")
+PACKAGES = ("gausslite", "gausslite_view", "gausslite_ros", "gausslite_sim", "gausslite_bench")
 PROGRAMS = ("gausslite_agent", "gausslite_fusion_server", "gausslite_parser")
 TASK = "Pick up the mug on the table"
 SOURCE, FRAMES = "sim:home", ("--frames", "0:3", "--size", "160x120")
@@ -63,7 +63,7 @@ def _main(program: str) -> Callable[[list[str]], object]:
 def default_paths(out: Path) -> list[dict[str, object]]:
     """Run what README and the help promise without any extra but `sim`."""
     run_folder, map_file = str(out / "map"), str(out / "map" / "map.ply")
-    halves = ("--frames-a", "0:6:3", "--frames-b", "0:6:3")
+    halves = ("--set", "frames-a=0:6:3", "--set", "frames-b=0:6:3")
     commands = (
         ("map", SOURCE, "--task", TASK, *FRAMES, "--out", run_folder),
         ("map", SOURCE, *FRAMES, "--out", str(out / "uniform")),
@@ -76,7 +76,7 @@ def default_paths(out: Path) -> list[dict[str, object]]:
         ("calibrate", "sim:home?frames=12&size=160x120&drift=2%"),
         ("models", "list"),
         ("doctor", "--json"),
-        ("demo", *halves, "--size", "160x120", "--refine-iterations", "5", "--out", str(out / "demo")),
+        ("demo", *halves, "--size", "160x120", "--set", "refine-iterations=5", "--out", str(out / "demo")),
         *((command, "--help") for command in importlib.import_module("gausslite.cli.main").SUMMARIES),
     )
     results = [run("gausslite", arguments) for arguments in commands]
@@ -87,16 +87,16 @@ def missing_extras(out: Path) -> list[dict[str, object]]:
     """Run what needs an extra; each result has the extra."""
     run_folder = str(out / "map")
     cases = [
-        ("view", "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / "view"), "--view", "0")),
-        ("view", "gausslite", ("demo", "--out", str(out / "view"), "--view", "0")),
+        ("view", "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / "view"), "--set", "view=0")),
+        ("view", "gausslite", ("demo", "--out", str(out / "view"), "--set", "view=0")),
         ("view", "gausslite", ("view", run_folder, "--port", "0")),
-        ("view", "gausslite_agent", ("--listen", "127.0.0.1:50099", "--view", "0")),
+        ("view", "gausslite_agent", ("--listen", "127.0.0.1:50099", "--set", "view=0")),
         ("view", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--view", "0")),
         ("metrics", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--metrics", "127.0.0.1:0")),
         ("completion", "gausslite", ("completion", "bash")),
         *(("export", "gausslite", ("export", run_folder, "--to", kind)) for kind in ("spz", "las", "octomap", "mesh")),
         *(
-            (backend, "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / backend), "--rasterizer", backend))
+            (backend, "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / backend), "--set", f"rasterizer={backend}"))
             for backend in ("cuda", "reference")
         ),
     ]

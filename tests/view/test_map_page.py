@@ -19,7 +19,7 @@ from gausslite.codec.run_files import KeyframeView, MapSnapshot, write_keyframe_
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite_view.contents import ColourMode, ViewContents, colours_of
-from gausslite_view.pages import read_contents, read_past
+from gausslite_view.run_contents import read_contents, read_past
 
 pytest.importorskip("viser")
 from gausslite_view.pages import open_page

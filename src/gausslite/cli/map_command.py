@@ -355,7 +355,7 @@ def _view(
     if port is None:
         return nullcontext(lambda _outcome: None)
     page: AbstractContextManager[Callable[[FrameOutcome], None]]
-    page = sibling(Sibling.PAGES).mission_view(port, mapper, task_at)
+    page = sibling(Sibling.MISSION_PAGE).mission_view(port, mapper, task_at)
     return page
 
 

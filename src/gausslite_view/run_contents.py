@@ -1,0 +1,79 @@
+"""Read what the page shows of a results folder or a PLY file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gausslite.codec.json import object_from_json
+from gausslite.codec.ply import read_ply
+from gausslite.codec.run_files import MapSnapshot, read_keyframe_views, read_map_history
+from gausslite.datasets.folder import read_pose_rows
+from gausslite.domain.errors import MapFileError
+from gausslite.domain.objects import ObjectLandmark
+from gausslite.mission.results import TRAJECTORY, read_report
+from gausslite_view.contents import NO_AGENT, ViewContents
+from gausslite_view.time_scrub import PastMap
+
+_MAP = "map.ply"
+
+
+def read_contents(path: Path) -> ViewContents:
+    """Return the contents of a results folder or a PLY file.
+
+    Raises MapFileError, DatasetError, PoseError, CodecError.
+    """
+    file = path / _MAP if path.is_dir() else path
+    if not file.is_file():
+        raise MapFileError(f"{path}: expected a results folder with {_MAP}, a PLY file or HOST:PORT, got neither")
+    gaussians = read_ply(file)
+    if not path.is_dir():
+        return ViewContents.of_one_agent(gaussians)
+    report = read_report(path)
+    contents = ViewContents.of_one_agent(gaussians, str(report.get("agent_id") or path.resolve().name))
+    contents = replace(
+        contents, targets=_targets(report), objects=_objects(report), keyframes=tuple(read_keyframe_views(path))
+    )
+    if not (path / TRAJECTORY).is_file():
+        return contents
+    times_ns, T_world_camera = read_pose_rows(path / TRAJECTORY)
+    return replace(contents, times_ns=times_ns, T_world_camera=T_world_camera)
+
+
+def read_past(path: Path, contents: ViewContents) -> tuple[PastMap, ...]:
+    """Return the earlier maps of a results folder with these contents; none for a PLY file. Raises MapFileError."""
+    if not path.is_dir():
+        return ()
+    return tuple(
+        PastMap(each.time_ns, each.total, partial(_contents_at, each, contents)) for each in read_map_history(path)
+    )
+
+
+def _contents_at(snapshot: MapSnapshot, newest: ViewContents) -> ViewContents:
+    """Return an earlier map with the keyframes and the objects that had been seen by then. Raises CodecError."""
+    gaussians = snapshot.gaussians()
+    index = 0 if newest.agents else NO_AGENT
+    return replace(
+        newest,
+        gaussians=gaussians,
+        agent=np.full(len(gaussians), index, np.int64),
+        objects=tuple(each for each in newest.objects if each.first_seen_ns <= snapshot.time_ns),
+        keyframes=[each for each in newest.keyframes if each.capture_time_ns <= snapshot.time_ns],
+        state_ns=snapshot.time_ns,
+    )
+
+
+def _targets(report: Mapping[str, object]) -> tuple[str, ...]:
+    """Return the targets: an agent's report lists them, that of `map` has them in its task."""
+    task = report.get("task")
+    targets = task.get("targets") if isinstance(task, Mapping) else report.get("targets")
+    return tuple(str(each) for each in targets) if isinstance(targets, list) else ()
+
+
+def _objects(report: Mapping[str, object]) -> tuple[ObjectLandmark, ...]:
+    values = report.get("objects")
+    return tuple(object_from_json(each) for each in values) if isinstance(values, list) else ()
