@@ -96,7 +96,11 @@ def missing_extras(out: Path) -> list[dict[str, object]]:
         ("completion", "gausslite", ("completion", "bash")),
         *(("export", "gausslite", ("export", run_folder, "--to", kind)) for kind in ("spz", "las", "octomap", "mesh")),
         *(
-            (backend, "gausslite", ("map", SOURCE, *FRAMES, "--out", str(out / backend), "--set", f"rasterizer={backend}"))
+            (
+                backend,
+                "gausslite",
+                ("map", SOURCE, *FRAMES, "--out", str(out / backend), "--set", f"rasterizer={backend}"),
+            )
             for backend in ("cuda", "reference")
         ),
     ]

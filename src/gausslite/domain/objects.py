@@ -137,9 +137,9 @@ def is_structure(phrase: str) -> bool:
     return head_of(phrase) in words()["nouns"]["structure"]
 
 
-def is_solid(phrase: str) -> bool:
-    """Return True for a kind of object that is never a thin plane, as floors, walls, screens and rugs are."""
-    return head_of(phrase) in words()["nouns"]["solid"]
+def is_convex(phrase: str) -> bool:
+    """Return False for a kind of object with other things inside its convex outline: chairs, plants, animals."""
+    return head_of(phrase) not in words()["nouns"]["non_convex"]
 
 
 def largest_size(phrase: str) -> tuple[float, float]:

@@ -85,7 +85,8 @@ class DepthSegmenter:
         while (seeds := np.flatnonzero(unvisited)).size > best_count:
             y, x = divmod(int(seeds[0]), width)
             flooded = np.zeros((height + 2, width + 2), np.uint8)
-            cv2.floodFill(layers, flooded, (x, y), 0, step, step, cv2.FLOODFILL_MASK_ONLY | 4 | (1 << 8))
+            flags = cv2.FLOODFILL_MASK_ONLY | 4 | (1 << 8)
+            cv2.floodFill(layers, flooded, (x, y), newVal=0, loDiff=step, upDiff=step, flags=flags)
             surface = flooded[1:-1, 1:-1] > 0
             surface[y, x] = True
             unvisited &= ~surface

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera, back_project, lift
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import is_solid
+from gausslite.domain.objects import is_convex
 from gausslite.domain.pose import transform_points, unit_up_axis
 from gausslite.domain.relevance import Detection
 from gausslite.perception.object_map import Observation
@@ -37,8 +37,8 @@ def lift_detections(
 ) -> list[tuple[Detection, Observation]]:
     """Return the detections with improved masks and their observations in the world.
 
-    Those with too little depth are left out. A solid kind has no planes: a plane that also surrounds its mask is cut
-    from it, and a mask that is one plane, as that of a rug or a screen, is left out.
+    Those with too little depth are left out, and those of a kind that is not convex but show one plane, such as a rug
+    or a screen.
     """
     improved = [
         replace(detection, mask=_object_mask(detection, depth_m, frame.camera, settings.lifting))
@@ -60,8 +60,11 @@ def lift_detections(
 def _object_mask(
     detection: Detection, depth_m: Float32[ndarray, "h w"], camera: Camera, settings: LiftingSettings
 ) -> Bool[ndarray, "h w"]:
+    """Return a detection's mask in its depth layer: filled if its kind is convex, else without background planes."""
     mask = foreground_mask(detection.mask, depth_m, settings)
-    return without_background_planes(mask, depth_m, camera, settings) if is_solid(detection.phrase) else mask
+    if is_convex(detection.phrase):
+        return filled_outline(mask, depth_m, settings)
+    return without_background_planes(mask, depth_m, camera, settings)
 
 
 def _lift(
@@ -96,7 +99,7 @@ def _lift(
         frame.capture_time_ns,
         settings.object_map,
     )
-    if is_solid(detection.phrase):
+    if not is_convex(detection.phrase):
         plane = FittedPlane.of(observation.without_outliers(points_m))
         if plane.is_level_or_upright(np.array(unit_up_axis(settings.up_axis)), settings.lifting):
             return None
@@ -143,6 +146,24 @@ def foreground_mask(
     front = mask.copy()
     front[known] = (bins >= nearest[0] - 1) & (bins <= nearest[-1] + 1)
     return front
+
+
+def filled_outline(
+    mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"], settings: LiftingSettings
+) -> Bool[ndarray, "h w"]:
+    """Return a mask with the pixels of its depth inside its convex outline: detectors leave out a bowl's fruit."""
+    known = depth_m[mask & (depth_m > 0)]
+    if len(known) == 0:
+        return mask
+    rows, columns = np.nonzero(mask)
+    outline = cv2.convexHull(np.stack([columns, rows], axis=1).astype(np.int32))
+    hull = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
+    nearest_m, farthest_m = np.percentile(known, (settings.outer_percent, 100.0 - settings.outer_percent))
+    slack_m = settings.depth_slack_m
+    added = hull & ~mask & (depth_m >= nearest_m - slack_m) & (depth_m <= farthest_m + slack_m)
+    wide = np.ones((settings.min_added_px, settings.min_added_px), np.uint8)
+    filled: Bool[ndarray, "h w"] = mask | (cv2.morphologyEx(added.astype(np.uint8), cv2.MORPH_OPEN, wide) > 0)
+    return filled
 
 
 def without_background_planes(

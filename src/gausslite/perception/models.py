@@ -1,4 +1,4 @@
-"""Catalogue of the model files that GaussLite can use: purpose, source, licence, and the commands that make each."""
+"""Model files: their catalogue, and the detector that a file becomes."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Observation:
         radius_m = 2.0 * float(np.median(np.linalg.norm(points_m - centroid_m, axis=1)))
         inliers_m = points_m[_is_inlier(points_m, centroid_m, radius_m, settings)]
         cells = np.unique(VoxelGrid(settings.cell_m).keys(inliers_m.astype(np.float32)))
-        return cls(phrase, centroid_m, radius_m, cells, camera_m, score, time_ns, settings)
+        return cls(phrase, centroid_m, radius_m, cells, camera_m, score=score, time_ns=time_ns, settings=settings)
 
     def without_outliers(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
         """Return those of the mask's points that are near the centroid for the object's size."""

@@ -200,7 +200,9 @@ class RelevanceTracker:
         self, frame: Frame, depth_m: Float32[ndarray, "h w"], detections: Sequence[Detection]
     ) -> list[tuple[Landmark, Bool[ndarray, "h w"]]]:
         """Add the detections to the object map; return the masks of its landmarks in this frame."""
-        kept = self._drop_excluded(self._drop_generic_anchors(detections))
+        excluded = self._excluded_pixels(detections, frame)
+        kept = self._drop_excluded(self._drop_generic_anchors(detections), excluded)
+        depth_m = np.where(excluded, np.float32(0.0), depth_m)
         localised = [
             (detection, self._surfaces.with_level(observation, detection.mask, frame))
             for detection, observation in lift_detections(kept, depth_m, frame, self._settings)
@@ -229,17 +231,21 @@ class RelevanceTracker:
             if not (is_generic(detection.phrase) and any(detection.mask is anchor for anchor in anchors))
         ]
 
-    def _drop_excluded(self, detections: Sequence[Detection]) -> list[Detection]:
-        """Remove the pixels of excluded objects from all others; drop detections that mostly show an excluded one."""
-        nouns = self._graph.excluded_nouns
-        excluded = [detection.mask for detection in detections if detection.phrase in nouns and not detection.is_weak]
-        if not excluded:
-            return list(detections)
-        left_out, kept = np.logical_or.reduce(excluded), []
+    def _excluded_pixels(self, detections: Sequence[Detection], frame: Frame) -> Bool[ndarray, "h w"]:
+        """Return the pixels of excluded objects, which belong to no other."""
+        pixels = np.zeros(frame.depth_m.shape, np.bool_)
         for detection in detections:
-            left = detection.mask & ~left_out
+            if detection.phrase in self._graph.excluded_nouns and not detection.is_weak:
+                pixels |= detection.mask
+        return pixels
+
+    def _drop_excluded(self, detections: Sequence[Detection], excluded: Bool[ndarray, "h w"]) -> list[Detection]:
+        """Remove the excluded pixels from all detections; drop those that mostly show an excluded object."""
+        kept = []
+        for detection in detections:
+            left = detection.mask & ~excluded
             is_other = np.count_nonzero(left) >= self._settings.min_left_share * np.count_nonzero(detection.mask)
-            if detection.phrase not in nouns and is_other:
+            if detection.phrase not in self._graph.excluded_nouns and is_other:
                 kept.append(replace(detection, mask=left))
         return kept
 

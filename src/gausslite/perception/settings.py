@@ -57,6 +57,13 @@ class LiftingSettings:
     """Share of the fullest bin below which a bin is almost empty."""
     min_layer_share: float = 0.15
     """Share of the mask from which the nearest layer is the object."""
+    outer_percent: float = 2.0
+    """Pixels with the least and the largest depth, in percent, that do not count to the depth of a convex object."""
+    depth_slack_m: float = 0.03
+    """Distance from that depth within which pixels inside the outline belong to the object. Without them, the recall of
+    a bowl with fruit is 0.52 instead of 0.94, and of the kitchen's table 0.80 instead of 0.88."""
+    min_added_px: int = 3
+    """Width from which they are more than the steps of an outline. With 5, the bowl's recall is 0.89."""
     ring_inner_px: int = 2
     """Pixels next to the outline that show no plane: their depth is often between two surfaces."""
     ring_outer_px: int = 9

@@ -8,7 +8,13 @@ import pytest
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Detection
-from gausslite.perception.lifting import FittedPlane, foreground_mask, lift_detections, without_background_planes
+from gausslite.perception.lifting import (
+    FittedPlane,
+    filled_outline,
+    foreground_mask,
+    lift_detections,
+    without_background_planes,
+)
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.settings import LiftingSettings, RelevanceTrackerSettings
 
@@ -177,8 +183,37 @@ def test_a_thin_back_of_a_chair_leans_and_a_screen_does_not(lean_deg, is_plane):
 
 
 @pytest.mark.parametrize(("noun", "is_lifted"), [("chair", False), ("potted plant", False), ("monitor", True)])
-def test_a_plane_is_no_object_of_a_solid_kind(noun, is_lifted):
+def test_a_plane_is_no_chair_and_no_plant(noun, is_lifted):
     depth_m = np.full((120, 160), 2.0, np.float32)
     frame = Frame(0, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, np.eye(4))
     lifted = lift_detections([detection(noun, 40, 80)], depth_m, frame, RelevanceTrackerSettings())
     assert bool(lifted) is is_lifted
+
+
+def bowl_and_fruit() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A disc at 1.5 m with a smaller disc in it, 2 cm nearer, that touches its upper edge, before a wall at 3 m."""
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    bowl = np.hypot(columns - 80, rows - 60) < 40
+    fruit = np.hypot(columns - 80, rows - 42) < 21
+    depth_m = np.where(bowl, 1.5, 3.0)
+    depth_m[fruit & bowl] = 1.48
+    return bowl & ~fruit, bowl, depth_m.astype(np.float32)
+
+
+def test_what_a_convex_object_holds_belongs_to_it():
+    mask, whole, depth_m = bowl_and_fruit()
+    frame = Frame(0, 0, np.zeros((120, 160, 3), np.uint8), depth_m, CAMERA, np.eye(4))
+    found = Detection("bowl", 0.9, (40.0, 20.0, 120.0, 100.0), mask)
+    ((lifted, _),) = lift_detections([found], depth_m, frame, RelevanceTrackerSettings())
+    assert lifted.mask[whole].mean() > 0.98
+    assert not lifted.mask[~whole].any()
+
+
+def test_what_is_behind_or_in_front_of_a_convex_object_is_left_out():
+    mask, whole, depth_m = bowl_and_fruit()
+    other = whole & ~mask
+    for distance_m in (1.0, 2.0, 0.0):
+        depth_m[other] = distance_m
+        assert np.array_equal(filled_outline(mask, depth_m, LiftingSettings()), mask)
+    empty = np.zeros_like(mask)
+    assert np.array_equal(filled_outline(empty, depth_m, LiftingSettings()), empty)
