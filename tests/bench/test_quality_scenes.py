@@ -134,7 +134,7 @@ def test_regions_that_no_frame_shows_are_reported(tmp_path: Path, capsys: pytest
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])
     for name, reported in (("lamp_1", True), ("mug_1", False)):
-        options = ["--roi", str(roi), "--objects", name, "--max-gaussians", "150", "--threads", "1"]
+        options = ["--roi", str(roi), "--objects", name, "--max-gaussians", "150", "--set", "threads=1"]
         assert main(["map", str(kitchen), *options, "--out", str(tmp_path / name)]) == 0
         assert ("none of these frames shows the selected region" in capsys.readouterr().out) is reported
     assert (

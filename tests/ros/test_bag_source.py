@@ -16,7 +16,7 @@ import gausslite as gl
 from gausslite.datasets.open import open_source
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
-TOOL = Path(__file__).resolve().parents[3] / "tools" / "write_bag.py"
+TOOL = Path(__file__).resolve().parents[2] / "tools" / "write_bag.py"
 
 
 @pytest.fixture(scope="module")

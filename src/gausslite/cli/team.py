@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,12 @@ from gausslite.config.option import build
 from gausslite.config.program import add_flags
 from gausslite.config.values import read_path
 from gausslite.domain.checks import quote_name, require_identifier
-from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import find_objects
 from gausslite.mission.results import MAP_FILE, as_text, prepare_file, read_report
-from gausslite.process import print_message
-from gausslite.wire.channel import require_callable, require_serving
+from gausslite.wire.channel import require_callable
 from gausslite.wire.clients import AgentClient, Export, FusionClient, query_status
 from gausslite.wire.security import TlsFiles
 
@@ -49,27 +47,6 @@ def agent_client(options: argparse.Namespace) -> AgentClient:
     """Return a client of the agent at the address. Raises InvalidInputError."""
     require_callable("address of the agent", options.address)
     return AgentClient(options.address, tls=build(TlsFiles, options).read())
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Return 0 if the service is SERVING, 1 with one line on stderr if not, 2 for wrong options."""
-    parser = CommandParser(prog="python -m gausslite.cli.team")
-    parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
-    add_flags(parser, TlsFiles)
-    options = parser.parse_args(arguments)
-    try:
-        require_serving(options.address, build(TlsFiles, options).read())
-    except InvalidInputError as error:
-        print_message(str(error))
-        return 2
-    except UnavailableError as error:
-        print_message(str(error))
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
 
 
 _MAX_DRAIN_S = 86_400.0

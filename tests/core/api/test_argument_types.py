@@ -25,7 +25,7 @@ WRONG = {
     'gl.MissionSettings(max_gaussians="5")': "max_gaussians: expected a whole number, got str '5'",
     "gl.MissionSettings(seed=None)": "seed: expected a whole number, got NoneType",
     'gl.MissionSettings(rate_hz="4")': "rate_hz: expected a number, got str '4'",
-    "gl.MissionSettings(policy=5)": "policy: expected the name of a policy",
+    "gl.MissionSettings(policy=5)": "policy: expected text, got int 5",
     'gl.FusionClient("nonsense")': "FusionClient address: expected HOST:PORT or unix:PATH, got 'nonsense'",
     'gl.AgentClient("host:0")': "AgentClient address: expected the port",
     "gl.SceneInfo(up_axis=(0, 0, 0))": r"up_axis: expected three numbers of length 1 .*got \(0, 0, 0\)",

@@ -16,7 +16,7 @@ from fusion_running import GRID, fusion_server
 from sample_gaussians import plain_gaussians
 from serving import serving
 
-from gausslite.cli.team import main as ask_health
+from gausslite.cli.health_check import main as ask_health
 from gausslite.domain.errors import InvalidInputError, NotPermittedError, UnavailableError
 from gausslite.domain.voxels import group_by_voxel
 from gausslite.task.rules import RuleParser
@@ -116,7 +116,8 @@ def test_the_health_check_works_over_tls(certs: Path) -> None:
 def test_each_service_listens_encrypted_and_never_prints_its_key(module: str, certs: Path, tmp_path: Path) -> None:
     listen = f"unix:{tmp_path}/s.sock"
     options = [f"--tls-{kind}={certs / name}" for kind, name in _FILES]
-    command = [sys.executable, "-m", module, "--listen", listen, *options]
+    keys = [word for option in options for word in ("--set", option.removeprefix("--"))]
+    command = [sys.executable, "-m", module, "--listen", listen, *keys]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         started = ""
@@ -154,7 +155,12 @@ def test_wrong_files_are_one_error_line_before_serving(
         (("--tls-cert", "/nowhere.pem", "--tls-key", key), "/nowhere.pem: expected a PEM file, got nothing"),
         (("--tls-cert", cert, "--tls-key", key, "--tls-ca", notes), f"--tls-ca {notes}: expected certificates"),
     ):
-        assert run(["--listen", "nowhere", *options]) == 2
+        keys = [
+            word
+            for flag, file in zip(options[::2], options[1::2], strict=True)
+            for word in ("--set", f"{flag.removeprefix('--')}={file}")
+        ]
+        assert run(["--listen", "nowhere", *keys]) == 2
         [line] = capsys.readouterr().err.splitlines()
         assert expected in line
 

@@ -215,7 +215,7 @@ def test_errors_of_task_source_and_disk_are_raised(tmp_path: Path) -> None:
         (["--max-gaussians", "0"], "--max-gaussians: expected at least 1"),
         (["--agent-id", ""], "--agent-id"),
         (["--agent-id", "husky-\udcff"], "--agent-id: expected 1 to 64 letters, digits"),
-        (["--mission", "x" * 256], "--mission: expected 1 to 64 letters, digits"),
+        (["--set", f"mission={'x' * 256}"], "mission: expected 1 to 64 letters, digits"),
         (["--set", "world-frame=\udcff"], "world-frame: expected UTF-8 text"),
         (["--set", "voxel-size=nan"], "voxel"),
         (["--rate", "-1"], "rate"),

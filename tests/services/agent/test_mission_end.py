@@ -200,7 +200,7 @@ def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> 
         log = process.stderr.read().splitlines()
         assert process.wait(60) == 1
     (line,) = [line for line in log if " ERROR " in line]
-    assert re.search(r"lost [1-9]\d* voxels and 0 keyframes that were not sent; --spool FILE keeps them", line)
+    assert re.search(r"lost [1-9]\d* voxels and 0 keyframes that were not sent; --set spool=FILE keeps them", line)
 
 
 def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_an_address_without_a_service_is_connection_refused(address: str) -> Non
 
 
 def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> None:
-    from gausslite.cli.team import main
+    from gausslite.cli.health_check import main
 
     with serving([parser_service(RuleParser())]) as server:
         assert main([server.address]) == 0
@@ -133,6 +133,6 @@ def test_the_health_check_of_a_container(capsys: pytest.CaptureFixture[str]) -> 
     with pytest.raises(SystemExit) as usage_error:
         main([])
     assert usage_error.value.code == 2
-    refused, usage, *_ = capsys.readouterr().err.splitlines()
+    refused, usage = capsys.readouterr().err.splitlines()
     assert server.address in refused
-    assert usage.startswith("usage")
+    assert "the following arguments are required: HOST:PORT|unix:PATH" in usage
