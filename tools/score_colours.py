@@ -81,18 +81,18 @@ def main() -> None:
     scores = score([int(home) for home in options.homes.split(",")], options.frames, options.size, gains)
     print("| word | objects of it | counted | surely | other objects | left out | surely counted | precision of sure |")
     total = WordScore()
-    for term, each in scores.items():
+    for term, word_score in scores.items():
         for match in ColourMatch:
-            total.right[match] += each.right[match]
-            total.wrong[match] += each.wrong[match]
-        print(_row(term, each))
+            total.right[match] += word_score.right[match]
+            total.wrong[match] += word_score.wrong[match]
+        print(_row(term, word_score))
     print(_row("all", total))
 
 
-def _row(word: str, each: WordScore) -> str:
-    right, wrong = sum(each.right.values()), sum(each.wrong.values())
-    counted, left_out = right - each.right[ColourMatch.NO], each.wrong[ColourMatch.NO]
-    sure, wrongly_sure = each.right[ColourMatch.YES], each.wrong[ColourMatch.YES]
+def _row(word: str, word_score: WordScore) -> str:
+    right, wrong = sum(word_score.right.values()), sum(word_score.wrong.values())
+    counted, left_out = right - word_score.right[ColourMatch.NO], word_score.wrong[ColourMatch.NO]
+    sure, wrongly_sure = word_score.right[ColourMatch.YES], word_score.wrong[ColourMatch.YES]
     precision = f"{sure / (sure + wrongly_sure):.2f}" if sure + wrongly_sure else "-"
     return f"| {word} | {right} | {counted} | {sure} | {wrong} | {left_out} | {wrongly_sure} | {precision} |"
 

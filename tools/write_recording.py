@@ -68,7 +68,7 @@ def _smooth_errors(count: int, noise_m: float, noise_rad: float, rng: np.random.
 def _object_voxels(source: str) -> Mapping[str, ndarray]:
     """Return the voxels of each object's surface that at least two views of an ideal camera see."""
     place, _, options = source.partition("?")
-    kept = [each for each in options.split("&") if each.split("=")[0] in ("seed", "trajectory", "frames")]
+    kept = [part for part in options.split("&") if part.split("=")[0] in ("seed", "trajectory", "frames")]
     ideal = open_source(f"{place}?{'&'.join([*kept, 'size=320x240', 'noise=0', 'exposure=0'])}")
     seen: dict[str, list[ndarray]] = {}
     for i in range(0, len(ideal), _ROI_STRIDE):

@@ -75,7 +75,7 @@ class CameraStudy:
         views = self._held_out()
         for condition, source, correction, evidence in self._sources(speed_deg_s):
             scene = self._scene(source, views)
-            score = average([score_view(*each) for each in self._renderings(scene)])
+            score = average([score_view(*rendering) for rendering in self._renderings(scene)])
             result = CameraScore(
                 speed_deg_s, condition, score.roi_psnr, score.full_psnr, str(correction or ""), tuple(evidence)
             )

@@ -108,10 +108,12 @@ def _parts(graph: TaskGraph) -> tuple[frozenset[object], ...]:
 
 def _is_reversed(expected: TaskGraph, parsed: TaskGraph) -> bool:
     """Return True if a relation stands with the wrong negation and nothing warns of it."""
-    wanted = {(each.predicate, each.target, each.anchor): each.negated for each in expected.relations}
+    wanted = {
+        (relation.predicate, relation.target, relation.anchor): relation.negated for relation in expected.relations
+    }
     return not parsed.warnings and any(
-        wanted.get((each.predicate, each.target, each.anchor), each.negated) != each.negated
-        for each in parsed.relations
+        wanted.get((relation.predicate, relation.target, relation.anchor), relation.negated) != relation.negated
+        for relation in parsed.relations
     )
 
 

@@ -92,8 +92,8 @@ class TaskChangeBench:
         for name, mapper in {CHANGED: changed, RESTARTED: restarted, ALWAYS: always}.items():
             points[name], each = self._recover(mapper, scene)
             reevaluations += each
-        keyframes = [each.keyframes for each in reevaluations]
-        seeded = [each.seeded for each in reevaluations]
+        keyframes = [reevaluation.keyframes for reevaluation in reevaluations]
+        seeded = [reevaluation.seeded for reevaluation in reevaluations]
         return Recovery(change, points, sum(keyframes), max(keyframes), sum(seeded), max(seeded))
 
     def _recover(self, mapper: TaskMapper, scene: Scene) -> tuple[list[tuple[float, float]], list[Reevaluation]]:
@@ -176,7 +176,7 @@ def recovery_table(recoveries: Sequence[Recovery]) -> str:
 
     The last score is used if mapping ended before GOAL_S.
     """
-    times_s = sorted({each.points[CHANGED][each.at(GOAL_S)][0] for each in recoveries})
+    times_s = sorted({recovery.points[CHANGED][recovery.at(GOAL_S)][0] for recovery in recoveries})
     lines = [
         "ROI PSNR of the new region in dB, first frame after the change → after "
         f"{' or '.join(f'{time_s:g}' for time_s in times_s)} s of further mapping.",
@@ -184,11 +184,12 @@ def recovery_table(recoveries: Sequence[Recovery]) -> str:
         f"| change | {CHANGED} | {RESTARTED} | {ALWAYS} | final gap | within {GOAL_DB:g} dB after |",
         "|---|---|---|---|---|---|",
     ]
-    for each in recoveries:
-        last = each.at(GOAL_S)
+    for recovery in recoveries:
+        last = recovery.at(GOAL_S)
         cells = [
-            f"{each.points[name][0][1]:.2f} → {each.points[name][last][1]:.2f}" for name in (CHANGED, RESTARTED, ALWAYS)
+            f"{recovery.points[name][0][1]:.2f} → {recovery.points[name][last][1]:.2f}"
+            for name in (CHANGED, RESTARTED, ALWAYS)
         ]
-        recovered = "never" if each.recovered_s is None else f"{each.recovered_s:.2f} s"
-        lines.append(f"| {each.change.name} | {' | '.join(cells)} | {each.gap_db(last):.2f} | {recovered} |")
+        recovered = "never" if recovery.recovered_s is None else f"{recovery.recovered_s:.2f} s"
+        lines.append(f"| {recovery.change.name} | {' | '.join(cells)} | {recovery.gap_db(last):.2f} | {recovered} |")
     return "\n".join(lines) + "\n"

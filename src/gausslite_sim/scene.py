@@ -64,7 +64,7 @@ class HomeScene:
         corners_m = merged.positions_m[merged.faces]
         uv = merged.uv[merged.faces] / repeats_m[:, None, None]
         texture = np.repeat([texture_ids[part.texture] for _, part in parts], counts)
-        albedo = np.array([each.rgb.mean(axis=(0, 1)) / 255.0 for each in textures.values()])
+        albedo = np.array([material.rgb.mean(axis=(0, 1)) / 255.0 for material in textures.values()])
         self._embree = new_caster(corners_m.astype(np.float32))
         light = vertex_light(merged, albedo[texture], self, plan.lighting, plan.seed)
         self.triangles = Triangles(
@@ -74,7 +74,7 @@ class HomeScene:
             normal=_unit_normals(corners_m),
             texture=texture,
             item=np.repeat([i for i, _ in parts], counts),
-            gloss=np.array([each.gloss for each in textures.values()], np.float32)[texture],
+            gloss=np.array([material.gloss for material in textures.values()], np.float32)[texture],
             texels_per_m=_texels_per_m(corners_m, uv),
         )
 

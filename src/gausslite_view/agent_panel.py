@@ -54,7 +54,7 @@ class AgentPanel:
         followed = self._follower.newest()
         if followed is None or followed.revision == self._shown_revision:
             return
-        objects = tuple(object_from_message(each) for each in status.objects)
+        objects = tuple(object_from_message(message) for message in status.objects)
         contents = replace(
             ViewContents.of_one_agent(followed.batch.gaussians, status.agent_id),
             targets=tuple(status.graph.targets),

@@ -46,11 +46,11 @@ def with_region(rgb: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt
 def with_detections(detected: DetectedImage) -> UInt8[ndarray, "h w 3"]:
     """Return the image with the boxes of the detector, their nouns and scores; those below its threshold in grey."""
     drawn = detected.rgb.copy()
-    for each in sorted(detected.boxes, key=lambda box: box.score):
-        left, top, right, bottom = (round(min(max(value, -_MAX_PX), _MAX_PX)) for value in each.box_px)
-        colour = _WEAK_RGB if each.is_weak else _DETECTION_RGB
+    for detection in sorted(detected.boxes, key=lambda box: box.score):
+        left, top, right, bottom = (round(min(max(value, -_MAX_PX), _MAX_PX)) for value in detection.box_px)
+        colour = _WEAK_RGB if detection.is_weak else _DETECTION_RGB
         cv2.rectangle(drawn, (left, top), (right, bottom), colour, 1)
-        _write(drawn, f"{each.phrase[:_MAX_NAME]} {each.score:.2f}", (left, top), colour)
+        _write(drawn, f"{detection.phrase[:_MAX_NAME]} {detection.score:.2f}", (left, top), colour)
     return drawn
 
 
@@ -149,8 +149,8 @@ class CameraImages:
                     handle = self._gui.add_image(image.rgb, label=image.label(is_past=False), format="jpeg")
                 self._shown[name] = _Shown(image, handle)
                 # an image that came late keeps its place in the order of the names
-                for number, each in enumerate(sorted(self._shown)):
-                    self._shown[each].handle.order = number + 1
+                for number, shown_name in enumerate(sorted(self._shown)):
+                    self._shown[shown_name].handle.order = number + 1
             shown = self._shown[name]
             shown.newest = image
             if time_ns is not None and shown.history.is_due(time_ns):
@@ -231,7 +231,7 @@ class TeamCameras:
             back = min(self.keyframes_back, len(indices) - 1)
             chosen = self._client.keyframe(agent_id, indices[-1 - back]) if back else None
             self._chosen[agent_id] = chosen or newest[agent_id]
-        most = max((len(each.indices) for each in newest.values()), default=0)
+        most = max((len(stored.indices) for stored in newest.values()), default=0)
         self._folder.visible = most > 0
         self._age.max = max(1, most - 1)
 
@@ -278,7 +278,7 @@ class TeamKeyframes:
 
     def read(self, agents: Sequence[Any]) -> None:
         """Read the newest keyframe of each agent of a status, and some earlier ones. Raises GaussLiteError."""
-        self._names = tuple(sorted(each.agent_id for each in agents))
+        self._names = tuple(sorted(agent_status.agent_id for agent_status in agents))
         known = {}
         for agent in agents:
             newest = self._client.keyframe(agent.agent_id) if agent.keyframes else None
@@ -297,7 +297,7 @@ class TeamKeyframes:
     @property
     def is_complete(self) -> bool:
         """Return True if all keyframes of the last status are known."""
-        return not any(self._missing(each) for each in self._known.values())
+        return not any(self._missing(agent_keyframes) for agent_keyframes in self._known.values())
 
     @property
     def newest(self) -> dict[str, StoredKeyframe]:

@@ -286,8 +286,8 @@ def start_view(contents: ViewContents) -> StartView:
     up = _up(poses)
     low, centre, high = np.percentile(contents.gaussians.means_m.astype(np.float64), (5, 50, 95), axis=0)
     if not len(contents.times_ns):
-        low = np.min([low, *(each.extent_m.min_m for each in contents.objects)], axis=0)
-        high = np.max([high, *(each.extent_m.max_m for each in contents.objects)], axis=0)
+        low = np.min([low, *(landmark.extent_m.min_m for landmark in contents.objects)], axis=0)
+        high = np.max([high, *(landmark.extent_m.max_m for landmark in contents.objects)], axis=0)
         centre = 0.5 * (low + high)
         first_axis, second_axis = np.eye(3)[np.flatnonzero(up == 0)]
         offset = _BESIDE * (first_axis - second_axis) + _ABOVE * up

@@ -42,7 +42,7 @@ class FusionPanel:
         status, time_s = self._client.status(), time.monotonic() - self._started_s
         self._show_status(status)
         self._plots.add_status(time_s, status)
-        agents = [each.agent_id for each in status.agents]
+        agents = [agent.agent_id for agent in status.agents]
         layers = (_FUSED, *([_REFINED] if status.refined else []), *agents)
         if layers != tuple(self._layer.options):
             self._layer.options = layers
@@ -50,7 +50,7 @@ class FusionPanel:
         revision = status.fused_revision if followed is None else followed.revision
         layer = str(self._layer.value)
         # an agent that replaces keyframes also sends updates, so that the revision changes
-        keyframes = tuple((each.agent_id, each.keyframes) for each in status.agents if each.keyframes)
+        keyframes = tuple((agent.agent_id, agent.keyframes) for agent in status.agents if agent.keyframes)
         shown = (layer, revision, keyframes, self._cameras.keyframes_back)
         if followed is None or (shown == self._shown and self._keyframes.is_complete):
             self._plots.add_keyframes(time_s, self._keyframes.newest, revision)
@@ -58,8 +58,8 @@ class FusionPanel:
         self._keyframes.read(status.agents)
         self._cameras.read(self._keyframes.newest)
         self._plots.add_keyframes(time_s, self._keyframes.newest, revision)
-        targets = {each.agent_id: tuple(each.targets) for each in status.agents}
-        objects = tuple(each.landmark for each in self._client.query_objects())
+        targets = {agent.agent_id: tuple(agent.targets) for agent in status.agents}
+        objects = tuple(team_object.landmark for team_object in self._client.query_objects())
         state_ns = round(time_s * _NS_PER_S)
         fused = replace(
             followed.contents(targets),
@@ -93,9 +93,9 @@ class FusionPanel:
             f"{mission}: {status.fused_gaussians:,} Gaussians in "
             f"{status.fused_voxels:,} voxels, {status.keyframes} keyframes",
             *(
-                f"{each.agent_id}{'' if each.joined else ' (left)'}: wins {each.won_voxels:,} of {each.voxels:,} "
-                f"voxels, {(each.roi_bytes + each.handover_bytes) / 1e6:.1f} MB received"
-                for each in status.agents
+                f"{agent.agent_id}{'' if agent.joined else ' (left)'}: wins {agent.won_voxels:,} of {agent.voxels:,} "
+                f"voxels, {(agent.roi_bytes + agent.handover_bytes) / 1e6:.1f} MB received"
+                for agent in status.agents
             ),
         ]
         self._status.content = text_html(lines)

@@ -90,8 +90,8 @@ class MapPage:
     def show_run(self, contents: ViewContents, past: Sequence[PastMap]) -> None:
         """Show a finished run and its earlier maps, oldest first."""
         with self._lock:
-            for each in past:
-                self._scrub.add(each)
+            for past_map in past:
+                self._scrub.add(past_map)
             self.show(contents)
 
     def on_time(self, listener: Callable[[int | None], None]) -> None:
@@ -116,7 +116,7 @@ class MapPage:
         self._viewed_count = len(contents.gaussians)
         self.server.scene.set_up_direction(view.up)
         clients = self.server.get_clients().values() if is_first else ()
-        cameras: list[Any] = [self.server.initial_camera, *(each.camera for each in clients)]
+        cameras: list[Any] = [self.server.initial_camera, *(client.camera for client in clients)]
         for camera in cameras:
             camera.up = view.up
             camera.position = view.position_m

@@ -31,7 +31,7 @@ def label_text(landmark: ObjectLandmark) -> str:
 def label_positions_m(objects: Sequence[ObjectLandmark], view: StartView) -> Float64[ndarray, "n 3"]:
     """Return where each object's label is: on its box, or higher if another label is there in this view."""
     up = np.array(view.up)
-    positions_m = np.array([_top_m(each, up) for each in objects]).reshape(-1, 3)
+    positions_m = np.array([_top_m(landmark, up) for landmark in objects]).reshape(-1, 3)
     screen, depth_m = _project(positions_m, view)
     placed: list[tuple[float, float, float]] = []
     # from the bottom of the window to its top, so that a label that moves up meets only labels above it
@@ -185,7 +185,7 @@ class SceneMarkers:
         if self._view is None:
             return []
         labels_m = label_positions_m(objects, self._view)
-        return [handle for i, each in enumerate(objects) for handle in self._object(i, each, labels_m[i])]
+        return [handle for i, landmark in enumerate(objects) for handle in self._object(i, landmark, labels_m[i])]
 
     def _object(self, index: int, landmark: ObjectLandmark, label_m: Float64[ndarray, "3"]) -> list[Any]:
         """Draw an object's box and its name, with a line between them if the name had to move up."""

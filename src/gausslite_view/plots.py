@@ -147,11 +147,11 @@ class TeamPlots:
     def add_status(self, time_s: float, status: Any) -> None:
         """Add what the server has received in the last seconds, and the size of its map."""
         totals = {
-            each.agent_id: (
-                each.roi_bytes + each.handover_bytes,
-                each.subsets_accepted + each.subsets_stale + each.subsets_rejected,
+            agent.agent_id: (
+                agent.roi_bytes + agent.handover_bytes,
+                agent.subsets_accepted + agent.subsets_stale + agent.subsets_rejected,
             )
-            for each in status.agents
+            for agent in status.agents
         }
         self._agents = sorted(totals)
         while len(self._recent) > 1 and time_s - self._recent[0][0] > _RATE_WINDOW_S:
@@ -170,7 +170,7 @@ class TeamPlots:
 
     def add_keyframes(self, time_s: float, keyframes: Mapping[str, StoredKeyframe], revision: int) -> None:
         """Add the regions' shares, and every few seconds the PSNR of one agent whose keyframe or map has changed."""
-        shares = {name: 100 * float(each.roi.mean()) for name, each in keyframes.items() if each.roi is not None}
+        shares = {name: 100 * float(view.roi.mean()) for name, view in keyframes.items() if view.roi is not None}
         self._roi.add_named(time_s, shares)
         if time_s - self._rendered_s < _RENDER_INTERVAL_S:
             return

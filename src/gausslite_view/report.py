@@ -208,7 +208,7 @@ def _section(title: str, *children: Element) -> Element:
 
 
 def _present(*elements: Element | None) -> list[Element]:
-    return [each for each in elements if each is not None]
+    return [item for item in elements if item is not None]
 
 
 def _first_bytes(path: Path) -> bytes:

@@ -30,13 +30,13 @@ def run(options: argparse.Namespace) -> int:
     """Read the runs and write the page. Raises MapFileError for a folder without a run, StorageError."""
     out = options.out or (options.runs[0] / REPORT_PAGE if len(options.runs) == 1 else Path(REPORT_PAGE))
     contents = read_results(options.runs)
-    for note in (note for each in contents.runs for note in each.notes):
+    for note in (note for run_contents in contents.runs for note in run_contents.notes):
         print_message(note)
     require_replaceable(out)
     prepare_folder(out.absolute().parent)
     size = write_page(out, contents)
     if options.json:
-        print(as_text({"file": str(out), "maps": [each.name for each in contents.runs], "bytes": size}))
+        print(as_text({"file": str(out), "maps": [run_contents.name for run_contents in contents.runs], "bytes": size}))
     else:
-        print(f"{', '.join(each.name for each in contents.runs)} → {out} ({size / 1e6:.1f} MB)")
+        print(f"{', '.join(run_contents.name for run_contents in contents.runs)} → {out} ({size / 1e6:.1f} MB)")
     return 0

@@ -167,7 +167,7 @@ def _read_team(folder: Path, report: Mapping[str, object]) -> list[RunResults]:
     if not present:
         raise MapFileError(f"{folder}: expected a folder with {_MAP} for each agent of report.json, got none")
     runs = [_read_run(folder / name, name, _mapping(maps.get(name))) for name in present]
-    objects = tuple(each for run in runs for each in run.contents.objects)
+    objects = tuple(landmark for run in runs for landmark in run.contents.objects)
     for name in _FUSED_MAPS:
         file = folder / f"{name}.ply"
         if file.is_file():
@@ -214,7 +214,7 @@ def short_text(value: object) -> str:
     """Return a value of a report as text of limited length; empty for None, empty lists and empty objects."""
     if value is None or value in ([], {}, ""):
         return ""
-    text = ", ".join(str(each) for each in value) if isinstance(value, list) else str(value)
+    text = ", ".join(str(item) for item in value) if isinstance(value, list) else str(value)
     return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT - 1]}…"
 
 
@@ -394,7 +394,7 @@ def task_column(run: RunResults) -> Element:
 
 def objects_table(runs: Sequence[RunResults]) -> Element | None:
     """Return the objects of all runs with their positions; None without any. Fused maps repeat those of the agents."""
-    rows = [_object_row(run.name, each) for run in runs if run.report for each in run.contents.objects]
+    rows = [_object_row(run.name, landmark) for run in runs if run.report for landmark in run.contents.objects]
     return list_table(_OBJECT_HEADER, rows) if rows else None
 
 
@@ -404,7 +404,7 @@ def nouns_table(runs: Sequence[RunResults]) -> Element | None:
     for run in runs:
         nouns = run.report.get("nouns")
         rows += (
-            [_noun_row(run.name, each) for each in nouns if isinstance(each, Mapping)]
+            [_noun_row(run.name, noun) for noun in nouns if isinstance(noun, Mapping)]
             if isinstance(nouns, list)
             else []
         )
@@ -424,7 +424,11 @@ def _task(task: object, report: Mapping[str, object]) -> Element:
         graph = report.get("task_graph")
         task = {**(graph if isinstance(graph, Mapping) else {}), "text": task}
     relations = task.get("relations")
-    lines = [_relation(each) for each in relations if isinstance(each, Mapping)] if isinstance(relations, list) else []
+    lines = (
+        [_relation(relation) for relation in relations if isinstance(relation, Mapping)]
+        if isinstance(relations, list)
+        else []
+    )
     return styled(
         "div",
         "task",

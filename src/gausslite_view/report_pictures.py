@@ -54,9 +54,9 @@ class PlanCamera:
     def above(cls, contents: Sequence[ViewContents]) -> PlanCamera | None:
         """Return a camera that shows all maps; None if they hold no visible Gaussian."""
         axes = _plan_axes(contents)
-        clouds = [each.gaussians.means_m[each.gaussians.opacities > _MIN_OPACITY] for each in contents]
+        clouds = [content.gaussians.means_m[content.gaussians.opacities > _MIN_OPACITY] for content in contents]
         points = np.concatenate([cloud.astype(np.float64) for cloud in clouds]) @ axes.T
-        paths = np.concatenate([each.T_world_camera[:, :3, 3] for each in contents]) @ axes.T
+        paths = np.concatenate([content.T_world_camera[:, :3, 3] for content in contents]) @ axes.T
         if not len(points):
             return None
         if len(paths):
@@ -103,7 +103,7 @@ def plan_view(contents: ViewContents, gaussians: Gaussians, plan: PlanCamera, ca
 
 def _plan_axes(contents: Sequence[ViewContents]) -> Float64[ndarray, "3 3"]:
     """Return the plan's right, forward and up as rows: up is the world axis nearest to the cameras' mean up."""
-    cameras = [each.T_world_camera for each in contents if len(each.T_world_camera)]
+    cameras = [content.T_world_camera for content in contents if len(content.T_world_camera)]
     mean_up = -np.concatenate(cameras)[:, :3, 1].mean(axis=0) if cameras else np.array((0.0, 0.0, 1.0))
     axis = int(np.argmax(np.abs(mean_up)))
     up = np.zeros(3)
@@ -154,7 +154,9 @@ def _marked_object(landmark: ObjectLandmark, plan: PlanCamera) -> list[Element]:
 
 def _scale_bar(camera: Camera) -> list[Element]:
     px_per_m = camera.length_px(1.0, _DISTANCE_M)
-    length_m = max([each for each in _SCALES_M if each * px_per_m < camera.width_px / 3], default=_SCALES_M[0])
+    length_m = max(
+        [candidate_m for candidate_m in _SCALES_M if candidate_m * px_per_m < camera.width_px / 3], default=_SCALES_M[0]
+    )
     x, y = 12, camera.height_px - 12
     points = f"{x},{y - 5} {x},{y} {x + length_m * px_per_m:.1f},{y} {x + length_m * px_per_m:.1f},{y - 5}"
     label = element("text", f"{length_m:g} m", attributes={"class": "label", "x": str(x + 6), "y": str(y - 6)})
@@ -257,7 +259,7 @@ def _tick_values(low: float, high: float) -> list[float]:
     """Return about four round values that cover the range from low to high."""
     raw = (high - low) / _TICKS
     magnitude = 10.0 ** math.floor(math.log10(raw))
-    step = next(each * magnitude for each in _STEPS if each * magnitude >= raw * (1 - 1e-9))
+    step = next(factor * magnitude for factor in _STEPS if factor * magnitude >= raw * (1 - 1e-9))
     count = math.ceil((high - low) / step - 1e-9)
     return [low + i * step for i in range(count + 1)]
 

@@ -114,11 +114,13 @@ class KeyframeUpload:
 def _selected_keyframes(uplink: Uplink) -> dict[int, SelectedKeyframe]:
     """Return the keyframes in the spool, those from before a restart."""
     known = {}
-    for each in uplink.selected_keyframes():
-        message = geometry_pb2.EncodedFrame.FromString(each.data)
+    for selected_keyframe in uplink.selected_keyframes():
+        message = geometry_pb2.EncodedFrame.FromString(selected_keyframe.data)
         try:
             T_world_camera = transform_from_message("keyframe t_world_camera", message.t_world_camera)
         except InvalidInputError as error:
-            raise StorageError(f"spool: keyframe {each.frame_index} is damaged: {error}") from error
-        known[each.frame_index] = SelectedKeyframe(Coverage.from_bytes(each.coverage), T_world_camera)
+            raise StorageError(f"spool: keyframe {selected_keyframe.frame_index} is damaged: {error}") from error
+        known[selected_keyframe.frame_index] = SelectedKeyframe(
+            Coverage.from_bytes(selected_keyframe.coverage), T_world_camera
+        )
     return known

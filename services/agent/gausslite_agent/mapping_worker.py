@@ -106,7 +106,7 @@ def newest_camera_view(mapper: GaussianMapper, detected: DetectedImage | None) -
         T_world_camera=newest.frame.T_world_camera,
         times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
         path=trajectory.T_world_camera,
-        keyframes=np.stack([each.frame.T_world_camera for each in keyframes]),
+        keyframes=np.stack([keyframe.frame.T_world_camera for keyframe in keyframes]),
         detected=detected,
     )
 

@@ -90,7 +90,7 @@ def status_to_message(
         age_p50_seconds=status.age_s(50),
         age_p99_seconds=status.age_s(99),
         map_to_odom=_correction_to_message(status),
-        objects=[object_to_message(each) for each in status.objects],
+        objects=[object_to_message(landmark) for landmark in status.objects],
         notes=(*mission.notes, *status.noun_notes, *status.notes, *status.task_notes, *status.load_notes),
     )
 

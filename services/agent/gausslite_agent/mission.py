@@ -76,8 +76,8 @@ def mission_report(
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),
         "team_gaussians_inserted": status.team_gaussians,
-        "objects": [object_as_json(each) for each in status.objects],
-        "nouns": [noun_as_json(each) for each in status.nouns],
+        "objects": [object_as_json(landmark) for landmark in status.objects],
+        "nouns": [noun_as_json(noun) for noun in status.nouns],
         "notes": [*status.notes, *status.task_notes, *status.load_notes],
     }
 

@@ -266,7 +266,7 @@ class WorkerStatus:
     @property
     def noun_notes(self) -> tuple[str, ...]:
         """One line for each noun that is searched: its class, detections and best score."""
-        return tuple(each.describe() for each in self.nouns if each.match.is_searched)
+        return tuple(noun.describe() for noun in self.nouns if noun.match.is_searched)
 
     @property
     def task_notes(self) -> tuple[str, ...]:

@@ -34,8 +34,8 @@ class TeamRegion:
     @classmethod
     def of(cls, graph: TaskGraph, objects: Sequence[TeamObject]) -> TeamRegion:
         """Return the region of the objects whose noun is a target of the task, with a margin."""
-        found = [each.landmark for each in objects if each.landmark.noun in graph.targets]
-        boxes = [(each.extent_m, graph.targets.index(each.noun)) for each in found]
+        found = [team_object.landmark for team_object in objects if team_object.landmark.noun in graph.targets]
+        boxes = [(landmark.extent_m, graph.targets.index(landmark.noun)) for landmark in found]
         return cls(tuple(sorted(((_grown(box), target) for box, target in boxes), key=lambda each: each[0].min_m)))
 
     @property
@@ -158,9 +158,9 @@ class TeamMapFollower:
 
     def _own_frame(self) -> Float64[ndarray, "4 4"]:
         """Return T_fused_agent of this agent, as the server estimates it."""
-        for each in self._client.status().agents:
-            if each.agent_id == self._agent_id and len(each.alignment.t_fused_agent.row_major) == 16:
-                return transform_from_message("t_fused_agent", each.alignment.t_fused_agent)
+        for agent in self._client.status().agents:
+            if agent.agent_id == self._agent_id and len(agent.alignment.t_fused_agent.row_major) == 16:
+                return transform_from_message("t_fused_agent", agent.alignment.t_fused_agent)
         return np.eye(4)
 
 

@@ -311,7 +311,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Return the team's objects that a noun names, or all."""
         self._engine.require_mission(request.mission_id)
         objects = await self._work(self._engine.query_objects, request.noun)
-        return pb.QueryObjectsResponse(objects=[object_to_message(each.landmark, each.observers) for each in objects])
+        return pb.QueryObjectsResponse(
+            objects=[object_to_message(team_object.landmark, team_object.observers) for team_object in objects]
+        )
 
     async def ContributeFreeSpace(
         self, request: pb.ContributeFreeSpaceRequest, context: Any

@@ -64,7 +64,7 @@ def extra_checks() -> Iterator[Check]:
 
 
 def _required(installed: Distribution) -> Check:
-    faults = [fault for each in _requirements(installed, "") if (fault := _fault(each))]
+    faults = [fault for requirement in _requirements(installed, "") if (fault := _fault(requirement))]
     if faults:
         return Check("package", "error", "; ".join(faults), "Repair it with: pip install --upgrade gausslite")
     return Check("package", "ok", f"gausslite {installed.version} with all required packages")
@@ -72,15 +72,15 @@ def _required(installed: Distribution) -> Check:
 
 def _extra(installed: Distribution, extra: str) -> Check:
     requirements = _requirements(installed, extra)
-    absent = [each.name for each in requirements if _installed_version(each) is None]
+    absent = [requirement.name for requirement in requirements if _installed_version(requirement) is None]
     command = f"pip install '{_PROJECT}[{extra}]'"
     name = f"extra {extra}"
     if absent:
         return Check(name, "ok", f"not installed; {', '.join(absent)} missing", f"To use it: {command}")
-    faults = [fault for each in requirements if (fault := _fault(each))]
+    faults = [fault for requirement in requirements if (fault := _fault(requirement))]
     if faults:
         return Check(name, "warning", "; ".join(faults), f"Repair it with: {command}")
-    packages = sorted({f"{each.name} {_installed_version(each)}" for each in requirements})
+    packages = sorted({f"{requirement.name} {_installed_version(requirement)}" for requirement in requirements})
     return Check(name, "ok", ", ".join(packages))
 
 
@@ -94,7 +94,7 @@ def _requirements(installed: Distribution, extra: str) -> list[Requirement]:
         if not is_added or (extra and is_always):
             continue
         if canonicalize_name(requirement.name) == _PROJECT:
-            found += [each for part in sorted(requirement.extras) for each in _requirements(installed, part)]
+            found += [nested for part in sorted(requirement.extras) for nested in _requirements(installed, part)]
         else:
             found.append(requirement)
     return found
@@ -169,7 +169,7 @@ def _available_memory_bytes() -> int | None:
 def _existing(folder: Path) -> Path:
     """Return the folder or its nearest existing parent, in which it would be created."""
     absolute = folder.absolute()
-    return next(each for each in (absolute, *absolute.parents) if each.exists())
+    return next(parent for parent in (absolute, *absolute.parents) if parent.exists())
 
 
 def _disk_and_clock(folder: Path) -> Iterator[Check]:

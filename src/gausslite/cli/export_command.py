@@ -24,7 +24,9 @@ _FORMATS_OF = {"voxel": ("octomap", "nav2", "mesh"), "min_opacity": ("octomap", 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite export`."""
     add = parser.add_argument
-    formats = "; ".join(f"{name}: {each.summary} ({each.suffix})" for name, each in FORMATS.items())
+    formats = "; ".join(
+        f"{name}: {file_format.summary} ({file_format.suffix})" for name, file_format in FORMATS.items()
+    )
     add("map", metavar="RUN", type=Path, help="a results folder of `gausslite map`, or a PLY file")
     add("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=formats)
     add("--out", metavar="FILE", type=Path, help="the file to write (default: RUN/map with the format's suffix)")

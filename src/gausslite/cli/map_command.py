@@ -88,7 +88,9 @@ def depth_notes(keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
 
 def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:
     medians = [
-        float(np.median(each.frame.depth_m[each.frame.depth_m > 0])) for each in keyframes if each.frame.has_depth
+        float(np.median(keyframe.frame.depth_m[keyframe.frame.depth_m > 0]))
+        for keyframe in keyframes
+        if keyframe.frame.has_depth
     ]
     return float(np.median(medians)) if medians else np.inf
 
@@ -273,8 +275,8 @@ class _Run:
             "active_gaussians": int(self._gaussians.active.sum()),
             "peak_rss_mib": peak_rss_mib(),
             "memory_mib": self._mapper.memory_mib(),
-            "objects": [object_as_json(each) for each in self._mapper.objects],
-            "nouns": [noun_as_json(each) for each in self._mapper.nouns],
+            "objects": [object_as_json(landmark) for landmark in self._mapper.objects],
+            "nouns": [noun_as_json(noun) for noun in self._mapper.nouns],
             "notes": list(self._notes),
         }
         prepare_folder(options.out)

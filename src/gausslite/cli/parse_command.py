@@ -42,9 +42,9 @@ def _as_text(graph: TaskGraph) -> str:
     targets = ", ".join(name if role is TargetRole.OBJECT else f"{name} ({role})" for name, role in roles)
     lines = [f"targets   {targets}", f"anchors   {', '.join(graph.anchors) or '-'}"]
     lines += [f"relation  {relation}" for relation in graph.relations]
-    for each in graph.attributes:
-        values = [value for value in (each.colour, each.superlative) if value is not None]
-        lines.append(f"attribute {each.name}: {', '.join(values)}")
+    for attribute in graph.attributes:
+        values = [value for value in (attribute.colour, attribute.superlative) if value is not None]
+        lines.append(f"attribute {attribute.name}: {', '.join(values)}")
     lines += [f"excluded  {name}" for name in graph.excluded]
     lines += [f"context   {place}" for place in graph.context]
     lines += [f"warning   {warning}" for warning in graph.warnings]

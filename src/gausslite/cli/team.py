@@ -272,9 +272,9 @@ def run_objects(options: argparse.Namespace) -> int:
     folder = Path(options.place)
     objects = _read_folder(folder, options.noun) if folder.is_dir() else _query(options)
     if options.json:
-        print(as_text({"objects": [_as_json(each) for each in objects]}))
+        print(as_text({"objects": [_as_json(team_object) for team_object in objects]}))
     else:
-        print("\n".join(_describe(each) for each in objects) or _no_object(options.noun))
+        print("\n".join(_describe(team_object) for team_object in objects) or _no_object(options.noun))
     return 0 if objects else 1
 
 
@@ -300,22 +300,22 @@ def _read_folder(folder: Path, noun: str) -> Sequence[TeamObject]:
         raise InvalidInputError(f"{folder}: expected a report.json with objects, got none")
     agent_id = str(report.get("agent_id") or folder.resolve().name)
     targets = report.get("targets")
-    nouns = tuple(str(each) for each in targets) if isinstance(targets, list) else ()
+    nouns = tuple(str(target) for target in targets) if isinstance(targets, list) else ()
     graph = TaskGraph("", str(report.get("task") or ""), nouns, (), ())
-    return find_objects({agent_id: ObjectReport(graph, tuple(object_from_json(each) for each in values))}, {}, noun)
+    return find_objects({agent_id: ObjectReport(graph, tuple(object_from_json(value) for value in values))}, {}, noun)
 
 
 def _as_json(team_object: TeamObject) -> dict[str, object]:
     observers = [
         {
-            "agent_id": each.agent_id,
-            "id": each.object_id,
-            "target": each.target,
-            "confidence": each.confidence,
-            "first_seen_ns": each.first_seen_ns,
-            "last_seen_ns": each.last_seen_ns,
+            "agent_id": observer.agent_id,
+            "id": observer.object_id,
+            "target": observer.target,
+            "confidence": observer.confidence,
+            "first_seen_ns": observer.first_seen_ns,
+            "last_seen_ns": observer.last_seen_ns,
         }
-        for each in team_object.observers
+        for observer in team_object.observers
     ]
     return {**object_as_json(team_object.landmark), "observers": observers}
 
@@ -325,8 +325,9 @@ def _describe(team_object: TeamObject) -> str:
     place = ", ".join(f"{value:.2f}" for value in landmark.centroid_m)
     size = " x ".join(f"{value:.2f}" for value in landmark.size_m)
     seen = "; ".join(
-        f"{each.agent_id} from {each.first_seen_ns / _NS_PER_S:.1f} s to {each.last_seen_ns / _NS_PER_S:.1f} s"
-        for each in team_object.observers
+        f"{observer.agent_id} from {observer.first_seen_ns / _NS_PER_S:.1f} s "
+        f"to {observer.last_seen_ns / _NS_PER_S:.1f} s"
+        for observer in team_object.observers
     )
     return (
         f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({place}) m, size {size} m, "

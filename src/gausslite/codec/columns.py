@@ -77,10 +77,12 @@ def compress_columns(arrays: Sequence[NDArray[Any]], columns: Sequence[Column]) 
     packed = [
         _shuffle(np.ascontiguousarray(array, column.dtype)) for array, column in zip(arrays, columns, strict=True)
     ]
-    compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compressobj(size=sum(len(each) for each in packed))
+    compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compressobj(
+        size=sum(len(column_bytes) for column_bytes in packed)
+    )
     parts = []
-    for each in packed:
-        parts += [compressor.compress(each), compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
+    for column_bytes in packed:
+        parts += [compressor.compress(column_bytes), compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
     return b"".join([*parts, compressor.flush()])
 
 

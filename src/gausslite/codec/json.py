@@ -18,8 +18,8 @@ def graph_as_json(graph: TaskGraph) -> dict[str, Any]:
         "targets": list(graph.targets),
         "roles": {target: str(role) for target, role in zip(graph.targets, graph.roles, strict=True)},
         "anchors": list(graph.anchors),
-        "relations": [_relation_as_json(each) for each in graph.relations],
-        "attributes": {each.name: _attributes_as_json(each) for each in graph.attributes},
+        "relations": [_relation_as_json(relation) for relation in graph.relations],
+        "attributes": {attribute.name: _attributes_as_json(attribute) for attribute in graph.attributes},
         "excluded": list(graph.excluded),
         "context": list(graph.context),
         "warnings": list(graph.warnings),
@@ -41,10 +41,12 @@ def graph_from_json(value: Mapping[str, Any]) -> TaskGraph:
         text=str(value.get("text", "")),
         targets=targets,
         anchors=_names(value.get("anchors", ())),
-        relations=tuple(_relation_from_json(each) for each in value.get("relations", ())),
+        relations=tuple(_relation_from_json(relation) for relation in value.get("relations", ())),
         warnings=_names(value.get("warnings", ())),
         roles=tuple(TargetRole(roles.get(target, TargetRole.OBJECT)) for target in targets),
-        attributes=tuple(_attributes_from_json(name, each) for name, each in value.get("attributes", {}).items()),
+        attributes=tuple(
+            _attributes_from_json(name, attributes) for name, attributes in value.get("attributes", {}).items()
+        ),
         excluded=_names(value.get("excluded", ())),
         context=_names(value.get("context", ())),
     )
@@ -96,7 +98,7 @@ def _attributes_from_json(name: str, value: Mapping[str, Any]) -> ObjectAttribut
 
 
 def _names(values: Any) -> tuple[str, ...]:
-    if not isinstance(values, list | tuple) or not all(isinstance(each, str) for each in values):
+    if not isinstance(values, list | tuple) or not all(isinstance(value, str) for value in values):
         raise TypeError(f"expected a list of names, got {type(values).__name__}")
     return tuple(values)
 
@@ -108,7 +110,7 @@ def encode_object_report(report: ObjectReport) -> bytes:
         "task_id": graph.task_id,
         "text": graph.text,
         **graph_as_json(graph),
-        "objects": [object_as_json(each) for each in report.objects],
+        "objects": [object_as_json(landmark) for landmark in report.objects],
     }
     return json.dumps(value, ensure_ascii=False).encode()
 
@@ -117,7 +119,7 @@ def decode_object_report(data: bytes) -> ObjectReport:
     """Return the report of `encode_object_report`. Raises CodecError."""
     try:
         value = json.loads(data)
-        return ObjectReport(graph_from_json(value), tuple(object_from_json(each) for each in value["objects"]))
+        return ObjectReport(graph_from_json(value), tuple(object_from_json(landmark) for landmark in value["objects"]))
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, GaussLiteError) as error:
         raise CodecError(f"object report: expected the JSON of a report, got other bytes ({error})") from error
 
@@ -156,8 +158,8 @@ def noun_as_json(report: NounReport) -> dict[str, Any]:
 def object_from_json(value: Mapping[str, Any]) -> ObjectLandmark:
     """Return the landmark of `object_as_json`. Raises CodecError."""
     try:
-        x, y, z = (float(each) for each in value["centroid_m"])
-        low, high = ([float(each) for each in value[name]] for name in ("min_m", "max_m"))
+        x, y, z = (float(coordinate) for coordinate in value["centroid_m"])
+        low, high = ([float(coordinate) for coordinate in value[name]] for name in ("min_m", "max_m"))
         return ObjectLandmark(
             object_id=str(value["id"]),
             noun=str(value["noun"]),

@@ -40,7 +40,7 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
     raw = decompress_columns(body, _columns(layout))
     keys, offsets = decode_voxels(raw[:3], layout)
     active, kappa, target = decode_labels(raw[-3:])
-    means_m, quats_wxyz, scales_m, opacities, rgb = (each.astype(np.float32) for each in raw[3:-3])
+    means_m, quats_wxyz, scales_m, opacities, rgb = (column.astype(np.float32) for column in raw[3:-3])
     gaussians = Gaussians(
         means_m=means_m,
         quats_wxyz=quats_wxyz,

@@ -108,13 +108,13 @@ class MapSnapshot:
 
 def write_map_history(folder: Path, snapshots: Sequence[MapSnapshot]) -> None:
     """Write the snapshots, oldest first; a file of an earlier run is replaced. Raises StorageError."""
-    messages = b"".join(each.message for each in snapshots)
+    messages = b"".join(snapshot.message for snapshot in snapshots)
     write_state(
         folder / _MAP_HISTORY_FILE,
         {
-            "times_ns": np.array([each.time_ns for each in snapshots], np.int64),
-            "totals": np.array([each.total for each in snapshots], np.int64),
-            "sizes_bytes": np.array([len(each.message) for each in snapshots], np.int64),
+            "times_ns": np.array([snapshot.time_ns for snapshot in snapshots], np.int64),
+            "totals": np.array([snapshot.total for snapshot in snapshots], np.int64),
+            "sizes_bytes": np.array([len(snapshot.message) for snapshot in snapshots], np.int64),
             "messages": np.frombuffer(messages, np.uint8),
         },
     )

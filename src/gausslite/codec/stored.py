@@ -238,7 +238,7 @@ def _encodable(gaussians: Gaussians) -> Gaussians:
 def _same_bits(first: Gaussians, second: Gaussians) -> Bool[ndarray, " n"]:
     same = np.ones(len(first), np.bool_)
     for field in fields(Gaussians):
-        left, right = (np.ascontiguousarray(getattr(each, field.name)) for each in (first, second))
+        left, right = (np.ascontiguousarray(getattr(voxels, field.name)) for voxels in (first, second))
         row = np.dtype((np.void, left[:1].nbytes or 1))
         same &= left.view(row).ravel() == right.view(row).ravel()
     return same

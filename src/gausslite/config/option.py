@@ -139,7 +139,9 @@ def check_options(settings: Any) -> None:
         if declared is None or (value is None and default is None):
             continue
         if declared.convert is None:
-            require_plain(name, value, field_type, declared.low, declared.high, declared.unit, declared.choices)
+            require_plain(
+                name, value, field_type, declared.low, declared.high, unit=declared.unit, choices=declared.choices
+            )
         elif isinstance(field_type, type):
             require_instance(name, value, field_type, f"a {field_type.__name__}")
 

@@ -163,7 +163,10 @@ class DetectedImage:
         return cls(
             frame.index,
             frame.rgb,
-            tuple(DetectedBox(each.phrase, each.score, each.box_px, each.rival, each.is_weak) for each in detections),
+            tuple(
+                DetectedBox(detection.phrase, detection.score, detection.box_px, detection.rival, detection.is_weak)
+                for detection in detections
+            ),
         )
 
 

@@ -216,13 +216,15 @@ def _require_relation(relation: Relation, graph: TaskGraph, limits: TaskLimits) 
 
 def _require_attributes(graph: TaskGraph, limits: TaskLimits) -> None:
     known = {*graph.targets, *graph.anchors, *graph.excluded}
-    names = tuple(each.name for each in graph.attributes)
+    names = tuple(attribute.name for attribute in graph.attributes)
     if len(set(names)) != len(names) or not known.issuperset(names):
         raise TaskError(f"task attributes: expected each object of the graph at most once, got {', '.join(names)}")
     _require_phrases(
-        "colours", tuple(dict.fromkeys(each.colour for each in graph.attributes if each.colour is not None)),
-        len(names), limits.max_phrase_chars,
-    )  # fmt: skip
+        "colours",
+        tuple(dict.fromkeys(attribute.colour for attribute in graph.attributes if attribute.colour is not None)),
+        len(names),
+        limits.max_phrase_chars,
+    )
 
 
 def _require_phrases(role: str, phrases: tuple[str, ...], max_count: int, max_chars: int) -> None:

@@ -96,7 +96,7 @@ def components_to_show(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
     bridged = cv2.dilate(roi.astype(np.uint8), np.ones((reach, reach), np.uint8))
     count, labels = cv2.connectedComponents(bridged)
     components = sorted((roi & (labels == label) for label in range(1, count)), key=np.count_nonzero, reverse=True)
-    large_enough = [each for each in components if np.count_nonzero(each) >= _SPECK_SHARE * roi.size]
+    large_enough = [component for component in components if np.count_nonzero(component) >= _SPECK_SHARE * roi.size]
     shown = large_enough or components[:1]
     return shown[:1] + shown[1:][-1:]
 

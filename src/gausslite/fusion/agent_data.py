@@ -224,7 +224,7 @@ class FrameAligner:
             _log.log(
                 level, "agent %s is %s%s", quote_name(agent_id), after.state, f": {after.message}" * bool(after.message)
             )
-        was_used, is_used = (each.state is not AlignmentState.QUARANTINED for each in (before, after))
+        was_used, is_used = (alignment.state is not AlignmentState.QUARANTINED for alignment in (before, after))
         if was_used == is_used and after.segments == before.segments:
             return np.zeros(0, np.int64)
         return self._votes.refresh(agent_id)

@@ -330,8 +330,8 @@ class FusionEngine:
         """
         with self._lock:
             frames, quarantined = self._mission.alignments.transforms(), self._mission.alignments.quarantined
-        moved = (in_fused_frame(each, frames) for each in keyframes if each.agent_id not in quarantined)
-        return [each for each in moved if each is not None]
+        moved = (in_fused_frame(keyframe, frames) for keyframe in keyframes if keyframe.agent_id not in quarantined)
+        return [keyframe for keyframe in moved if keyframe is not None]
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""

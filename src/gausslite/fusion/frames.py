@@ -371,7 +371,7 @@ class FrameAlignments:
 
     def get(self, agent_id: str) -> FrameAlignment:
         """Return the agent's alignment."""
-        orders = (each.order for each in self._by_agent.values())
+        orders = (alignment.order for alignment in self._by_agent.values())
         return self._by_agent.get(agent_id) or FrameAlignment(order=1 + max(orders, default=-1))
 
     def __contains__(self, agent_id: str) -> bool:
@@ -394,12 +394,14 @@ class FrameAlignments:
 
     def transforms(self) -> dict[str, Float64[ndarray, "4 4"]]:
         """Return the latest T_fused_agent of the agents whose frame differs from the fused map's."""
-        return {name: each.T_fused_agent for name, each in self._by_agent.items() if not each.is_identity}
+        return {
+            name: alignment.T_fused_agent for name, alignment in self._by_agent.items() if not alignment.is_identity
+        }
 
     @property
     def quarantined(self) -> set[str]:
         """The agents whose contribution is not used."""
-        return {name for name, each in self._by_agent.items() if each.state is AlignmentState.QUARANTINED}
+        return {name for name, alignment in self._by_agent.items() if alignment.state is AlignmentState.QUARANTINED}
 
     def in_other_frames(self) -> set[str]:
         """Return the agents whose frame differs from the fused map's, as far as is known."""
@@ -408,7 +410,7 @@ class FrameAlignments:
     def earlier(self, agent_id: str) -> set[str]:
         """Return the agents that contributed before this one and are not quarantined."""
         order = self.get(agent_id).order
-        return {name for name, each in self._by_agent.items() if each.order < order} - self.quarantined
+        return {name for name, alignment in self._by_agent.items() if alignment.order < order} - self.quarantined
 
 
 def _encode(alignment: FrameAlignment) -> bytes:
@@ -438,7 +440,7 @@ def _decode(data: bytes) -> FrameAlignment:
         stored = value["fit"]
         fit = None
         if stored is not None:
-            before, after = (Misfit(*(float(each) for each in stored[name])) for name in ("before", "after"))
+            before, after = (Misfit(*(float(value) for value in stored[name])) for name in ("before", "after"))
             shift_m, rotation_deg, compared = stored["rest"]
             fit = FrameFit(_matrix(stored["T"]), before, after, float(shift_m), float(rotation_deg), int(compared))
         segments = tuple((int(first), _matrix(T)) for first, T in value["segments"])

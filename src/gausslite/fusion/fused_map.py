@@ -93,7 +93,7 @@ def save_refinement(store: FusionStore, stored: StoredRefinement) -> None:
         "voted_keys": stored.voted_keys,
         "winner_hashes": stored.winner_hashes,
     }
-    store.save_record(_OWNER, RECORD, save({name: np.ascontiguousarray(each) for name, each in columns.items()}))
+    store.save_record(_OWNER, RECORD, save({name: np.ascontiguousarray(column) for name, column in columns.items()}))
 
 
 def load_refinement(store: FusionStore) -> StoredRefinement | None:

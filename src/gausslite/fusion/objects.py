@@ -53,18 +53,18 @@ def merge_objects(reports: Mapping[str, ObjectReport]) -> tuple[TeamObject, ...]
     """Return the team's objects, the most confident first; an agent's landmarks are never merged with each other."""
     observed = sorted(
         (
-            _Observed(agent_id, each, report.target_index(each.noun))
+            _Observed(agent_id, landmark, report.target_index(landmark.noun))
             for agent_id, report in reports.items()
-            for each in report.objects
+            for landmark in report.objects
         ),
         key=lambda each: each.order,
     )
-    position = {id(each): i for i, each in enumerate(observed)}
-    clusters = [[each] for each in observed]
+    position = {id(member): i for i, member in enumerate(observed)}
+    clusters = [[member] for member in observed]
     # pairs at the smallest distance are merged first; a cluster has at most one landmark of each agent
-    for _, i, j in _matching_pairs([each.landmark for each in observed]):
+    for _, i, j in _matching_pairs([member.landmark for member in observed]):
         first, second = clusters[i], clusters[j]
-        if first is second or {each.agent_id for each in first} & {each.agent_id for each in second}:
+        if first is second or {member.agent_id for member in first} & {member.agent_id for member in second}:
             continue
         first += second
         for member in second:
@@ -81,8 +81,8 @@ def team_object_id(agent_id: str, object_id: str) -> str:
 def _matching_pairs(landmarks: Sequence[ObjectLandmark]) -> list[tuple[float, int, int]]:
     """Return (distance of the centroids, i, j) of the landmarks that can be one object, the nearest first."""
     groups: dict[str, list[int]] = {}
-    for i, each in enumerate(landmarks):
-        groups.setdefault(each.noun, []).append(i)
+    for i, landmark in enumerate(landmarks):
+        groups.setdefault(landmark.noun, []).append(i)
     pairs: list[tuple[float, int, int]] = []
     for group in groups.values():
         centroids = np.array([landmarks[i].centroid_m for i in group])
@@ -105,35 +105,35 @@ def _merge(cluster: Sequence[_Observed]) -> TeamObject:
     The agents' detections are treated as independent.
     """
     members = sorted(cluster, key=lambda each: each.order)
-    landmarks = [each.landmark for each in members]
-    weights = [max(each.confidence, 1e-6) for each in landmarks]
+    landmarks = [member.landmark for member in members]
+    weights = [max(landmark.confidence, 1e-6) for landmark in landmarks]
     x, y, z = (
-        sum(w * each.centroid_m[axis] for w, each in zip(weights, landmarks, strict=True)) / sum(weights)
+        sum(w * landmark.centroid_m[axis] for w, landmark in zip(weights, landmarks, strict=True)) / sum(weights)
         for axis in range(3)
     )
-    low_x, low_y, low_z = (min(each.extent_m.min_m[axis] for each in landmarks) for axis in range(3))
-    high_x, high_y, high_z = (max(each.extent_m.max_m[axis] for each in landmarks) for axis in range(3))
-    is_target = any(each.role is ObjectRole.TARGET for each in landmarks)
+    low_x, low_y, low_z = (min(landmark.extent_m.min_m[axis] for landmark in landmarks) for axis in range(3))
+    high_x, high_y, high_z = (max(landmark.extent_m.max_m[axis] for landmark in landmarks) for axis in range(3))
+    is_target = any(landmark.role is ObjectRole.TARGET for landmark in landmarks)
     merged = ObjectLandmark(
         object_id=team_object_id(members[0].agent_id, landmarks[0].object_id),
         noun=landmarks[0].noun,
         role=ObjectRole.TARGET if is_target else ObjectRole.ANCHOR,
         centroid_m=(x, y, z),
         extent_m=AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z)),
-        confidence=1.0 - math.prod(1.0 - each.confidence for each in landmarks),
-        first_seen_ns=min(each.first_seen_ns for each in landmarks),
-        last_seen_ns=max(each.last_seen_ns for each in landmarks),
+        confidence=1.0 - math.prod(1.0 - landmark.confidence for landmark in landmarks),
+        first_seen_ns=min(landmark.first_seen_ns for landmark in landmarks),
+        last_seen_ns=max(landmark.last_seen_ns for landmark in landmarks),
     )
     observers = tuple(
         ObjectObserver(
-            each.agent_id,
-            each.landmark.object_id,
-            each.target,
-            each.landmark.confidence,
-            each.landmark.first_seen_ns,
-            each.landmark.last_seen_ns,
+            member.agent_id,
+            member.landmark.object_id,
+            member.target,
+            member.landmark.confidence,
+            member.landmark.first_seen_ns,
+            member.landmark.last_seen_ns,
         )
-        for each in sorted(members, key=lambda each: each.agent_id)
+        for member in sorted(members, key=lambda each: each.agent_id)
     )
     return TeamObject(merged, observers)
 
@@ -191,12 +191,14 @@ def find_objects(
         for agent_id, report in reports.items()
     }
     objects = merge_objects(moved)
-    return tuple(each for each in objects if not noun or same_kind(noun.strip().lower(), each.landmark.noun))
+    return tuple(
+        team_object for team_object in objects if not noun or same_kind(noun.strip().lower(), team_object.landmark.noun)
+    )
 
 
 def _moved(report: ObjectReport, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectReport:
-    moved = (_move(each, T_fused_agent) for each in report.objects)
-    return replace(report, objects=tuple(each for each in moved if each is not None))
+    moved = (_move(landmark, T_fused_agent) for landmark in report.objects)
+    return replace(report, objects=tuple(landmark for landmark in moved if landmark is not None))
 
 
 def _move(landmark: ObjectLandmark, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectLandmark | None:

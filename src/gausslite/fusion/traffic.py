@@ -140,15 +140,15 @@ class MissionStatus:
 
 
 def _encode(counters: dict[str, TrafficCounters]) -> bytes:
-    return json.dumps({agent_id: asdict(each) for agent_id, each in counters.items()}).encode()
+    return json.dumps({agent_id: asdict(counter) for agent_id, counter in counters.items()}).encode()
 
 
 def _decode(data: bytes) -> dict[str, TrafficCounters]:
     try:
         stored = json.loads(data)
         return {
-            str(agent_id): TrafficCounters(**{name: int(value) for name, value in each.items()})
-            for agent_id, each in stored.items()
+            str(agent_id): TrafficCounters(**{name: int(value) for name, value in counters.items()})
+            for agent_id, counters in stored.items()
         }
     except (AttributeError, TypeError, ValueError, RecursionError) as error:
         raise CodecError(f"stored counters: expected the JSON of counters, got other bytes ({error})") from error

@@ -118,8 +118,8 @@ class PendingUpdate:
     def outcome(self) -> PutOutcome:
         """Return the outcome of the whole message."""
         return PutOutcome(
-            np.concatenate([each.accepted for each in self.outcomes]),
-            np.concatenate([each.stale for each in self.outcomes]),
+            np.concatenate([outcome.accepted for outcome in self.outcomes]),
+            np.concatenate([outcome.stale for outcome in self.outcomes]),
         )
 
 

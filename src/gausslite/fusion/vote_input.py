@@ -155,8 +155,8 @@ def move_batch(
     """
     segments = alignment.segment_of(update_seqs)
     parts = [
-        move_gaussians(select_voxels(batch, segments == each).gaussians, alignment.transform(int(each)))
-        for each in np.unique(segments)
+        move_gaussians(select_voxels(batch, segments == segment).gaussians, alignment.transform(int(segment)))
+        for segment in np.unique(segments)
     ]
     gaussians = Gaussians.concatenate(parts)
     try:

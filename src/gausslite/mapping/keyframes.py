@@ -278,7 +278,9 @@ class KeyframeStore:
         A view that no longer shows the ROI stays only among the most recent keyframes.
         """
         long_term = [view if is_same_frame(old.keyframe, view.keyframe) else old for old in self._long_term]
-        self._long_term = [each for each in long_term if self._is_long_term(each) or not each.keyframe.evaluated]
+        self._long_term = [
+            prepared for prepared in long_term if self._is_long_term(prepared) or not prepared.keyframe.evaluated
+        ]
         self._recent = [view if is_same_frame(old.keyframe, view.keyframe) else old for old in self._recent]
         self._buffer = [view.keyframe if is_same_frame(old, view.keyframe) else old for old in self._buffer]
 
@@ -323,7 +325,7 @@ class KeyframeStore:
             return
         view = prepare(keyframe)
         self.replace_view(view)
-        if shows_roi and not any(is_same_frame(each.keyframe, keyframe) for each in self._long_term):
+        if shows_roi and not any(is_same_frame(prepared.keyframe, keyframe) for prepared in self._long_term):
             self._set_long_term(sorted([*self._long_term, view], key=_capture_time_ns))
 
     def find(self, recorded: Frame) -> WindowView | None:
@@ -360,7 +362,7 @@ class KeyframeStore:
         for name, limit in limits.items():
             if len(numbers[name]) > limit:
                 raise MapFileError(f"state keyframes {name}: expected at most {limit}, got {len(numbers[name])}")
-        stored = sorted({i for each in numbers.values() for i in each})
+        stored = sorted({i for number in numbers.values() for i in number})
         keyframes = {i: Keyframe.from_state(select_prefix(state, str(i))) for i in stored}
         views = {i: prepare(keyframes[i]) for i in sorted({*numbers["recent"], *numbers["long_term"]})}
         self._recent = [views[i] for i in numbers["recent"]]

@@ -190,6 +190,6 @@ def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
         raise InvalidInputError(f"disable: expected names among {', '.join(ABLATION_FLAGS)}, got {', '.join(unknown)}")
     off = dict.fromkeys((name for name in PAPER_FLAGS if name in names), False)
     settings = replace(settings, components=replace(settings.components, **off))
-    for name in (each for each in EXTENSION_FLAGS if each in names):
+    for name in (flag for flag in EXTENSION_FLAGS if flag in names):
         settings = EXTENSION_FLAGS[name](settings)
     return settings

@@ -32,7 +32,7 @@ class ResumeConfig:
     @classmethod
     def of(cls, *settings: Any) -> ResumeConfig:
         """Return the fields of these settings objects, except those that may change."""
-        return cls({type(each).__name__: _fixed_fields(each) for each in settings})
+        return cls({type(setting).__name__: _fixed_fields(setting) for setting in settings})
 
     @classmethod
     def parse(cls, stored: str) -> ResumeConfig:
@@ -141,13 +141,13 @@ def _errors_name(path: Path) -> Iterator[None]:
 
 def _fixed_fields(settings: Any) -> dict[str, Any]:
     fixed = {}
-    for each in fields(settings):
-        value = getattr(settings, each.name)
-        if each.metadata.get("may_change"):
+    for option in fields(settings):
+        value = getattr(settings, option.name)
+        if option.metadata.get("may_change"):
             continue
-        if each.metadata.get("is_file") and value is not None:
+        if option.metadata.get("is_file") and value is not None:
             value = Path(value).name
-        fixed[each.name] = to_plain(value)
+        fixed[option.name] = to_plain(value)
     return fixed
 
 

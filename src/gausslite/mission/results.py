@@ -102,11 +102,11 @@ def prepare_folder(folder: Path) -> None:
 
 def require_writable(folder: Path) -> None:
     """Check that files can be written to a folder, which is not created. Raises StorageError."""
-    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    missing = [parent for parent in (folder, *folder.parents) if not parent.exists()]
     prepare_folder(folder)
-    for each in missing:
+    for parent in missing:
         with contextlib.suppress(OSError):  # another program may use it already
-            each.rmdir()
+            parent.rmdir()
 
 
 def prepare_file(path: Path, kind: FileKind | None = None) -> None:

@@ -96,7 +96,7 @@ def _convert(kind: Any, value: Any, name: str) -> Any:
 def _convert_union(kinds: tuple[Any, ...], value: Any, name: str) -> Any:
     if value is None and type(None) in kinds:
         return None
-    [kind] = [each for each in kinds if each is not type(None)]
+    [kind] = [given for given in kinds if given is not type(None)]
     return _convert(kind, value, name)
 
 

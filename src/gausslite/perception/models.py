@@ -125,21 +125,21 @@ def identify_family(model: OpenModel) -> ModelFamily:
     from gausslite.perception.text_features import TOKEN_ID_TYPES
 
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
-    if is_grounding([each.name for each in inputs], [each.name for each in outputs]):
+    if is_grounding([port.name for port in inputs], [output.name for output in outputs]):
         return ModelFamily.GROUNDING_DINO
     if is_prompted(model.session):
         return ModelFamily.PROMPTED_YOLO
-    if all(len(each.shape) == 2 and each.type in TOKEN_ID_TYPES for each in inputs):
+    if all(len(port.shape) == 2 and port.type in TOKEN_ID_TYPES for port in inputs):
         return ModelFamily.TEXT_ENCODER
     has_image_input = len(inputs) == 1 and len(inputs[0].shape) == 4
     # a dynamic size is known only after the network has run
-    channels = [each.shape[1] for each in outputs if len(each.shape) == 4]
+    channels = [output.shape[1] for output in outputs if len(output.shape) == 4]
     has_prototypes = any(not isinstance(count, int) or count == MASK_COEFFICIENTS for count in channels)
     if has_image_input and has_prototypes and len(outputs) == 2:
         return ModelFamily.YOLO_SEG
     if has_image_input and _has_named_boxes(model):
         return ModelFamily.YOLO_BOXES
-    received = " → ".join(", ".join(f"{each.name} {each.shape}" for each in ports) for ports in (inputs, outputs))
+    received = " → ".join(", ".join(f"{port.name} {port.shape}" for port in ports) for ports in (inputs, outputs))
     raise ModelFileError(f"model {model.path}: expected one of {', '.join(ModelFamily)}; got {received}")
 
 
@@ -147,7 +147,7 @@ def _has_named_boxes(model: OpenModel) -> bool:
     """Return True if the only output is [1, 4+c, A] for the c class names in the metadata."""
     from gausslite.perception.yolo_network import class_names
 
-    (rows, *more), names = [each.shape for each in model.session.get_outputs()], class_names(model.session)
+    (rows, *more), names = [output.shape for output in model.session.get_outputs()], class_names(model.session)
     return not more and bool(names) and len(rows) == 3 and rows[1] in (4 + len(names), None)
 
 
@@ -258,7 +258,7 @@ def inspect(path: Path) -> ModelSheet:
     model = open_model(path, threads=1)
     session = model.session
     described = [
-        tuple(f"{each.name} {each.shape} {each.type.removeprefix('tensor').strip('()')}" for each in side)
+        tuple(f"{port.name} {port.shape} {port.type.removeprefix('tensor').strip('()')}" for port in side)
         for side in (session.get_inputs(), session.get_outputs())
     ]
     family = identify_family(model)

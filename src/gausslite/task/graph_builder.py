@@ -9,9 +9,9 @@ from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
 from gausslite.task.graph_draft import GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
-from gausslite.task.roles import Clause, RoleAssigner, names_object, with_shared_head
+from gausslite.task.roles import Clause, RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
-from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS
+from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is
@@ -179,8 +179,8 @@ class GraphBuilder:
             if pending == "with":
                 self._assigner.make_tools(named)
                 return
-            for each in named:
-                self._assigner.assign_by_preposition(pending, phrase_from_text(each))
+            for phrase in named:
+                self._assigner.assign_by_preposition(pending, phrase_from_text(phrase))
 
     def _handle_demonstrative(self, word: str, before: Chunk | None, after: Chunk | None) -> None:
         """Handle a "this" without a noun."""
@@ -213,23 +213,23 @@ class GraphBuilder:
         if adjectives_only(noun.words) and not (of_follows and noun.head in lexicon.PLACES):
             self._lone_adjectives(noun, pending, after)
             return
-        if not names_object(noun, pending, after, self._clause.verb):
+        if not _names_object(noun, pending, after, self._clause.verb):
             self._skip_noun(noun, pending, conjoined, after)
             return
         if pending is not None and lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS:
             pending = "inside"
-        nouns = [*(with_shared_head(adjective, noun) for adjective in self._adjectives), noun]
+        nouns = [*(_with_shared_head(adjective, noun) for adjective in self._adjectives), noun]
         self._adjectives = []
-        for each in nouns:
+        for listed in nouns:
             if self._negated and pending == "to" and not self._clause.verb_since_negation:
                 self._negated = False  # "bring everything except the knife to the sink"
             if self._negated:
-                self._exclude(each, pending)
+                self._exclude(listed, pending)
             else:
-                self._assigner.assign(each, pending, conjoined, self._following)
-                self._described = each.text
+                self._assigner.assign(listed, pending, conjoined, self._following)
+                self._described = listed.text
                 if self._alternative is not None:
-                    self._assigner.assign_by_preposition(self._alternative, each)
+                    self._assigner.assign_by_preposition(self._alternative, listed)
         self._alternative = None
 
     def _lone_adjectives(self, noun: NounPhrase, pending: str | None, after: Chunk | None) -> None:
@@ -295,10 +295,42 @@ class GraphBuilder:
         """Relate an obstacle to its place; "the mugs except the one on the shelf" negates the relation."""
         terms = self._clause.terms
         objects = self._negated_objects
-        if objects and all(self._draft.roles.get(each) is TargetRole.OBSTACLE for each in objects):
+        if objects and all(self._draft.roles.get(phrase) is TargetRole.OBSTACLE for phrase in objects):
             self._draft.add_relation(RelationTerms(relation, terms.negated, terms.bounds), objects, noun.text)
-        elif objects and all(each in self._draft.targets for each in objects) and not lexicon.is_space(noun.words):
-            self._draft.excluded = [each for each in self._draft.excluded if each not in objects]
+        elif objects and all(phrase in self._draft.targets for phrase in objects) and not lexicon.is_space(noun.words):
+            self._draft.excluded = [phrase for phrase in self._draft.excluded if phrase not in objects]
             self._draft.add_relation(RelationTerms(relation, not terms.negated, terms.bounds), objects, noun.text)
         else:
             self._draft.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")
+
+
+def _names_object(noun: NounPhrase, pending: str | None, after: Chunk | None, verb: str | None) -> bool:
+    """Return False for names of the robot, and for places, routes and measures that stand for another noun."""
+    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES:
+        return False
+    if noun.head in lexicon.TASK_NOUNS and pending is None:
+        return False
+    of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
+    compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
+    if compound and noun.head in lexicon.PLACES and not of_follows:
+        return True
+    if noun.head in lexicon.PHYSICAL_MEASURES and verb in HANDLING_VERBS and pending is None and not of_follows:
+        return True
+    unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
+    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):
+        return False
+    if noun.head in lexicon.BUILDINGS:
+        return pending != "inside" or bool(noun.words[1:])
+    if noun.head in lexicon.PLACES:
+        return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
+    if noun.head in lexicon.ROUTES and not compound:
+        return pending not in (None, "of", "for", "to")
+    if noun.head in lexicon.MEASURES and pending not in (None, "of"):
+        return not of_follows
+    return noun.head not in lexicon.MEASURES or ((noun.is_known or compound) and not of_follows)
+
+
+def _with_shared_head(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:
+    """Return the adjective with the noun's head: in "red and blue mugs", "red" becomes "red mug"."""
+    words = adjective.words[:-1] if adjective.head in ("one", "ones") else adjective.words
+    return NounPhrase((*words, noun.head), adjective.has_determiner)

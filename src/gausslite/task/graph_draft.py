@@ -76,7 +76,7 @@ class GraphDraft:
     def rename(self, phrase: str, new: str) -> None:
         """Replace a phrase everywhere, because its description has changed."""
         for phrases in (self.targets, self.anchors, self.mentions):
-            phrases[:] = dict.fromkeys(new if each == phrase else each for each in phrases)
+            phrases[:] = dict.fromkeys(new if known == phrase else known for known in phrases)
         if phrase in self.roles:
             self.roles.setdefault(new, self.roles.pop(phrase))
         if phrase in self._statement_nouns:
@@ -84,11 +84,11 @@ class GraphDraft:
             self._statement_nouns.add(new)
         self.relations = [
             replace(
-                each,
-                target=new if each.target == phrase else each.target,
-                anchor=new if each.anchor == phrase else each.anchor,
+                relation,
+                target=new if relation.target == phrase else relation.target,
+                anchor=new if relation.anchor == phrase else relation.anchor,
             )
-            for each in self.relations
+            for relation in self.relations
         ]
 
     def is_from_statement(self, phrase: str) -> bool:

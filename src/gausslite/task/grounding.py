@@ -51,18 +51,24 @@ def name_objects(phrases: Iterable[str], excluded: Iterable[str] = ()) -> NamedO
         noun = split_attributes(phrase)
         warnings += [f"{word!r} is not understood: every {noun.noun!r} is meant" for word in noun.unseen]
         known = None if phrase in excluded else _known_name(noun, referable)
-        number = 1 + sum(each.noun == noun.noun for each in described.values())
+        number = 1 + sum(description.noun == noun.noun for description in described.values())
         names[phrase] = known or (noun.noun if number == 1 else f"{noun.noun}_{number}")
         described.setdefault(names[phrase], noun)
         if phrase not in excluded:
             referable.setdefault(names[phrase], described[names[phrase]])
-    attributes = (ObjectAttributes(name, each.colour, each.superlative) for name, each in described.items())
-    return NamedObjects(names, tuple(each for each in attributes if each.colour or each.superlative), tuple(warnings))
+    attributes = (
+        ObjectAttributes(name, description.colour, description.superlative) for name, description in described.items()
+    )
+    return NamedObjects(
+        names,
+        tuple(attribute for attribute in attributes if attribute.colour or attribute.superlative),
+        tuple(warnings),
+    )
 
 
 def _known_name(noun: DescribedNoun, described: Mapping[str, DescribedNoun]) -> str | None:
     """Return the name of the object with this noun and these attributes; without attributes, the latest of its noun."""
-    same_noun = [name for name, each in described.items() if each.noun == noun.noun]
+    same_noun = [name for name, description in described.items() if description.noun == noun.noun]
     if noun.colour is None and noun.superlative is None:
         return same_noun[-1] if same_noun else None
     attributes = noun.colour, noun.superlative
@@ -169,14 +175,16 @@ def grounded_graph(text: str, parsed: ParsedPhrases, draft: GraphDraft | None = 
 
 def _named_graph(parsed: ParsedPhrases, text: str) -> TaskGraph:
     """Return the graph of normalised phrases, with one name for each object."""
-    order = [plain_phrase(each) for each in parsed.mentions]
+    order = [plain_phrase(mention) for mention in parsed.mentions]
     kept = (*parsed.targets, *parsed.anchors, *parsed.excluded)
-    named = name_objects([*(each for each in order if each in kept), *kept], parsed.excluded)
+    named = name_objects([*(phrase for phrase in order if phrase in kept), *kept], parsed.excluded)
     names = named.names
     roles: dict[str, TargetRole] = {}
     for target, role in parsed.targets.items():
         roles.setdefault(names[target], role)
-    relations = (replace(each, target=names[each.target], anchor=names[each.anchor]) for each in parsed.relations)
+    relations = (
+        replace(relation, target=names[relation.target], anchor=names[relation.anchor]) for relation in parsed.relations
+    )
     return TaskGraph(
         task_id=task_id_of(text),
         text=text.strip(),
@@ -193,13 +201,15 @@ def _named_graph(parsed: ParsedPhrases, text: str) -> TaskGraph:
 
 def _with_rule_negations(parsed: ParsedPhrases, draft: GraphDraft, warn: Callable[[str], None]) -> ParsedPhrases:
     """Return a model's answer with the obstacles and the negations that the rules find in the same sentence."""
-    negations = {(each.predicate, each.target, each.anchor): each.negated for each in draft.relations}
+    negations = {
+        (relation.predicate, relation.target, relation.anchor): relation.negated for relation in draft.relations
+    }
     relations = []
-    for each in parsed.relations:
-        key = each.predicate, plain_phrase(each.target), plain_phrase(each.anchor)
-        corrected = replace(each, negated=negations.get(key, each.negated))
-        if corrected != each:
-            warn(f"{each} contradicts the sentence: read as {corrected}")
+    for relation in parsed.relations:
+        key = relation.predicate, plain_phrase(relation.target), plain_phrase(relation.anchor)
+        corrected = replace(relation, negated=negations.get(key, relation.negated))
+        if corrected != relation:
+            warn(f"{relation} contradicts the sentence: read as {corrected}")
         relations.append(corrected)
     obstacles = {phrase for phrase, role in draft.roles.items() if role is TargetRole.OBSTACLE}
     targets = {
@@ -264,13 +274,13 @@ def _valid_relations(
     relations: Sequence[Relation], targets: tuple[str, ...], anchors: tuple[str, ...], warn: Callable[[str], None]
 ) -> tuple[Relation, ...]:
     kept: dict[Relation, None] = {}
-    for each in relations:
-        relation = replace(each, target=plain_phrase(each.target), anchor=plain_phrase(each.anchor))
+    for stated in relations:
+        relation = replace(stated, target=plain_phrase(stated.target), anchor=plain_phrase(stated.anchor))
         if relation.target in targets and relation.anchor in anchors:
             kept[relation] = None
         else:
-            nouns = f"{_abbreviate(each.target)} to {_abbreviate(each.anchor)}"
-            warn(f"{each.predicate} joins {nouns}, not both known: it is dropped")
+            nouns = f"{_abbreviate(stated.target)} to {_abbreviate(stated.anchor)}"
+            warn(f"{stated.predicate} joins {nouns}, not both known: it is dropped")
     return tuple(kept)
 
 

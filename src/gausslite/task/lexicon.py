@@ -75,11 +75,13 @@ _WORDS_OF_SUPERLATIVE: Final = {
     Superlative.NEAREST: "nearest closest nearer closer",
     Superlative.FARTHEST: "farthest furthest farther further remotest",
 }
-SUPERLATIVES: Final = {word: each for each, words in _WORDS_OF_SUPERLATIVE.items() for word in words.split()}
+SUPERLATIVES: Final = {
+    word: superlative for superlative, words in _WORDS_OF_SUPERLATIVE.items() for word in words.split()
+}
 COMPARATIVES: Final = frozenset(
     word
-    for word, each in SUPERLATIVES.items()
-    if word.endswith("er") and each not in (Superlative.NEAREST, Superlative.FARTHEST)
+    for word, superlative in SUPERLATIVES.items()
+    if word.endswith("er") and superlative not in (Superlative.NEAREST, Superlative.FARTHEST)
 ) | word_set("heavier lighter older newer thicker thinner")
 DISTANCE_SUPERLATIVES: Final = frozenset({Superlative.NEAREST, Superlative.FARTHEST})
 # superlatives of properties that geometry does not show
@@ -134,7 +136,7 @@ def split_attributes(phrase: str) -> DescribedNoun:
 
 
 def _is_colour(word: str) -> bool:
-    return all(each in COLOURS for each in word.split(_JOINED))
+    return all(part in COLOURS for part in word.split(_JOINED))
 
 
 ROOMS: Final = word_set(

@@ -7,7 +7,7 @@ from typing import Final
 
 from gausslite.domain.task import Predicate, Superlative, TargetRole
 from gausslite.task import lexicon
-from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
+from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, phrase_from_text
 from gausslite.task.graph_draft import GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, word_set
 from gausslite.task.verbs import (
@@ -19,7 +19,6 @@ from gausslite.task.verbs import (
     FILLING_VERBS,
     GIVING_VERBS,
     GO_VERBS,
-    HANDLING_VERBS,
     INSPECTION_VERBS,
     LOOKING_VERBS,
     MOVING_VERBS,
@@ -66,38 +65,6 @@ class Clause:
         self.inherited_preposition: str | None = None
         self.nouns_since_negation = 0
         self.verb_since_negation = False
-
-
-def names_object(noun: NounPhrase, pending: str | None, after: Chunk | None, verb: str | None) -> bool:
-    """Return False for names of the robot, and for places, routes and measures that stand for another noun."""
-    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES:
-        return False
-    if noun.head in lexicon.TASK_NOUNS and pending is None:
-        return False
-    of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
-    compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
-    if compound and noun.head in lexicon.PLACES and not of_follows:
-        return True
-    if noun.head in lexicon.PHYSICAL_MEASURES and verb in HANDLING_VERBS and pending is None and not of_follows:
-        return True
-    unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
-    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):
-        return False
-    if noun.head in lexicon.BUILDINGS:
-        return pending != "inside" or bool(noun.words[1:])
-    if noun.head in lexicon.PLACES:
-        return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
-    if noun.head in lexicon.ROUTES and not compound:
-        return pending not in (None, "of", "for", "to")
-    if noun.head in lexicon.MEASURES and pending not in (None, "of"):
-        return not of_follows
-    return noun.head not in lexicon.MEASURES or ((noun.is_known or compound) and not of_follows)
-
-
-def with_shared_head(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:
-    """Return the adjective with the noun's head: in "red and blue mugs", "red" becomes "red mug"."""
-    words = adjective.words[:-1] if adjective.head in ("one", "ones") else adjective.words
-    return NounPhrase((*words, noun.head), adjective.has_determiner)
 
 
 class RelationAssigner:
@@ -147,7 +114,7 @@ class RelationAssigner:
         clause = self.clause
         word = clause.superlative or ""
         for phrase in list(clause.objects):
-            self.rename(phrase, " ".join(each for each in phrase.split() if each != word))
+            self.rename(phrase, " ".join(part for part in phrase.split() if part != word))
         farthest = SUPERLATIVES[word] is Superlative.FARTHEST
         clause.superlative = None
         self.relate(Predicate.FARTHEST_FROM if farthest else Predicate.CLOSEST_TO, noun)
@@ -156,7 +123,7 @@ class RelationAssigner:
         """Change the description of an object that the sentence has named."""
         self._draft.rename(phrase, new)
         for phrases in (self.clause.objects, self.clause.referents, self.clause.places):
-            phrases[:] = [new if each == phrase else each for each in phrases]
+            phrases[:] = [new if known == phrase else known for known in phrases]
 
 
 _ORIGIN_RELATIONS: Final = {f"from_{place}": place for place in ("on", "under", "inside", "behind", "near")}

@@ -122,7 +122,9 @@ class RuleParser:
         draft = build_draft(chunks)
         if not draft.targets:
             raise TaskError(_no_object_message(text, tuple(draft.excluded)))
-        draft.warnings += [f"{each!r} is not understood: it is dropped" for each in comparisons(normalise_text(text))]
+        draft.warnings += [
+            f"{comparison!r} is not understood: it is dropped" for comparison in comparisons(normalise_text(text))
+        ]
         parsed = ParsedPhrases(
             targets={target: draft.roles[target] for target in draft.targets},
             anchors=draft.anchors,

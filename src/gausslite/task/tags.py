@@ -181,7 +181,7 @@ _VERB_OPENINGS: Final = ("re", "un", "dis", "de", "over", "pre", "mis")
 
 
 def _options(line: str) -> Options:
-    return {Tag(each[0]): int(each[1:]) for each in line.split()}
+    return {Tag(part[0]): int(part[1:]) for part in line.split()}
 
 
 _CLOSED: Final[dict[str, Options]] = (

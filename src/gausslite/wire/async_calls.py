@@ -21,8 +21,10 @@ _MODULES = (agent_service_pb2, fusion_service_pb2, parser_service_pb2)
 
 def service_methods() -> dict[str, dict[str, bool]]:
     """Return the methods of each service, by its full name, and whether a method takes a stream of requests."""
-    services = [each for module in _MODULES for each in module.DESCRIPTOR.services_by_name.values()]
-    return {each.full_name: {method.name: method.client_streaming for method in each.methods} for each in services}
+    services = [service for module in _MODULES for service in module.DESCRIPTOR.services_by_name.values()]
+    return {
+        service.full_name: {method.name: method.client_streaming for method in service.methods} for service in services
+    }
 
 
 class RawCalls:

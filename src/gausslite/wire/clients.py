@@ -347,7 +347,9 @@ class FusionClient(ServiceChannel):
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first."""
         request = fusion_service_pb2.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
-        return tuple(team_object_from_message(each) for each in self._call(self._stub.QueryObjects, request).objects)
+        return tuple(
+            team_object_from_message(message) for message in self._call(self._stub.QueryObjects, request).objects
+        )
 
     def keyframe(self, agent_id: str, index: int | None = None) -> StoredKeyframe | None:
         """Return the agent's keyframe of this frame index, or the newest one; None if the server has none of it.

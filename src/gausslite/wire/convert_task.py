@@ -25,14 +25,16 @@ from gausslite.domain.task import (
 from gausslite.v1 import fusion_service_pb2, geometry_pb2, objects_pb2, task_pb2
 from gausslite.wire.convert import box_from_message, box_to_message
 
-_PREDICATE_NUMBERS = {each: task_pb2.Predicate.Value(f"PREDICATE_{each.name}") for each in Predicate}
+_PREDICATE_NUMBERS = {predicate: task_pb2.Predicate.Value(f"PREDICATE_{predicate.name}") for predicate in Predicate}
 _PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
-_ROLE_NUMBERS = {each: task_pb2.TargetRole.Value(f"TARGET_ROLE_{each.name}") for each in TargetRole}
+_ROLE_NUMBERS = {role: task_pb2.TargetRole.Value(f"TARGET_ROLE_{role.name}") for role in TargetRole}
 _ROLE_BY_NUMBER = {
     task_pb2.TARGET_ROLE_UNSPECIFIED: TargetRole.OBJECT,
     **{number: role for role, number in _ROLE_NUMBERS.items()},
 }
-_SUPERLATIVE_NUMBERS = {each: task_pb2.Superlative.Value(f"SUPERLATIVE_{each.name}") for each in Superlative}
+_SUPERLATIVE_NUMBERS = {
+    superlative: task_pb2.Superlative.Value(f"SUPERLATIVE_{superlative.name}") for superlative in Superlative
+}
 _SUPERLATIVE_BY_NUMBER = {
     task_pb2.SUPERLATIVE_UNSPECIFIED: None,
     **{number: superlative for superlative, number in _SUPERLATIVE_NUMBERS.items()},
@@ -48,26 +50,26 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
         anchors=graph.anchors,
         relations=[
             task_pb2.Relation(
-                predicate=_PREDICATE_NUMBERS[each.predicate],
-                target=each.target,
-                anchor=each.anchor,
-                negated=each.negated,
-                min_m=each.min_m,
-                max_m=each.max_m,
+                predicate=_PREDICATE_NUMBERS[relation.predicate],
+                target=relation.target,
+                anchor=relation.anchor,
+                negated=relation.negated,
+                min_m=relation.min_m,
+                max_m=relation.max_m,
             )
-            for each in graph.relations
+            for relation in graph.relations
         ],
         warnings=graph.warnings,
         roles=[_ROLE_NUMBERS[role] for role in graph.roles],
         attributes=[
             task_pb2.ObjectAttributes(
-                name=each.name,
-                colour=each.colour or "",
+                name=attribute.name,
+                colour=attribute.colour or "",
                 superlative=task_pb2.SUPERLATIVE_UNSPECIFIED
-                if each.superlative is None
-                else _SUPERLATIVE_NUMBERS[each.superlative],
+                if attribute.superlative is None
+                else _SUPERLATIVE_NUMBERS[attribute.superlative],
             )
-            for each in graph.attributes
+            for attribute in graph.attributes
         ],
         excluded=graph.excluded,
         context=graph.context,
@@ -82,12 +84,12 @@ def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
         text=message.text,
         targets=tuple(message.targets),
         anchors=tuple(message.anchors),
-        relations=tuple(_relation_from_message(each) for each in message.relations),
+        relations=tuple(_relation_from_message(relation) for relation in message.relations),
         warnings=tuple(message.warnings),
         roles=tuple(_ROLE_BY_NUMBER[role] for role in message.roles),
         attributes=tuple(
-            ObjectAttributes(each.name, each.colour or None, _SUPERLATIVE_BY_NUMBER[each.superlative])
-            for each in message.attributes
+            ObjectAttributes(attribute.name, attribute.colour or None, _SUPERLATIVE_BY_NUMBER[attribute.superlative])
+            for attribute in message.attributes
         ),
         excluded=tuple(message.excluded),
         context=tuple(message.context),
@@ -105,10 +107,10 @@ def _require_known_numbers(message: task_pb2.TaskGraph) -> None:
     for role in message.roles:
         if role not in _ROLE_BY_NUMBER:
             raise TaskError(f"task roles: expected one of {', '.join(TargetRole)}, got role {role}")
-    for each in message.attributes:
-        if each.superlative not in _SUPERLATIVE_BY_NUMBER:
+    for attribute in message.attributes:
+        if attribute.superlative not in _SUPERLATIVE_BY_NUMBER:
             raise TaskError(
-                f"task attributes: expected one of {', '.join(Superlative)}, got superlative {each.superlative}"
+                f"task attributes: expected one of {', '.join(Superlative)}, got superlative {attribute.superlative}"
             )
 
 
@@ -141,14 +143,14 @@ def object_to_message(landmark: ObjectLandmark, observers: Sequence[ObjectObserv
         last_seen_ns=landmark.last_seen_ns,
         observers=[
             objects_pb2.ObjectObserver(
-                agent_id=each.agent_id,
-                object_id=each.object_id,
-                target=each.target,
-                confidence=each.confidence,
-                first_seen_ns=each.first_seen_ns,
-                last_seen_ns=each.last_seen_ns,
+                agent_id=observer.agent_id,
+                object_id=observer.object_id,
+                target=observer.target,
+                confidence=observer.confidence,
+                first_seen_ns=observer.first_seen_ns,
+                last_seen_ns=observer.last_seen_ns,
             )
-            for each in observers
+            for observer in observers
         ],
     )
 
@@ -175,9 +177,14 @@ def team_object_from_message(message: objects_pb2.ObjectLandmark) -> TeamObject:
     """Decode an object of the team. Raises InvalidInputError."""
     observers = tuple(
         ObjectObserver(
-            each.agent_id, each.object_id, each.target, each.confidence, each.first_seen_ns, each.last_seen_ns
+            observer.agent_id,
+            observer.object_id,
+            observer.target,
+            observer.confidence,
+            observer.first_seen_ns,
+            observer.last_seen_ns,
         )
-        for each in message.observers
+        for observer in message.observers
     )
     return TeamObject(object_from_message(message), observers)
 
@@ -187,7 +194,7 @@ def report_to_message(session_id: str, report: ObjectReport) -> fusion_service_p
     return fusion_service_pb2.ReportObjectsRequest(
         session_id=session_id,
         task=graph_to_message(report.graph),
-        objects=[object_to_message(each) for each in report.objects],
+        objects=[object_to_message(landmark) for landmark in report.objects],
     )
 
 
@@ -195,4 +202,6 @@ def report_from_message(message: fusion_service_pb2.ReportObjectsRequest) -> Obj
     """Decode an agent's report; its size is checked first. Raises TaskError, InvalidInputError."""
     if len(message.objects) > MAX_OBJECTS_PER_AGENT:
         raise InvalidInputError(f"objects: expected at most {MAX_OBJECTS_PER_AGENT}, got {len(message.objects)}")
-    return ObjectReport(graph_from_message(message.task), tuple(object_from_message(each) for each in message.objects))
+    return ObjectReport(
+        graph_from_message(message.task), tuple(object_from_message(landmark) for landmark in message.objects)
+    )

@@ -72,7 +72,7 @@ class AgentSnapshot:
             problem=message.uplink.stopped_because,
             notes=tuple(message.notes),
             T_map_odometry=T_map_odometry,
-            objects=tuple(object_from_message(each) for each in message.objects),
+            objects=tuple(object_from_message(landmark) for landmark in message.objects),
         )
 
 

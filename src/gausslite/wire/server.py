@@ -241,8 +241,8 @@ async def start_server(
         health_server = grpc.aio.server(options=(*_OPTIONS, *_HEALTH_LIMITS.connection_options))
         health_pb2_grpc.add_HealthServicer_to_server(health_servicer, health_server)
         servers[_bind(health_server, health_listen, None)] = health_server
-    for each in servers.values():
-        await each.start()
+    for started in servers.values():
+        await started.start()
     return RunningServer(servers, health_servicer, [asyncio.create_task(watch.run()) for watch in watches])
 
 

@@ -275,8 +275,8 @@ class Spool:
             due = _by_value(self._due(Purpose.ROI, resend_threshold), self._keyframes.pending())
             if chosen := _take(due, max_bytes):
                 return SpoolRound(
-                    _to_batch(Purpose.ROI, [each for each in chosen if isinstance(each, tuple)]),
-                    tuple(each for each in chosen if isinstance(each, SpooledKeyframe)),
+                    _to_batch(Purpose.ROI, [item for item in chosen if isinstance(item, tuple)]),
+                    tuple(item for item in chosen if isinstance(item, SpooledKeyframe)),
                 )
             if rows := _take(self._due(Purpose.HANDOVER, resend_threshold), max_bytes):
                 return SpoolRound(_to_batch(Purpose.HANDOVER, rows), ())
@@ -423,11 +423,11 @@ def _take(due: Iterable[_Due], max_bytes: int) -> list[_Due]:
     """Return the first items of about max_bytes together, at least one."""
     chosen: list[_Due] = []
     spent = 0
-    for each in due:
-        spent += _size(each)
+    for item in due:
+        spent += _size(item)
         if chosen and spent > max_bytes:
             break
-        chosen.append(each)
+        chosen.append(item)
     return chosen
 
 

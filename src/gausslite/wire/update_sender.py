@@ -260,8 +260,8 @@ class UpdateSender:
                         error_to_retry = self._handle_outcome(outcome, sent.pop(outcome.sequence)) or error_to_retry
         except InvalidInputError as error:
             # the server refuses these messages permanently
-            for each in sent.values():
-                self._drop(each.batch, str(error))
+            for unanswered in sent.values():
+                self._drop(unanswered.batch, str(error))
             sent.clear()
         return error_to_retry
 

@@ -258,23 +258,23 @@ class Uplink:
 
     def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
         requests, sent = self._sender.encode(due, session)
-        self._token_bucket.spend(sum(each.size_bytes for each in sent.values()))
+        self._token_bucket.spend(sum(sent_update.size_bytes for sent_update in sent.values()))
         self._sender.send(requests, sent)
 
     def _send_keyframes(self, due: Sequence[SpooledKeyframe], session: Session) -> None:
         """Send keyframes on one stream. A rejected keyframe is dropped, because it would be rejected again."""
-        byte_count = sum(len(each.data) for each in due)
+        byte_count = sum(len(keyframe.data) for keyframe in due)
         self._token_bucket.spend(byte_count)
-        messages = [geometry_pb2.EncodedFrame.FromString(each.data) for each in due]
+        messages = [geometry_pb2.EncodedFrame.FromString(keyframe.data) for keyframe in due]
         selected = self._spool.keyframe_indices()
         deadline_s = self._settings.deadline_s
         response = self._client.contribute_encoded_keyframes(session.session_id, messages, selected, deadline_s)
         self._spool.mark_keyframes_done(due)
-        for each in response.rejected:
-            _log.warning("uplink: keyframe %d is dropped: %s", each.index, each.reason)
-        rejected = {each.index for each in response.rejected}
+        for rejection in response.rejected:
+            _log.warning("uplink: keyframe %d is dropped: %s", rejection.index, rejection.reason)
+        rejected = {rejection.index for rejection in response.rejected}
         with self._changed:
-            self._sent_keyframes |= {each.frame_index for each in due} - rejected
+            self._sent_keyframes |= {keyframe.frame_index for keyframe in due} - rejected
             self._counters = replace(self._counters, keyframe_bytes=self._counters.keyframe_bytes + byte_count)
 
     def _join_if_needed(self) -> Session:

@@ -89,8 +89,8 @@ def camera_view_from_message(message: agent_pb.GetCameraViewResponse) -> CameraV
         camera=camera,
         frame_index=message.frame_index,
         T_world_camera=transform_from_message("camera view t_world_camera", message.t_world_camera),
-        times_ns=np.array([each.capture_time_ns for each in message.path], np.int64),
-        path=_poses("camera view path", [each.t_world_camera for each in message.path]),
+        times_ns=np.array([view_pose.capture_time_ns for view_pose in message.path], np.int64),
+        path=_poses("camera view path", [view_pose.t_world_camera for view_pose in message.path]),
         keyframes=_poses("camera view keyframes", list(message.keyframes)),
         detected=_detected_from_message(message.detected) if message.HasField("detected") else None,
     )
@@ -106,15 +106,15 @@ def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
         height_px=height_px,
         boxes=[
             agent_pb.DetectedBox(
-                phrase=each.phrase,
-                score=each.score,
-                left_px=each.box_px[0],
-                top_px=each.box_px[1],
-                right_px=each.box_px[2],
-                bottom_px=each.box_px[3],
-                is_weak=each.is_weak,
+                phrase=box.phrase,
+                score=box.score,
+                left_px=box.box_px[0],
+                top_px=box.box_px[1],
+                right_px=box.box_px[2],
+                bottom_px=box.box_px[3],
+                is_weak=box.is_weak,
             )
-            for each in boxes
+            for box in boxes
         ],
     )
 
@@ -126,18 +126,18 @@ def _detected_from_message(message: agent_pb.DetectedImage) -> DetectedImage:
     if len(message.boxes) > MAX_BOXES:
         raise InvalidInputError(f"detected boxes: expected at most {MAX_BOXES}, got {len(message.boxes)}")
     boxes = []
-    for each in message.boxes:
-        require_name("detected phrase", each.phrase)
-        box_px = each.left_px, each.top_px, each.right_px, each.bottom_px
-        if not all(math.isfinite(value) for value in (*box_px, each.score)):
+    for box in message.boxes:
+        require_name("detected phrase", box.phrase)
+        box_px = box.left_px, box.top_px, box.right_px, box.bottom_px
+        if not all(math.isfinite(value) for value in (*box_px, box.score)):
             raise InvalidInputError("detected boxes: expected finite numbers, got others")
-        boxes.append(DetectedBox(each.phrase, each.score, box_px, is_weak=each.is_weak))
+        boxes.append(DetectedBox(box.phrase, box.score, box_px, is_weak=box.is_weak))
     rgb = decode_colour(message.colour_jpeg, message.width_px, message.height_px)
     return DetectedImage(message.frame_index, rgb, tuple(boxes))
 
 
 def _poses(name: str, messages: list[geometry_pb2.RigidTransform]) -> Float64[ndarray, "n 4 4"]:
-    return np.array([transform_from_message(name, each) for each in messages], np.float64).reshape(-1, 4, 4)
+    return np.array([transform_from_message(name, message) for message in messages], np.float64).reshape(-1, 4, 4)
 
 
 def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:

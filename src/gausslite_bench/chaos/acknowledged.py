@@ -83,12 +83,12 @@ class AgentAcknowledgements:
         """Return the latest acknowledged content, with tombstones."""
         keys = sorted(self.voxels)
         voxels = [self.voxels[key] for key in keys]
-        parts = [from_bytes(each.records) for each in voxels]
+        parts = [from_bytes(voxel.records) for voxel in voxels]
         return VoxelBatch(
             np.array(keys, np.int64),
-            np.array([each.kappa_sum for each in voxels], np.uint64),
-            np.array([len(each) for each in parts], np.uint32),
-            from_bytes(b"".join(each.records for each in voxels)),
+            np.array([voxel.kappa_sum for voxel in voxels], np.uint64),
+            np.array([len(part) for part in parts], np.uint32),
+            from_bytes(b"".join(voxel.records for voxel in voxels)),
         )
 
     def _acknowledge(self, message: bytes) -> None:
@@ -105,7 +105,7 @@ class AgentAcknowledgements:
 
 def offline_map(agents: Mapping[str, AgentAcknowledgements]) -> FusedMap:
     """Return the vote over the latest acknowledged content of every agent, without a server or a store."""
-    return fuse({agent_id: each.batch() for agent_id, each in agents.items() if each.voxels})
+    return fuse({agent_id: agent.batch() for agent_id, agent in agents.items() if agent.voxels})
 
 
 def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> StoreComparison:
@@ -115,12 +115,12 @@ def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> S
             if path.exists():
                 shutil.copy(path, folder)
         with closing(SqliteStore(Path(folder) / store.name)) as opened:
-            results = [_compare_agent(agent_id, each, opened) for agent_id, each in agents.items()]
+            results = [_compare_agent(agent_id, agent, opened) for agent_id, agent in agents.items()]
     return StoreComparison(
-        sum(each.voxels for each in results),
-        sum(each.lost for each in results),
-        sum(each.wrong for each in results),
-        sum(each.extra for each in results),
+        sum(result.voxels for result in results),
+        sum(result.lost for result in results),
+        sum(result.wrong for result in results),
+        sum(result.extra for result in results),
     )
 
 
@@ -140,5 +140,5 @@ def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: Sq
             lost += 1
         elif got.update_seq == expected.update_seq and got != expected:
             wrong += 1
-    same = sum(held[key].update_seq == each.update_seq for key, each in acknowledged.voxels.items() if key in held)
+    same = sum(held[key].update_seq == voxel.update_seq for key, voxel in acknowledged.voxels.items() if key in held)
     return StoreComparison(len(acknowledged.voxels), lost, wrong, len(held) - same)

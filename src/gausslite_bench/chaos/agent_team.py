@@ -30,12 +30,12 @@ class AgentTeam:
     def messages(self) -> int:
         """Acknowledged messages of all agents until now."""
         self.read()
-        return sum(each.messages for each in self.acknowledged.values())
+        return sum(journal.messages for journal in self.acknowledged.values())
 
     def read(self) -> None:
         """Read the new records of all journals."""
-        for each in self.acknowledged.values():
-            each.read()
+        for journal in self.acknowledged.values():
+            journal.read()
 
     def start(self, agent_id: str, seed: int, clock_offset_s: float) -> None:
         """Start an agent on its spool."""

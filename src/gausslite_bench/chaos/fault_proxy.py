@@ -69,7 +69,7 @@ class FaultProxy:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="fault-proxy", daemon=True)
         self._thread.start()
-        self._servers = [self._run(asyncio.start_unix_server(each.serve, each.path)) for each in self._links.values()]
+        self._servers = [self._run(asyncio.start_unix_server(link.serve, link.path)) for link in self._links.values()]
 
     def address(self, agent_id: str) -> str:
         """Return where the agent has to connect."""

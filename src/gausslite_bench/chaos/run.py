@@ -248,14 +248,14 @@ class _ChaosRun:
         parts, last = list(self.team.acknowledged.values()), self.comparisons[-1]
         return ChaosResult(
             faults={str(fault): self.faults[fault] for fault in Fault},
-            acknowledged_messages=sum(each.messages for each in parts),
-            acknowledged_updates=sum(each.updates for each in parts),
+            acknowledged_messages=sum(part.messages for part in parts),
+            acknowledged_updates=sum(part.updates for part in parts),
             disk_errors=self._disk_errors(),
             comparisons=len(self.comparisons),
             voxels=last.voxels,
             fused_voxels=len(offline.batch),
-            lost=sum(each.lost for each in self.comparisons),
-            wrong=sum(each.wrong for each in self.comparisons),
+            lost=sum(comparison.lost for comparison in self.comparisons),
+            wrong=sum(comparison.wrong for comparison in self.comparisons),
             extra_at_end=last.extra,
             same_map=exported == ply_bytes(offline.gaussians),
             same_watch=same_watch,

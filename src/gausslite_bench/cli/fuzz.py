@@ -46,7 +46,7 @@ def run_command(options: argparse.Namespace) -> int:
         sys.stdout.write(json.dumps(list(map(_values, results)), indent=1) + "\n")
     if options.out is not None:
         _write_faults(options.out, results)
-    return 1 if any(each.crashes or each.hangs for each in results) else 0
+    return 1 if any(target_result.crashes or target_result.hangs for target_result in results) else 0
 
 
 def _values(result: FuzzResult) -> dict[str, object]:

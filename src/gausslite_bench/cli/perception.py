@@ -162,10 +162,12 @@ def object_table(scores: Sequence[TaskScore]) -> str:
         "|---|---" + "|---:" * (2 + len(PerceptionStage)) + "|",
     ]
     for score in scores:
-        for each in score.object_scores:
-            recalls = " | ".join(_format(each.recall[stage], 2) for stage in PerceptionStage)
-            detected = f"{100 * each.detected_share:.0f}"
-            lines.append(f"| {score.task} | {each.name} | {each.shown_frames} | {detected} | {recalls} |")
+        for object_score in score.object_scores:
+            recalls = " | ".join(_format(object_score.recall[stage], 2) for stage in PerceptionStage)
+            detected = f"{100 * object_score.detected_share:.0f}"
+            lines.append(
+                f"| {score.task} | {object_score.name} | {object_score.shown_frames} | {detected} | {recalls} |"
+            )
     return "\n".join(lines)
 
 

@@ -97,7 +97,7 @@ def _add_size_and_budget(parser: argparse.ArgumentParser, default_equal: str) ->
     add, budget = parser.add_argument_group("budget").add_argument, TrialBudget()
     add(
         "--equal",
-        choices=[*(str(each) for each in BudgetMode), _BOTH],
+        choices=[*(str(mode) for mode in BudgetMode), _BOTH],
         default=default_equal,
         help="quantity per frame that is equal for all policies (default: %(default)s)",
     )

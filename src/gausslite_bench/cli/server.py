@@ -60,7 +60,7 @@ def run_server(options: argparse.Namespace) -> int:
 
 def _numbers(name: str, text: str, least: int) -> list[int]:
     try:
-        numbers = [int(each) for each in text.split(",")]
+        numbers = [int(part) for part in text.split(",")]
     except ValueError:
         numbers = []
     if not numbers or min(numbers) < least:

@@ -43,7 +43,7 @@ def run_with_progress(
     _warn_about_other_code(expected_origins(study, cache, perceptual is not None, reuse_other_code))
     with _StudyBar(study.count) as bar:
         finished = run_study(study, cache, perceptual, bar, reuse_other_code)
-    origins = Counter(each.origin for each in finished)
+    origins = Counter(trial.origin for trial in finished)
     print_above_bar(f"trials: {', '.join(f'{count} {origin}' for origin, count in origins.items())}")
     return StudyResults(finished)
 

@@ -85,6 +85,8 @@ def _write(folder: Path, recoveries: Sequence[Recovery]) -> None:
     write_atomic(
         folder / "task-change.md", f"# bench task-change\n\n`{command}`\n\n{recovery_table(recoveries)}".encode()
     )
-    write_json(folder / "task-change.json", {"command": command, "changes": [each.as_json() for each in recoveries]})
-    panels = {each.change.name: each.points for each in recoveries}
+    write_json(
+        folder / "task-change.json", {"command": command, "changes": [recovery.as_json() for recovery in recoveries]}
+    )
+    panels = {recovery.change.name: recovery.points for recovery in recoveries}
     write_curves(folder / "task-change.png", panels, "seconds of mapping since the change", "ROI PSNR in dB")

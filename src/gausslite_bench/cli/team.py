@@ -114,7 +114,7 @@ def run_team(options: argparse.Namespace) -> int:
                 results.append(run_trial(trial, scene, lambda _: _count(bar)))
                 _write(options.out, results)
                 print_above_bar(team_table(results[-1:]).splitlines()[-1])
-    print(as_text({"trials": [each.as_json() for each in results]}) if options.json else team_table(results))
+    print(as_text({"trials": [result.as_json() for result in results]}) if options.json else team_table(results))
     return 0
 
 
@@ -132,7 +132,7 @@ def _run_late_joiner(options: argparse.Namespace, trials: Sequence[tuple[TeamPla
     for trial in (trial for _, plan_trials in trials for trial in plan_trials):
         results.append(run_late_joiner(trial.plan, trial.settings, trial.size, trial.grid))
         print_above_bar(results[-1].row)
-    _write_table(options, "late-joiner", late_joiner_table(results), [asdict(each) for each in results])
+    _write_table(options, "late-joiner", late_joiner_table(results), [asdict(result) for result in results])
     return 0
 
 
@@ -146,7 +146,7 @@ def _run_positions(options: argparse.Namespace, plans: Sequence[TeamPlan], size:
             scene = plan.load(size)
             _expect(bar, sum(len(agent.frames) for agent in scene.agents))
             scores += measure_positions(scene, perception, lambda: _count(bar))
-    _write_table(options, "positions", positions_table(scores), [asdict(each) for each in scores])
+    _write_table(options, "positions", positions_table(scores), [asdict(score) for score in scores])
     return 0
 
 
@@ -237,4 +237,4 @@ def _read_frame_error(text: str) -> FrameError:
 def _write(folder: Path, results: Sequence[TeamResult]) -> None:
     command = shlex.join(["gausslite", *sys.argv[1:]])
     write_atomic(folder / "team.md", f"# bench team\n\n`{command}`\n\n{team_table(results)}".encode())
-    write_json(folder / "team.json", {"command": command, "trials": [each.as_json() for each in results]})
+    write_json(folder / "team.json", {"command": command, "trials": [result.as_json() for result in results]})

@@ -68,12 +68,12 @@ def measure_formats(
     shown = [view for view in views if view.shows_region]
     scores = []
     for content, chosen in (("region", gaussians.take(gaussians.active)), ("hand-over", gaussians)):
-        for each in formats:
-            encode_s, parts = _shortest(lambda each=each, chosen=chosen: each.encode(chosen))  # type: ignore[misc]
+        for tested in formats:
+            encode_s, parts = _shortest(lambda tested=tested, chosen=chosen: tested.encode(chosen))  # type: ignore[misc]
             size = sum(len(part) for part in parts) / max(len(chosen), 1)
             decode_ms = loss = fidelity = None
-            if each.decode is not None:
-                decode_s, decoded = _shortest(lambda each=each, parts=parts: each.decode(parts))  # type: ignore[misc]
+            if tested.decode is not None:
+                decode_s, decoded = _shortest(lambda tested=tested, parts=parts: tested.decode(parts))  # type: ignore[misc]
                 decode_ms = 1e3 * decode_s
                 if content == "hand-over" and shown:
                     loss, fidelity = _lost(gaussians, decoded, shown, threads)
@@ -81,7 +81,7 @@ def measure_formats(
                 CodecScore(
                     scene=scene,
                     content=content,
-                    format=each.name,
+                    format=tested.name,
                     gaussians=len(chosen),
                     bytes_per_gaussian=size,
                     encode_ms=1e3 * encode_s,
@@ -105,7 +105,7 @@ def _shortest(run: Callable[[], _Result]) -> tuple[float, _Result]:
 def _lost(
     original: Gaussians, decoded: Gaussians, views: Sequence[HeldOutView], threads: int | None
 ) -> tuple[float, float]:
-    before, after = (MapViewer(each, choose_rasterizer(threads=threads)) for each in (original, decoded))
+    before, after = (MapViewer(scored, choose_rasterizer(threads=threads)) for scored in (original, decoded))
     losses, fidelities = [], []
     for view in views:
         first, second = (viewer.render_frame(view.frame).rgb for viewer in (before, after))

@@ -16,9 +16,9 @@ AGENT_ID = "fuzzer"
 def read_corpus(folder: Path) -> dict[str, list[bytes]]:
     """Return the messages of each target. Raises InvalidInputError if the folder has none."""
     targets = {
-        each.name: [path.read_bytes() for path in sorted(each.glob("*.bin"))]
-        for each in sorted(folder.glob("*"))
-        if each.is_dir()
+        target.name: [path.read_bytes() for path in sorted(target.glob("*.bin"))]
+        for target in sorted(folder.glob("*"))
+        if target.is_dir()
     }
     found = {name: messages for name, messages in targets.items() if messages}
     if not found:

@@ -11,9 +11,10 @@ _FIXED_BYTES = {_FIXED64: 8, _FIXED32: 4}
 _EXTREME_INTEGERS = (0, 1, 127, 1 << 31, (1 << 32) - 1, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 _EXTREME_NUMBERS = {
     8: tuple(
-        bytes.fromhex(each) for each in ("00" * 8, "000000000000f07f", "000000000000f8ff", "ff" * 8, "9c7500883ce4377e")
+        bytes.fromhex(digits)
+        for digits in ("00" * 8, "000000000000f07f", "000000000000f8ff", "ff" * 8, "9c7500883ce4377e")
     ),
-    4: tuple(bytes.fromhex(each) for each in ("00" * 4, "0000807f", "0000c0ff", "ff" * 4)),
+    4: tuple(bytes.fromhex(digits) for digits in ("00" * 4, "0000807f", "0000c0ff", "ff" * 4)),
 }
 """Zero, infinity, NaN and large values, as doubles and as floats."""
 _EXTREME_TEXTS = (b"", b"\x00", b"\xff\xfe", "\u202e\U0001f916".encode(), b"\x1b[2J\n", b"a" * 10_000)
@@ -40,11 +41,11 @@ def parse_fields(data: bytes) -> list[Field] | None:
 def encode_fields(fields: Sequence[Field]) -> bytes:
     """Return the message of these fields."""
     parts = []
-    for each in fields:
-        parts.append(encode_varint(each.number << 3 | each.wire_type))
-        if each.wire_type == _BYTES:
-            parts.append(encode_varint(len(each.value)))
-        parts.append(each.value)
+    for field in fields:
+        parts.append(encode_varint(field.number << 3 | field.wire_type))
+        if field.wire_type == _BYTES:
+            parts.append(encode_varint(len(field.value)))
+        parts.append(field.value)
     return b"".join(parts)
 
 

@@ -38,7 +38,9 @@ class ServiceFuzzer:
     def __init__(self, service: FuzzedService, corpus: Mapping[str, list[bytes]], mutator: Mutator) -> None:
         self._service, self._mutator = service, mutator
         prefix = f"{service.name}."
-        self._corpus = {name.removeprefix(prefix): each for name, each in corpus.items() if name.startswith(prefix)}
+        self._corpus = {
+            name.removeprefix(prefix): messages for name, messages in corpus.items() if name.startswith(prefix)
+        }
         self._full_name = f"gausslite.v1.{service.name}"
         self._takes_stream = service_methods()[self._full_name]
         self.outcomes = Outcomes()
@@ -56,11 +58,11 @@ class ServiceFuzzer:
                 batch = self._batch(min(left, _BATCH), is_last)
                 await self._send(calls, batch)
                 await self._repeat_slow(calls)
-                sent = sum(len(each.messages) for each in batch)
+                sent = sum(len(call.messages) for call in batch)
                 left -= sent
                 note(sent)
         if not self._service.is_running:
-            last = itertools.chain.from_iterable(each.messages for each in batch)
+            last = itertools.chain.from_iterable(call.messages for call in batch)
             self.outcomes.crashes += [(f"{self._service.name}: ended", data) for data in last]
 
     def _batch(self, messages: int, is_last: bool) -> list[Call]:

@@ -29,4 +29,4 @@ class SharedDetections:
         """Return the detections of these nouns, best first. queries: some of the nouns."""
         if self._latest is None or self._latest[0] is not frame:
             self._latest = frame, self._detector.detect(frame, self._nouns)
-        return [each for each in self._latest[1] if each.phrase in queries]
+        return [detection for detection in self._latest[1] if detection.phrase in queries]

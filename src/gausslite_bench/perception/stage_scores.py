@@ -171,10 +171,10 @@ class _TaskEvaluation:
         graph = self._query.graph
         nouns = [noun_of(target) for target in graph.targets]
         every = self._detector.detect(frame, graph.queries)
-        detections = [each for each in every if each.phrase in nouns and not each.is_weak]
+        detections = [detection for detection in every if detection.phrase in nouns and not detection.is_weak]
         masks = {PerceptionStage.DETECTED: merge_detections(detections, nouns, frame).roi}
         relevance = {stage: estimator.estimate(frame).relevance for stage, estimator in self._estimators.items()}
-        masks |= {stage: each.roi for stage, each in relevance.items()}
+        masks |= {stage: stage_relevance.roi for stage, stage_relevance in relevance.items()}
         has_depth = frame.depth_m > 0
         objects = {name: truths[name] & has_depth for name in self._query.objects}
         truth = np.zeros(has_depth.shape, np.bool_)

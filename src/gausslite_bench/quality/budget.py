@@ -43,9 +43,9 @@ class BudgetAxes:
         """Return the points of each axis that has several values, ascending; with one value each, the single point."""
         cap, size, iterations = self.caps[0], self.sizes[0], self.iterations[0]
         axes = {
-            "Gaussians": [BudgetPoint(each, size, iterations) for each in sorted(set(self.caps))],
-            "image size": [BudgetPoint(cap, each, iterations) for each in sorted(set(self.sizes))],
-            "iterations": [BudgetPoint(cap, size, each) for each in sorted(set(self.iterations))],
+            "Gaussians": [BudgetPoint(gaussian_cap, size, iterations) for gaussian_cap in sorted(set(self.caps))],
+            "image size": [BudgetPoint(cap, image_size, iterations) for image_size in sorted(set(self.sizes))],
+            "iterations": [BudgetPoint(cap, size, iteration) for iteration in sorted(set(self.iterations))],
         }
         return {name: points for name, points in axes.items() if len(points) > 1} or {"budget": axes["Gaussians"]}
 
@@ -77,18 +77,18 @@ def task_gain(finished: Sequence[FinishedTrial]) -> TaskGain | None:
     if not roi:
         return None
     seeds, scenes = sorted({seed for _, seed in roi}), sorted({scene for scene, _ in roi})
-    by_seed = [fmean(gain for (_, seed), gain in roi.items() if seed == each) for each in seeds]
-    by_scene = [fmean(gain for (scene, _), gain in roi.items() if scene == each) for each in scenes]
-    of_task = [each for each in finished if each.trial.variant.label == TASK]
+    by_seed = [fmean(gain for (_, seed), gain in roi.items() if seed == chosen) for chosen in seeds]
+    by_scene = [fmean(gain for (scene, _), gain in roi.items() if scene == chosen) for chosen in scenes]
+    of_task = [trial for trial in finished if trial.trial.variant.label == TASK]
     costs = [
-        fmean(each.result.ms_per_frame for each in finished if each.trial.variant == variant) for variant in VARIANTS
+        fmean(trial.result.ms_per_frame for trial in finished if trial.trial.variant == variant) for variant in VARIANTS
     ]
     return TaskGain(
         roi=fmean(by_seed),
         roi_spread=pstdev(by_seed),
         worst_scene=min(by_scene),
         full=fmean(_differences(finished, "full_psnr").values()),
-        roi_psnr=fmean(value for each in of_task if (value := _score(each, "roi_psnr")) is not None),
+        roi_psnr=fmean(value for trial in of_task if (value := _score(trial, "roi_psnr")) is not None),
         ms=(costs[0], costs[1]),
     )
 
@@ -100,7 +100,7 @@ def budget_table(axes: BudgetAxes, gains: Mapping[BudgetPoint, TaskGain]) -> str
         "|---|---|---|---|---|---|---|",
     ]
     for name, points in axes.points().items():
-        for point in (each for each in points if each in gains):
+        for point in (known for known in points if known in gains):
             gain = gains[point]
             rows.append(
                 f"| {name} | {point} | {gain.roi_psnr:.2f} | {gain.roi:+.2f} ± {gain.roi_spread:.2f} | "
@@ -139,9 +139,9 @@ def _score(finished: FinishedTrial, field: str) -> float | None:
 def _differences(finished: Sequence[FinishedTrial], field: str) -> dict[tuple[str, int], float]:
     """Return task minus uniform by scene and seed."""
     by_variant: dict[str, dict[tuple[str, int], float]] = {variant.label: {} for variant in VARIANTS}
-    for each in finished:
-        value = _score(each, field)
+    for trial in finished:
+        value = _score(trial, field)
         if value is not None:
-            by_variant[each.trial.variant.label][each.trial.plan.name, each.trial.seed] = value
+            by_variant[trial.trial.variant.label][trial.trial.plan.name, trial.trial.seed] = value
     task, uniform = (by_variant[variant.label] for variant in VARIANTS)
     return {key: task[key] - uniform[key] for key in task.keys() & uniform.keys()}

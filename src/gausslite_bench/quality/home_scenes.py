@@ -75,7 +75,7 @@ class HomeScenePlan:
     def _training_specs(self) -> list[str]:
         first = max(1, round(_FIRST_TRAJECTORY_SHARE * self.frames))
         counts = (first, self.frames - first)
-        return [self._spec(*each) for each in zip(_TRAINING_TRAJECTORIES, counts, strict=True)]
+        return [self._spec(*row) for row in zip(_TRAINING_TRAJECTORIES, counts, strict=True)]
 
     def _held_out_spec(self) -> str:
         return f"{self._spec(_HELD_OUT_TRAJECTORY, self.views)}&noise=0&exposure=0"

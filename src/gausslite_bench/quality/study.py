@@ -70,7 +70,7 @@ class Study:
 
     def with_rate(self, rate_hz: float) -> Study:
         """Return the study with this rate in every budget that needs one."""
-        budgets = [replace(each, rate_hz=rate_hz) if each.needs_rate else each for each in self.budgets]
+        budgets = [replace(budget, rate_hz=rate_hz) if budget.needs_rate else budget for budget in self.budgets]
         return replace(self, budgets=budgets)
 
     @property

@@ -82,7 +82,7 @@ class StudyResults:
 
     def __init__(self, finished: Sequence[FinishedTrial]) -> None:
         self._finished = list(finished)
-        trials = [each.trial for each in finished]
+        trials = [trial.trial for trial in finished]
         self.scenes = list(dict.fromkeys(trial.plan.name for trial in trials))
         self.variants = list(dict.fromkeys(trial.variant.label for trial in trials))
         self.budgets = list(dict.fromkeys(trial.budget for trial in trials))
@@ -95,20 +95,20 @@ class StudyResults:
     @property
     def has_fitted(self) -> bool:
         """True if a trial has scores with fitted views."""
-        return any(each.result.fitted is not None for each in self._finished)
+        return any(trial.result.fitted is not None for trial in self._finished)
 
     @property
     def notes(self) -> list[str]:
         """Warnings to print first: the number of trials from other code."""
-        others, count = sum(each.from_other_code for each in self._finished), len(self._finished)
+        others, count = sum(trial.from_other_code for trial in self._finished), len(self._finished)
         text = f"**{others} of these {count} trials are from other code: their scores may not be comparable.**"
         return [text] if others else []
 
     def figure(self, scene: str, variant: str, metric: Metric, budget: TrialBudget) -> MeanStd | None:
         """Return mean and spread over the seeds; None if no trial has the metric."""
-        results = [each.result for each in self._of(scene, variant, budget)]
+        results = [trial.result for trial in self._of(scene, variant, budget)]
         scores = [getattr(result, metric.fit) for result in results]
-        values = [getattr(each, metric.field) for each in scores if each is not None]
+        values = [getattr(score, metric.field) for score in scores if score is not None]
         known = [value for value in values if value is not None]
         return MeanStd(fmean(known), pstdev(known)) if known else None
 
@@ -130,16 +130,16 @@ class StudyResults:
 
     def roi_share(self, scene: str) -> float:
         """Return the region's share of the held-out views' pixels."""
-        return next(each.result.roi_share for each in self._finished if each.trial.plan.name == scene)
+        return next(trial.result.roi_share for trial in self._finished if trial.trial.plan.name == scene)
 
     def shown(self, scene: str) -> str:
         """Return the region's visibility in the held-out views, such as "0.7% in 4 of 5 views"."""
-        scores = next(each.result.scores for each in self._finished if each.trial.plan.name == scene)
+        scores = next(trial.result.scores for trial in self._finished if trial.trial.plan.name == scene)
         return f"{self.roi_share(scene):.1%} in {scores.n_roi_views} of {scores.n_views} views"
 
     def task(self, scene: str) -> str:
         """Return the scene's task."""
-        return next(each.trial.plan.task for each in self._finished if each.trial.plan.name == scene)
+        return next(trial.trial.plan.task for trial in self._finished if trial.trial.plan.name == scene)
 
     def cost(self, variant: str, budget: TrialBudget) -> tuple[float, float]:
         """Return the mean iterations and milliseconds per frame, over all scenes and seeds."""
@@ -156,9 +156,9 @@ class StudyResults:
 
     def _of(self, scene: str, variant: str, budget: TrialBudget) -> list[FinishedTrial]:
         return [
-            each
-            for each in self._finished
-            if (each.trial.plan.name, each.trial.variant.label, each.trial.budget) == (scene, variant, budget)
+            trial
+            for trial in self._finished
+            if (trial.trial.plan.name, trial.trial.variant.label, trial.trial.budget) == (scene, variant, budget)
         ]
 
     def _scene_as_json(self, scene: str) -> dict[str, object]:
@@ -173,8 +173,8 @@ class StudyResults:
                         "equal": str(budget.equal),
                         **{name: None if figure is None else asdict(figure) for name, figure in figures.items()},
                         "trials": [
-                            {"seed": each.trial.seed, "other_code": each.from_other_code, **each.result.as_json()}
-                            for each in self._of(scene, variant, budget)
+                            {"seed": trial.trial.seed, "other_code": trial.from_other_code, **trial.result.as_json()}
+                            for trial in self._of(scene, variant, budget)
                         ],
                     }
                 )
@@ -232,9 +232,9 @@ def _by_component(results: StudyResults, scenes: Sequence[str]) -> str:
     rows = [["components", *(f"{title}, equal {budget.equal}" for budget in results.budgets for title, _ in columns)]]
     for variant in results.variants:
         if len(scenes) == 1:
-            cells = [_text(results.figure(scenes[0], variant, *each), each[0]) for each in shown]
+            cells = [_text(results.figure(scenes[0], variant, *figure), figure[0]) for figure in shown]
         else:
-            cells = [_number(results.mean(scenes, variant, *each), each[0]) for each in shown]
+            cells = [_number(results.mean(scenes, variant, *figure), figure[0]) for figure in shown]
         rows.append([variant, *cells])
     return _markdown(rows)
 

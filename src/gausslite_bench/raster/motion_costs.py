@@ -52,7 +52,7 @@ def motion_costs(
             ):
                 times += measured
         still, *moving = (Duration.of(times) for times in seconds)
-        costs += [MotionCost(motion, name, each, still) for motion, each in zip(MOTIONS, moving, strict=True)]
+        costs += [MotionCost(motion, name, duration, still) for motion, duration in zip(MOTIONS, moving, strict=True)]
     return tuple(costs)
 
 

@@ -103,7 +103,7 @@ class RasterBench:
         if self.external_library is not None:
             contenders.append(ExternalRasterizer(self.external_library, rasterizer.threads, _table(table.count), view))
         seconds, clock_ghz = _measure_interleaved(contenders, self.repetitions)
-        durations = [{name: Duration.of(times) for name, times in each.items()} for each in seconds]
+        durations = [{name: Duration.of(times) for name, times in second.items()} for second in seconds]
         blocks = BlockCost.of(own.evaluations, clock_ghz, rasterizer.threads, own.stages_ms["fused_l1"])
         return RasterTiming(
             gaussians=table.count,

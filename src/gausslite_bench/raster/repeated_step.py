@@ -47,7 +47,8 @@ class Duration:
     def mean(cls, durations: Sequence[Duration]) -> Duration:
         """Return the mean of the minima and the mean of the medians."""
         return cls(
-            float(np.mean([each.min_ms for each in durations])), float(np.mean([each.median_ms for each in durations]))
+            float(np.mean([duration.min_ms for duration in durations])),
+            float(np.mean([duration.median_ms for duration in durations])),
         )
 
 

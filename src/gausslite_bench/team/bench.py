@@ -72,9 +72,9 @@ class TeamResult:
             "policy": trial.policy,
             "seed": trial.seed,
             "frame_error": [trial.frame_error.shift_m, trial.frame_error.rotation_deg, trial.frame_error.drift],
-            "roi_psnr": {name: each.roi_psnr for name, each in self.scores.items()},
-            "roi_ssim": {name: each.roi_ssim for name, each in self.scores.items()},
-            "full_psnr": {name: each.full_psnr for name, each in self.scores.items()},
+            "roi_psnr": {name: score.roi_psnr for name, score in self.scores.items()},
+            "roi_ssim": {name: score.roi_ssim for name, score in self.scores.items()},
+            "full_psnr": {name: score.full_psnr for name, score in self.scores.items()},
             "share_percent": self.share_percent,
             "bytes_sent": self.bytes_sent,
             "gaussians_sent": self.gaussians_sent,
@@ -103,26 +103,26 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
         trial=trial,
         scores=score_team(viewers, scene.views, trial.fit_views, sheets=0).scores,
         share_percent=100.0 * float(active) / max(total, 1),
-        bytes_sent=sum(each.bytes_sent for each in maps),
-        gaussians_sent=sum(each.gaussians_sent for each in maps),
+        bytes_sent=sum(agent_map.bytes_sent for agent_map in maps),
+        gaussians_sent=sum(agent_map.gaussians_sent for agent_map in maps),
         gaussians=total,
-        bytes_whole=sum(each.bytes_whole for each in maps),
-        alignment={each.agent_id: str(each.alignment.state) for each in engine.status().agents},
+        bytes_whole=sum(agent_map.bytes_whole for agent_map in maps),
+        alignment={agent_status.agent_id: str(agent_status.alignment.state) for agent_status in engine.status().agents},
     )
 
 
 def _fuse(trial: TeamTrial, maps: Sequence[AgentMap], align: bool) -> tuple[dict[str, Gaussians], FusionEngine]:
     """Return the fused map of each strategy, and the engine that has received the whole maps."""
     grid = trial.grid
-    whole = {each.agent_id: whole_map(each, grid) for each in maps}
-    free = {each.agent_id: each.free_space for each in maps}
+    whole = {agent_map.agent_id: whole_map(agent_map, grid) for agent_map in maps}
+    free = {agent_map.agent_id: agent_map.free_space for agent_map in maps}
     engine = fuse_messages(whole, grid, align, free)
     fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
     first, *others = maps
-    shared = {first.agent_id: whole_map(first, grid), **{each.agent_id: each.messages for each in others}}
+    shared = {first.agent_id: whole_map(first, grid), **{other.agent_id: other.messages for other in others}}
     fused[SHARED_VOTE] = fuse_messages(shared, grid, align, free).maps.voted_map().gaussians
     if trial.refine_iterations > 0:
-        keyframes = engine.in_fused_frame([keyframe for each in maps for keyframe in each.keyframes])
+        keyframes = engine.in_fused_frame([keyframe for agent_map in maps for keyframe in agent_map.keyframes])
         fused[REFINED] = _refine(trial, fused[VOTE], keyframes)
     return fused, engine
 

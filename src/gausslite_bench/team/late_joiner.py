@@ -49,7 +49,9 @@ def run_late_joiner(plan: TeamPlan, settings: MissionSettings, size: tuple[int, 
     """
     scene = plan.load(size)
     regions = scene.regions(scene.agents[0].objects)
-    views = [view for view in (HeldOutView.of(each.frame, regions) for each in scene.views) if view.shows_region]
+    views = [
+        view for view in (HeldOutView.of(scene_view.frame, regions) for scene_view in scene.views) if view.shows_region
+    ]
     if not views:
         raise InvalidInputError(f"{plan.name}: expected held-out views that show the first task's region, got none")
     estimator = RegionRelevanceEstimator(regions)
@@ -102,6 +104,6 @@ def late_joiner_table(results: Sequence[LateJoiner]) -> str:
         "",
         "| scene | first agent | alone | with the team's map | bytes |",
         "|---|---|---|---|---|",
-        *(each.row for each in results),
+        *(result.row for result in results),
     ]
     return "\n".join(lines) + "\n"

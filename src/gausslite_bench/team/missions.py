@@ -101,7 +101,9 @@ def map_agent(
 
     MissionRunner(mapper.process, after_frame).run(agent.frames).raise_if_stopped()
     sent.send(0.0)
-    keyframes = tuple(AgentKeyframe(agent.agent_id, each) for each in _select_keyframes(mapper.keyframes(), grid))
+    keyframes = tuple(
+        AgentKeyframe(agent.agent_id, keyframe) for keyframe in _select_keyframes(mapper.keyframes(), grid)
+    )
     gaussians_sent = sum(len(message.batch.gaussians) for message in sent.messages)
     gaussians = mapper.gaussians()
     whole = split_batch(group_by_voxel(gaussians, grid), _SUBSET_BYTES)

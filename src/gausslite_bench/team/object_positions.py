@@ -45,7 +45,7 @@ class PositionScore:
     @property
     def row(self) -> str:
         """The table row."""
-        errors = [100 * each for each in self.errors_m]
+        errors = [100 * error_m for error_m in self.errors_m]
         figures = f"{fmean(errors):.1f} | {max(errors):.1f}" if errors else "- | -"
         found = f"{len(errors)} of {self.shown}"
         return f"| {self.scene} | {self.task} | {self.agents} | {found} | {figures} | {self.others} |"
@@ -90,10 +90,10 @@ def _score(
     found = _target_objects(reports, RuleParser().parse(task))
     # the nearest pairs of a reported and a true object first, each once
     distances = sorted(
-        (float(np.linalg.norm(np.array(each.landmark.centroid_m) - centroid)), i, name)
-        for i, each in enumerate(found)
+        (float(np.linalg.norm(np.array(team_object.landmark.centroid_m) - centroid)), i, name)
+        for i, team_object in enumerate(found)
         for name, centroid in truths.items()
-        if same_kind(each.landmark.noun, name)
+        if same_kind(team_object.landmark.noun, name)
     )
     errors: dict[str, float] = {}
     used: set[int] = set()
@@ -106,7 +106,9 @@ def _score(
 
 def _target_objects(reports: dict[str, ObjectReport], graph: TaskGraph) -> list[TeamObject]:
     objects = {
-        each.landmark.object_id: each for target in graph.targets for each in find_objects(reports, {}, noun_of(target))
+        found.landmark.object_id: found
+        for target in graph.targets
+        for found in find_objects(reports, {}, noun_of(target))
     }
     return list(objects.values())
 
@@ -147,6 +149,6 @@ def positions_table(scores: Sequence[PositionScore]) -> str:
         "",
         "| scene | task | agents | found | mean error (cm) | largest (cm) | others |",
         "|---|---|---|---|---|---|---|",
-        *(each.row for each in scores),
+        *(score.row for score in scores),
     ]
     return "\n".join(lines) + "\n"

@@ -22,8 +22,8 @@ def team_table(results: Sequence[TeamResult]) -> str:
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups: dict[tuple[str, str], list[TeamResult]] = {}
-    for each in results:
-        groups.setdefault((each.trial.plan.name, each.trial.policy), []).append(each)
+    for result in results:
+        groups.setdefault((result.trial.plan.name, result.trial.policy), []).append(result)
     for (scene, policy), group in groups.items():
         lines += [
             f"| {scene} | {policy} | {strategy} | {_scores(group, strategy)} | {_sent(group)} | {len(group)} |"
@@ -33,19 +33,24 @@ def team_table(results: Sequence[TeamResult]) -> str:
 
 
 def _scores(group: Sequence[TeamResult], strategy: str) -> str:
-    scores = [each.scores[strategy] for each in group]
-    base = _roi_psnr([each.scores[CONCATENATION] for each in group])
+    scores = [result.scores[strategy] for result in group]
+    base = _roi_psnr([result.scores[CONCATENATION] for result in group])
     roi_psnr = _roi_psnr(scores)
-    roi_ssim = fmean(each.roi_ssim or 0.0 for each in scores)
-    return f"{roi_psnr:.2f} | {roi_psnr - base:+.2f} | {roi_ssim:.3f} | {fmean(each.full_psnr for each in scores):.2f}"
+    roi_ssim = fmean(score.roi_ssim or 0.0 for score in scores)
+    return (
+        f"{roi_psnr:.2f} | {roi_psnr - base:+.2f} | {roi_ssim:.3f} | {fmean(score.full_psnr for score in scores):.2f}"
+    )
 
 
 def _roi_psnr(scores: Sequence[MapScores]) -> float:
-    return fmean(each.roi_psnr or 0.0 for each in scores)
+    return fmean(score.roi_psnr or 0.0 for score in scores)
 
 
 def _sent(group: Sequence[TeamResult]) -> str:
-    share = fmean(each.share_percent for each in group)
-    gaussians, megabytes = fmean(each.gaussians_sent for each in group), fmean(each.bytes_sent for each in group) / 1e6
-    percent = fmean(100 * each.bytes_sent / max(each.bytes_whole, 1) for each in group)
+    share = fmean(result.share_percent for result in group)
+    gaussians, megabytes = (
+        fmean(result.gaussians_sent for result in group),
+        fmean(result.bytes_sent for result in group) / 1e6,
+    )
+    percent = fmean(100 * result.bytes_sent / max(result.bytes_whole, 1) for result in group)
     return f"{share:.1f} % | {gaussians:.0f}, {megabytes:.2f} MB ({percent:.1f} %)"

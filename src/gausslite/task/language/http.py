@@ -116,7 +116,7 @@ class HttpLanguageModel:
     def _request(self, messages: Sequence[Message]) -> dict[str, Any]:
         request: dict[str, Any] = {
             "model": self._settings.model,
-            "messages": [{"role": str(each.role), "content": each.text} for each in messages],
+            "messages": [{"role": str(message.role), "content": message.text} for message in messages],
             "temperature": 0,
             "max_tokens": _MAX_ANSWER_TOKENS,
         }
@@ -139,9 +139,9 @@ def _close_sockets_at(deadline_s: float) -> Iterator[tuple[threading.Event, list
 
     def shut_down() -> None:
         expired.set()
-        for each in sockets:
+        for open_socket in sockets:
             with suppress(OSError):  # already closed
-                each.shutdown(socket.SHUT_RDWR)
+                open_socket.shutdown(socket.SHUT_RDWR)
 
     timer = threading.Timer(max(0.0, deadline_s - time.monotonic()), shut_down)
     timer.daemon = True

@@ -91,7 +91,7 @@ class OnnxLanguageModel:
 
 def phi3_chat(messages: Sequence[Message]) -> str:
     """Return a chat in the template of Phi-3; template markers inside the messages are escaped."""
-    chat = "".join(f"<|{each.role}|>\n{each.text.replace('<|', '< |')}<|end|>\n" for each in messages)
+    chat = "".join(f"<|{message.role}|>\n{message.text.replace('<|', '< |')}<|end|>\n" for message in messages)
     return f"{chat}<|assistant|>\n"
 
 
@@ -113,5 +113,5 @@ def _context_tokens(folder: Path, config: bytes) -> int:
 
 
 def _version_of(folder: Path, config: bytes) -> str:
-    sizes = sorted(f"{each.name} {each.stat().st_size}" for each in folder.iterdir() if each.is_file())
+    sizes = sorted(f"{path.name} {path.stat().st_size}" for path in folder.iterdir() if path.is_file())
     return f"{folder.name} {hashlib.sha256(config + chr(10).join(sizes).encode()).hexdigest()[:12]}"

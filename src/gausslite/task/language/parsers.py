@@ -203,7 +203,7 @@ def _first_object(answer: str) -> dict[str, Any]:
 def _phrases(role: str, value: object) -> list[str]:
     if not isinstance(value, list) or len(value) > MAX_PHRASES:
         _refuse(f"expected a list of at most {MAX_PHRASES} {role}, got something else")
-    return [_phrase(each) for each in value]
+    return [_phrase(item) for item in value]
 
 
 def _phrase(value: object) -> str:
@@ -215,7 +215,7 @@ def _phrase(value: object) -> str:
 def _relations(value: object) -> list[Relation]:
     if not isinstance(value, list) or len(value) > MAX_RELATIONS:
         _refuse(f"expected a list of at most {MAX_RELATIONS} relations, got something else")
-    return [_relation(each) for each in value]
+    return [_relation(item) for item in value]
 
 
 def _relation(value: object) -> Relation:
