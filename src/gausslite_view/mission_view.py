@@ -68,7 +68,7 @@ class MissionView:
             objects=self._mapper.objects,
             times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
             T_world_camera=trajectory.T_world_camera,
-            keyframes=[_view(each) for each in keyframes],
+            keyframes=[_view(keyframe) for keyframe in keyframes],
         )
 
     def _add_quality(self, time_s: float, keyframe: Keyframe) -> None:

@@ -62,7 +62,7 @@ def _contents_at(snapshot: MapSnapshot, newest: ViewContents) -> ViewContents:
         gaussians=gaussians,
         agent=np.full(len(gaussians), index, np.int64),
         objects=tuple(each for each in newest.objects if each.first_seen_ns <= snapshot.time_ns),
-        keyframes=[each for each in newest.keyframes if each.capture_time_ns <= snapshot.time_ns],
+        keyframes=[keyframe for keyframe in newest.keyframes if keyframe.capture_time_ns <= snapshot.time_ns],
         state_ns=snapshot.time_ns,
     )
 
@@ -71,9 +71,9 @@ def _targets(report: Mapping[str, object]) -> tuple[str, ...]:
     """Return the targets: an agent's report lists them, that of `map` has them in its task."""
     task = report.get("task")
     targets = task.get("targets") if isinstance(task, Mapping) else report.get("targets")
-    return tuple(str(each) for each in targets) if isinstance(targets, list) else ()
+    return tuple(str(target) for target in targets) if isinstance(targets, list) else ()
 
 
 def _objects(report: Mapping[str, object]) -> tuple[ObjectLandmark, ...]:
     values = report.get("objects")
-    return tuple(object_from_json(each) for each in values) if isinstance(values, list) else ()
+    return tuple(object_from_json(value) for value in values) if isinstance(values, list) else ()
