@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 
 from gausslite.codec.state_file import read_png, write_atomic
 from gausslite.domain.errors import StorageError
+from gausslite_view.report_elements import as_html, element, picture, styled
 from gausslite_view.report_parts import (
     MAP_SIZE,
     SCORES,
@@ -16,17 +17,13 @@ from gausslite_view.report_parts import (
     ReportContents,
     RunResults,
     as_count,
-    as_html,
     as_percent,
     as_seconds,
-    element,
     figures_table,
     nouns_table,
     objects_table,
-    picture,
     read_results,
     settings_table,
-    styled,
     task_column,
 )
 from gausslite_view.report_pictures import (

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from xml.etree.ElementTree import Element, tostring
+from xml.etree.ElementTree import Element
 
-import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.codec.ply import read_ply, read_world_frame
@@ -21,57 +18,8 @@ from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
 from gausslite_view.contents import ViewContents
+from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
-
-_JPEG_QUALITY = 88
-# HTML does not allow these characters, not even escaped
-_FORBIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
-_NO_ATTRIBUTES: Mapping[str, str] = {}
-
-
-def element(tag: str, *children: Element | str, attributes: Mapping[str, str] = _NO_ATTRIBUTES) -> Element:
-    """Return an element with its children in order. Characters that HTML forbids become U+FFFD."""
-    created = Element(tag, {name: _allowed(value) for name, value in attributes.items()})
-    last: Element | None = None
-    for child in children:
-        if isinstance(child, Element):
-            created.append(child)
-            last = child
-        elif last is None:
-            created.text = (created.text or "") + _allowed(child)
-        else:
-            last.tail = (last.tail or "") + _allowed(child)
-    return created
-
-
-def styled(tag: str, style_class: str, *children: Element | str) -> Element:
-    """Return an element with a class of the style sheet."""
-    return element(tag, *children, attributes={"class": style_class})
-
-
-def as_html(root: Element) -> bytes:
-    """Return the document as UTF-8."""
-    return b"<!doctype html>\n" + tostring(root, encoding="unicode", method="html").encode() + b"\n"
-
-
-def picture_url(image: UInt8[ndarray, "h w 3"]) -> str:
-    """Return an RGB image as a data URI with a JPEG."""
-    import cv2
-
-    encoded = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
-
-
-def picture(image: UInt8[ndarray, "h w 3"], caption: str) -> Element:
-    """Return an RGB image with a caption under it."""
-    height, width = image.shape[:2]
-    attributes = {"src": picture_url(image), "alt": caption, "width": str(width), "height": str(height)}
-    return element("figure", element("img", attributes=attributes), element("figcaption", caption))
-
-
-def _allowed(text: str) -> str:
-    return _FORBIDDEN.sub("\ufffd", text)
-
 
 _MAP, _PICTURES = "map.ply", "pictures"
 _FUSED_MAPS = ("concatenation", "vote", "refine")

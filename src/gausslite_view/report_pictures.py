@@ -26,7 +26,8 @@ from gausslite.evaluation.pictures import (
 )
 from gausslite.evaluation.views import MIN_ROI_PIXELS, MapViewer, view_map
 from gausslite_view.contents import ColourMode, ViewContents, colours_of, legend_of
-from gausslite_view.report_parts import RunResults, element, picture, picture_url, styled
+from gausslite_view.report_elements import element, picture, picture_url, styled
+from gausslite_view.report_parts import RunResults
 
 _WIDTH_PX, _MAX_HEIGHT_PX = 480, 640
 _MARGIN_M = 0.3

@@ -15,11 +15,7 @@ from gausslite_view.contents import ViewContents
 
 _MAX_STATES = 64
 """Earlier maps: 91 MB at most, with MAX_GAUSSIANS each."""
-
-
 _NS_PER_S = 1e9
-
-
 _STEP_S = 0.01
 
 

@@ -23,7 +23,8 @@ import torch
 
 from gausslite.render.cuda import CudaRasterizer
 from gausslite.render.cuda.gsplat_baseline import GsplatBaseline
-from gausslite.render.cuda.kernels import DeviceCamera, TorchKernels, project
+from gausslite.render.cuda.kernels import TorchKernels, project
+from gausslite.render.cuda.tables import DeviceCamera
 
 torch.set_num_threads(1)
 SIZE = (48, 32)

@@ -23,7 +23,8 @@ from gausslite.process import Sibling, sibling
 from gausslite.task.grounding import TaskParser
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.server import run_service, serve_until_stopped
+from gausslite.wire.process import run_service
+from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import ChangeNotifier

@@ -20,7 +20,8 @@ from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import StoreReport
 from gausslite.process import Sibling, print_message, sibling
 from gausslite.wire.convert import decode_frame
-from gausslite.wire.server import LogFormat, log_to_stderr, run_service, serve_until_stopped
+from gausslite.wire.process import LogFormat, log_to_stderr, run_service
+from gausslite.wire.server import serve_until_stopped
 from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer

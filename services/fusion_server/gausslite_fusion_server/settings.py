@@ -19,8 +19,8 @@ from gausslite.fusion.refinement import RefineSettings
 from gausslite.process import print_message
 from gausslite.render.choose import BACKENDS
 from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port
+from gausslite.wire.process import LogFormat
 from gausslite.wire.security import CallLimits, Tls, TlsFiles
-from gausslite.wire.server import LogFormat
 
 PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"

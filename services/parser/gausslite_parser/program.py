@@ -18,8 +18,9 @@ from gausslite.task.rules import BackendSettings, open_parser
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire.channel import PARSER_ADDRESS
 from gausslite.wire.convert_task import graph_to_message
+from gausslite.wire.process import run_service
 from gausslite.wire.security import Tls, TlsFiles
-from gausslite.wire.server import Service, run_service, serve_until_stopped
+from gausslite.wire.server import Service, serve_until_stopped
 
 SERVICE_NAME = parser_service_pb2.DESCRIPTOR.services_by_name["ParserService"].full_name
 

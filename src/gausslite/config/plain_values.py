@@ -15,11 +15,7 @@ from gausslite.domain.errors import InvalidInputError
 
 Plain = str | bool | int | float | Sequence[str] | None
 """The value of one option in a configuration file; None leaves the option out."""
-
-
 _BOOLEANS = {**dict.fromkeys(("1", "true", "yes", "on"), True), **dict.fromkeys(("0", "false", "no", "off"), False)}
-
-
 _URL_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):[^/@\s]+(?=@)")
 
 

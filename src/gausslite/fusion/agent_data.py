@@ -16,15 +16,8 @@ from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.voxels import RoiSubset, select_voxels
-from gausslite.fusion.frames import (
-    AlignmentSettings,
-    AlignmentState,
-    FrameAlignment,
-    FrameAlignments,
-    SurfaceSamples,
-    crop_to_overlap,
-    fit_frame,
-)
+from gausslite.fusion.alignment import SurfaceSamples, crop_to_overlap, fit_frame
+from gausslite.fusion.frames import AlignmentSettings, AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import fuse

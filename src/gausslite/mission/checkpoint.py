@@ -15,7 +15,7 @@ from gausslite.codec.state_file import read_state, write_state
 from gausslite.config.option import option_key
 from gausslite.domain.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.domain.state import State, add_prefix, encode_text, get_array, get_text, int_array, select_prefix
-from gausslite.mission.settings import field_from_plain, to_plain
+from gausslite.mission.serialisation import field_from_plain, to_plain
 from gausslite.mission.task_mapper import TaskMapper
 
 _MAX_SHOWN = 200

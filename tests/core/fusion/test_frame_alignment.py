@@ -15,8 +15,9 @@ from gausslite.domain.free_space import FreeSpace, split_indices
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
+from gausslite.fusion.alignment import SurfaceSamples, fit_frame
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import AlignmentSettings, AlignmentState, SurfaceSamples, fit_frame
+from gausslite.fusion.frames import AlignmentSettings, AlignmentState
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore

@@ -35,7 +35,8 @@ from gausslite.task.rules import RuleParser
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
 from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
 from gausslite.wire.clients import AgentClient, FusionClient
-from gausslite.wire.server import run_service, serve_until_stopped
+from gausslite.wire.process import run_service
+from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink

@@ -12,8 +12,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
-from gausslite.render.cuda.kernels import load_gsplat, to_device
+from gausslite.render.cuda.kernels import load_gsplat
 from gausslite.render.cuda.loss import CudaView, training_loss
+from gausslite.render.cuda.tables import to_device
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, LossWeights
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.render.cuda.kernels import DeviceCamera, to_device
+from gausslite.render.cuda.tables import DeviceCamera, to_device
 from gausslite.render.rasterizer import TILE_PX, LossWeights
 
 MIN_DEPTH_ALPHA = 0.5

@@ -15,19 +15,16 @@ from torch import Tensor
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.cuda.kernels import (
-    DeviceCamera,
-    DeviceTables,
     Footprints,
     GsplatKernels,
-    HostTables,
     Kernels,
     TorchKernels,
     load_gsplat,
     project,
-    to_device,
     visible_rows,
 )
 from gausslite.render.cuda.loss import CudaView, Window, training_loss
+from gausslite.render.cuda.tables import DeviceCamera, DeviceTables, HostTables, to_device
 from gausslite.render.rasterizer import (
     FULL_FRAME,
     AdamSettings,
