@@ -92,15 +92,15 @@ def test_the_current_task_is_that_of_the_latest_switch() -> None:
 
 @pytest.mark.parametrize("text", ["Find the mug", "x:Find the mug", "7:", "-1:Find the mug"])
 def test_an_invalid_task_switch_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["map", "sim:home?frames=2", "--task", "Find the mug", f"--task-at={text}", "--out", str(tmp_path)]
+    command = ["map", "sim:home?frames=2", "--task", "Find the mug", "--set", f"task-at={text}", "--out", str(tmp_path)]
     assert main(command) == 2
-    assert "--task-at" in capsys.readouterr().err
+    assert "task-at" in capsys.readouterr().err
 
 
 def test_a_mission_with_a_task_change_resumes_bit_identically(tmp_path: Path) -> None:
     def map_home(name: str, *more: str) -> tuple[bytes, dict[str, object]]:
-        common = ["--size", "64x48", "--max-gaussians", "500", "--iterations", "2", "--threads", "1"]
-        tasks = ["--task", "Pick up the mug on the table", "--task-at", "6:Find the chair"]
+        common = ["--size", "64x48", "--max-gaussians", "500", "--iterations", "2", "--set", "threads=1"]
+        tasks = ["--task", "Pick up the mug on the table", "--set", "task-at=6:Find the chair"]
         out = str(tmp_path / name)
         assert main(["map", "sim:home?seed=0&trajectory=0&frames=14", *common, *tasks, "--out", out, *more]) == 0
         report = json.loads((tmp_path / name / "report.json").read_text())
@@ -110,5 +110,5 @@ def test_a_mission_with_a_task_change_resumes_bit_identically(tmp_path: Path) ->
     uninterrupted, report = map_home("uninterrupted")
     # all six earlier frames showed the first task's region, so they are keyframes
     assert report["keyframes_reread"] == 6
-    map_home("first", "--frames", "0:7", "--save-state", state)
-    assert map_home("rest", "--resume", state)[0] == uninterrupted
+    map_home("first", "--frames", "0:7", "--set", f"save-state={state}")
+    assert map_home("rest", "--set", f"resume={state}")[0] == uninterrupted

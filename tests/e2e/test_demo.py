@@ -60,7 +60,7 @@ def test_the_demo_maps_fuses_scores_and_ends_its_processes_on_a_recording_with_a
     folder, out = tmp_path / "recording", tmp_path / "demo"
     _write_recording(folder)
     camera = ",".join(np.loadtxt(folder / "camera-intrinsics.txt")[[0, 1, 0, 1], [0, 1, 2, 2]].astype(str))
-    calibration = ("--register-depth", camera, "--pose-prior", "0.01,0.5,0.1,0.03")
+    calibration = ("--set", f"register-depth={camera}", "--set", "pose-prior=0.01,0.5,0.1,0.03")
     tasks = ("--source", folder, "--task-a", "Find the table", "--task-b", "Find the table")
     command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *map(str, tasks), *calibration, "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280)

@@ -88,7 +88,7 @@ class EvalOptions:
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite eval`."""
     Program.of(
-        *(EvalOptions, SourceSettings, RecordingOptions, TaskSettings),
+        *(EvalOptions, RecordingOptions, SourceSettings, TaskSettings),
         flags="frames size roi objects test-every poses pictures save-scores strict json",
         positional="map source",
         omit=("task", "pose-prior"),

@@ -160,7 +160,7 @@ class MapOptions:
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite map`."""
     Program.of(
-        *(MapOptions, TaskSettings, SourceSettings, RecordingOptions, PerceptionSettings, MissionSettings),
+        *(MapOptions, TaskSettings, RecordingOptions, SourceSettings, PerceptionSettings, MissionSettings),
         flags="task detector frames size max-gaussians iterations rate roi objects policy seed poses test-every out "
         "overwrite",
         positional="source",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from gausslite.config.option import suggestion
-from gausslite.config.plain_values import describe_range, is_within, read_plain
+from gausslite.config.plain_values import describe_range, is_within, read_plain, without_password
 from gausslite.domain.errors import InvalidInputError
 from gausslite.process import printable
 
@@ -28,7 +28,7 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the message and the command that lists the options, and exit."""
-        self.exit(2, f"{self.prog}: {printable(message)}; see `{self.prog} --help`\n")
+        self.exit(2, f"{self.prog}: {printable(without_password(message))}; see `{self.prog} --help`\n")
 
     @property
     def flags(self) -> list[str]:

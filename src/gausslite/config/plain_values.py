@@ -16,7 +16,12 @@ from gausslite.domain.errors import InvalidInputError
 Plain = str | bool | int | float | Sequence[str] | None
 """The value of one option in a configuration file; None leaves the option out."""
 _BOOLEANS = {**dict.fromkeys(("1", "true", "yes", "on"), True), **dict.fromkeys(("0", "false", "no", "off"), False)}
-_URL_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):[^/@\s]+(?=@)")
+_PASSWORDS = (
+    re.compile(r"(://[^/@\s:]*:)[^/@\s]+(?=@)"),
+    # of a database, also one with characters that a URL has to escape
+    re.compile(r"(postgres(?:ql)?://[^/@\s:]*:)\S+(?=@)"),
+    re.compile(r"([?&](?:ssl)?password=)[^&\s]+"),
+)
 
 
 def split_names(text: str) -> tuple[str, ...]:
@@ -83,7 +88,9 @@ def describe_range(low: float | None, high: float | None, unit: str = "") -> str
 
 def without_password(text: str) -> str:
     """Return the text with "***" in place of a URL's password."""
-    return _URL_PASSWORD.sub(r"\1:***", text)
+    for pattern in _PASSWORDS:
+        text = pattern.sub(r"\1***", text)
+    return text
 
 
 def to_toml(values: Mapping[str, Plain]) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 _SOURCES = Path(__file__).resolve().parents[2]
 """The folder of the packages that a trial runs."""
 _PACKAGES = ("gausslite", "gausslite_bench", "gausslite_sim")
-_NEVER_IMPORTED = {"gausslite": ("cli", "config", "fusion", "v1", "wire"), "gausslite_bench": ("cli",)}
+_NEVER_IMPORTED = {"gausslite": ("cli", "fusion", "v1", "wire"), "gausslite_bench": ("cli",)}
 """Subpackages that a trial does not import, so that their changes cannot affect its result."""
 
 

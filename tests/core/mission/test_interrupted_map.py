@@ -51,7 +51,7 @@ def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
         assert mapped(sequence, tmp_path / "first", "--set", f"save-state={state}") == code
     last_line = capsys.readouterr().err.splitlines()[-1]
     kept = f"3 frames are mapped; map.ply, report.json and preview.png are in {tmp_path / 'first'}"
-    assert last_line.endswith(f"ed: {kept}; continue with --resume {state}")
+    assert last_line.endswith(f"ed: {kept}; continue with --set resume={state}")
     report = json.loads((tmp_path / "first" / "report.json").read_text())
     assert (report["frames"], report["stopped_by"]) == (3, "interrupted")
     assert mapped(sequence, tmp_path / "rest", "--set", f"resume={state}") == 0

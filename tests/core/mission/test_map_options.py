@@ -110,4 +110,4 @@ def test_eval_skips_and_counts_corrupt_frames(tmp_path: Path, capsys: pytest.Cap
     assert "frame 8 skipped" in printed.err
     assert main([*command, "--json"]) == 0
     assert '"frames_corrupt": 1' in capsys.readouterr().out
-    assert main([*command, "--strict"]) == 2
+    assert main([*command, "--set", "strict=true"]) == 2

@@ -26,13 +26,15 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return str(request.getfixturevalue("postgres").new_database())
 
 
-def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(store: str) -> None:
+def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(
+    store: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with server_process("--store", store) as (_, client):
         session = client.join("ant", GRID).session_id
         message = request(session, make_subset("ant", 1, {0: [4], 1: [2, 2]}))
         [answer] = client.contribute([message], 20.0)
         assert answer.acknowledged == 1
-        assert "in use by another server" in ends_with_one_line("--store", store)
+        assert "in use by another server" in ends_with_one_line(capsys, "--store", store)
     with server_process("--store", store) as (_, client):
         [answer] = client.contribute([message], 20.0)
         assert answer.outcomes[0].status == pb.SUBSET_STATUS_STALE
@@ -91,7 +93,11 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(
     nonsense.parent.mkdir()
     nonsense.write_text("remember the milk, " * 300)
     secret = "postgresql://ant:kept-secret@127.0.0.1:1/team"
-    assert "--store-max-mb: expected a file" in ends_with_one_line(capsys, "--store", secret, "--store-max-mb", "9")
+    limited = ends_with_one_line(capsys, "--store", secret, "--set", "store-max-mb=9")
+    assert "store-max-mb: expected a file" in limited
+    with pytest.raises(SystemExit):
+        run([secret])
+    assert "kept-secret" not in capsys.readouterr().err
     for url in (secret, secret.replace("ant", "ant@"), secret.replace("postgresql", "postgres")):
         assert "kept-secret" not in ends_with_one_line(capsys, "--store", url)
     with socket.socket() as taken:
@@ -103,10 +109,10 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(
             (("--store", "memroy"), "--store memroy: expected memory or"),
             (("--store", str(tmp_path)), "expected a file, got a folder"),
             (("--store", str(nonsense.parent)), "start one server for each mission in the folder"),
-            (("--health", "nonsense"), "--health"),
+            (("--set", "health=nonsense"), "health"),
             (("--voxel-size", "0"), "--voxel-size: expected 0.001 to 1000"),
-            (("--store-max-mb", "0"), "--store-max-mb"),
-            (("--refine-iterations", "1000000"), "--refine-iterations"),
+            (("--set", "store-max-mb=0"), "store-max-mb"),
+            (("--set", "refine-iterations=1000000"), "refine-iterations"),
             (("--mission", "husky-\udcff"), "mission: expected 1 to 64 letters"),
             (("--listen", f"127.0.0.1:{taken.getsockname()[1]}"), "in use"),
         ):
