@@ -111,7 +111,7 @@ def test_map_reads_its_options_from_a_file(tmp_path: Path) -> None:
     config.write_text('tasks = "Find the mug"\n')
     done = gausslite("map", "--config", config)
     assert done.returncode == 2
-    assert done.stderr == f"gausslite: {config}: unknown option 'tasks'; did you mean task?\n"
+    assert done.stderr == f"gausslite: {config}: tasks: unknown option; did you mean task?\n"
 
 
 def test_parse_prints_the_stable_json() -> None:
