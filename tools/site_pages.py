@@ -18,6 +18,9 @@ from unittest.mock import patch
 from latex2mathml.converter import convert as mathml
 from mkdocs.structure.files import File, Files
 
+from gausslite.cli.main import build_parser
+from gausslite.config.program import PROGRAM, Program, describe, variable_name
+
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.pages import Page
@@ -35,6 +38,8 @@ PAGES = {
     **{f"bench/results/{path.name}": f"results/{path.name}" for path in (ROOT / "bench/results").glob("20*.md")},
 }
 COMMANDS_PAGE = "reference/commands.md"
+CONFIGURABLE = ("map", "demo", "eval", "parse")
+"""Commands whose options are also keys of a file."""
 SERVICES = {
     "gausslite-agent": "gausslite_agent",
     "gausslite-fusion-server": "gausslite_fusion_server",
@@ -69,7 +74,7 @@ def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
     parts = _FENCE.split(markdown)
     for index in range(0, len(parts), 2):  # the odd parts are fenced code
         parts[index] = _LIST_AFTER_TEXT.sub(r"\1\n\n", _LINK.sub(lambda link: _site_link(link, page), parts[index]))
-    helps = _help_texts() if page.file.src_uri == COMMANDS_PAGE else ""
+    helps = _help_texts() + _option_tables() if page.file.src_uri == COMMANDS_PAGE else ""
     return "".join(parts) + helps
 
 
@@ -124,6 +129,30 @@ def _sub_commands(help_text: str) -> list[str]:
     """Return the names of sub-commands in a help text: the words that argparse indents by four spaces."""
     _, _, listed = help_text.partition("positional arguments:")
     return re.findall(r"^    ([a-z][\w-]*)(?:\s|$)", listed.partition("\noptions:")[0], re.MULTILINE)
+
+
+@cache
+def _option_tables() -> str:
+    """Return a table of all options of each configurable program, from their declarations."""
+    commands = build_parser(CONFIGURABLE).commands
+    parsers = [commands[name] for name in CONFIGURABLE]
+    for module in SERVICES.values():
+        settings = f"{module}.{'program' if module == 'gausslite_parser' else 'settings'}"
+        parsers.append(importlib.import_module(settings).build_parser())
+    sections = []
+    for parser in parsers:
+        program: Program = parser.get_default(PROGRAM)
+        rows = [
+            f"| `{program.name(key)}` | `{variable_name(key)}` | {_table_cell(describe(declared))} |"
+            for key, declared in program.options.items()
+        ]
+        head = (f"## All settings of {parser.prog}\n", "| option | variable | meaning |", "|---|---|---|")
+        sections.append("\n".join((*head, *rows)))
+    return "\n\n" + "\n\n".join(sections)
+
+
+def _table_cell(text: str) -> str:
+    return html.escape(text, quote=False).replace("|", "&#124;")
 
 
 @cache
