@@ -69,5 +69,5 @@ def test_the_reference_has_the_public_names_and_all_commands(site: Path) -> None
     for heading in ("gausslite-map", "gausslite-bench-quality", "gausslite-models-source", "gausslite-agent"):
         assert f'id="{heading}"' in commands
     # the tables of settings come from their declarations
-    assert "--set register-depth=" in commands
+    assert "<code>register-depth</code>" in commands
     assert "GAUSSLITE_REGISTER_DEPTH" in commands
