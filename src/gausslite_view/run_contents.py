@@ -49,7 +49,8 @@ def read_past(path: Path, contents: ViewContents) -> tuple[PastMap, ...]:
     if not path.is_dir():
         return ()
     return tuple(
-        PastMap(each.time_ns, each.total, partial(_contents_at, each, contents)) for each in read_map_history(path)
+        PastMap(snapshot.time_ns, snapshot.total, partial(_contents_at, snapshot, contents))
+        for snapshot in read_map_history(path)
     )
 
 
@@ -61,7 +62,7 @@ def _contents_at(snapshot: MapSnapshot, newest: ViewContents) -> ViewContents:
         newest,
         gaussians=gaussians,
         agent=np.full(len(gaussians), index, np.int64),
-        objects=tuple(each for each in newest.objects if each.first_seen_ns <= snapshot.time_ns),
+        objects=tuple(item for item in newest.objects if item.first_seen_ns <= snapshot.time_ns),
         keyframes=[keyframe for keyframe in newest.keyframes if keyframe.capture_time_ns <= snapshot.time_ns],
         state_ns=snapshot.time_ns,
     )
