@@ -39,6 +39,8 @@ MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 def _read_store(text: str) -> Path | str | None:
     if text == MEMORY:
         return None
+    if "://" in text and not text.startswith(POSTGRES_SCHEME):
+        raise InvalidInputError(f"expected {POSTGRES_SCHEME}USER@HOST/DATABASE, got {without_password(text)}")
     return text if text.startswith(POSTGRES_SCHEME) else read_path(text)
 
 
