@@ -41,7 +41,7 @@ def test_the_report_next_to_a_map_sets_the_registration_and_fitting(
         return json.loads(captured.out), captured.err
 
     scores, message = score()
-    assert message == f"from the report next to map.ply: --register-depth {CAMERA} --poses refine\n"
+    assert message == f"from the report next to map.ply: register-depth {CAMERA} --poses refine\n"
     assert scores == score("--set", f"register-depth={CAMERA}", "--set", "fit-views=true")[0]
     raw, message = score("--set", f"register-depth={CAMERA}", "--set", "fit-views=false")
     assert (scores["fitted"], raw["fitted"], message) == (True, False, "")

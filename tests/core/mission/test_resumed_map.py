@@ -89,7 +89,8 @@ def test_registration_and_prior_of_the_saved_run_are_not_estimated_again(
     assert main(rest) == 0
     assert "register-depth" not in capsys.readouterr().err
     report = json.loads((tmp_path / "rest" / "report.json").read_text())
-    assert (report["frames"], report["colour_camera"], report["view_error"]) == (3, found[1], found[3])
+    camera, prior = (setting.partition("=")[2] for setting in found[1::2])
+    assert (report["frames"], report["colour_camera"], report["view_error"]) == (3, camera, prior)
     assert main([*rest, "--set", "pose-prior=none"]) == 2
     assert "pose-prior '0.01,0.5,0.1,0.03' (got '0,0,0,0')" in capsys.readouterr().err
 
