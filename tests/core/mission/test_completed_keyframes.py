@@ -39,7 +39,8 @@ def frame_at(index: int) -> Frame:
 
 def make_task_mapper() -> TaskMapper:
     settings = MapperSettings(
-        max_gaussians=1500,
+        # room for seeds: with less, rounding of the processor decides whether there is any
+        max_gaussians=2500,
         seeding=SeedingSettings(first_frame_seeds=60_000, later_seeds=20_000),
         keyframes=KeyframeSettings(every=1, window=3, buffer=8, long_term_keyframes=4),
         task_change=TaskChangeSettings(keyframes_per_frame=2),
