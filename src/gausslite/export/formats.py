@@ -1,4 +1,4 @@
-"""The table of export formats, and the content of a map that they write."""
+"""The table of export formats, the content of a map that they write, and the writers of point clouds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PCD_ROW = np.dtype(
     [("mean_m", "<f4", 3), ("bgra", "u1", 4), ("opacity", "<f4"), ("kappa", "<u4"), ("target", "<i2"), ("active", "u1")]
 )
 _LAS_STEP_M = 1e-4
-"""Resolution of LAS coordinates, which are 32-bit integers: 0.1 mm covers the 200 km of `formats.MAX_EXTENT_M`."""
+"""Resolution of LAS coordinates, which are 32-bit integers: 0.1 mm covers the 200 km of `MAX_EXTENT_M`."""
 
 
 def write_pcd(path: Path, gaussians: Gaussians) -> None:

@@ -1,4 +1,4 @@
-"""Seed new Gaussians from pixels of a frame, by relevance to the task (Sec. III-C: SB, SIS, GFD)."""
+"""Seed new Gaussians from pixels of a frame, by relevance to the task (Sec. III-C: its budget, scales, gradients)."""
 
 from __future__ import annotations
 
