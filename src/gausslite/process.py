@@ -1,4 +1,8 @@
-"""Write messages to stderr: one line each, without control characters."""
+"""What every program of the package shares: messages, signals, optional packages, and packages beside the core.
+
+Programs call `end_quietly_while_starting` before their other imports, because imports take most of the start-up. The
+handler is our own and not the system's default, because process 1 of a container ignores signals without a handler.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +112,7 @@ class Sibling(StrEnum):
     BAGS = "gausslite_ros.bag_source"
     """open_bag."""
     PAGES = "gausslite_view.pages"
-    """live_page, own_page."""
+    """live_page, service_page."""
     MISSION_PAGE = "gausslite_view.mission_view"
     """mission_view."""
     REPORT = "gausslite_view.report"

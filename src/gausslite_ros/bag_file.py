@@ -1,4 +1,4 @@
-"""The address of a bag: its path, and the options that choose topics and frames."""
+"""Read a bag (ROS 1 files, ROS 2 folders, single MCAP or SQLite files) by its address with options."""
 
 from __future__ import annotations
 

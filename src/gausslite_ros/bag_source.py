@@ -1,4 +1,4 @@
-"""The camera's poses in a bag: from tf between a world frame and the camera, or from a topic of poses."""
+"""A bag as a sequence of posed RGB-D frames, with poses from tf or a topic, at the times of the headers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Convert a colour and a depth message, with the camera's pose, to a frame: for bags and for live topics alike."""
+"""Join colour and depth messages with the camera's pose to a frame: for bags and for live topics alike."""
 
 from __future__ import annotations
 

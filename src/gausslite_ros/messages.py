@@ -1,4 +1,4 @@
-"""Convert camera_info messages to the camera and lens of an image topic."""
+"""Decode ROS messages, of ROS 1 and ROS 2 alike: images, compressed depth, and camera_info as camera and lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node's parameters: their defaults, and their check when the node starts."""
+"""What the node does without rclpy: its parameters, the topics it reads, and the messages it publishes."""
 
 from __future__ import annotations
 

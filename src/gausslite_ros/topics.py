@@ -1,4 +1,4 @@
-"""Recordings of the RealSense SDK (realsense-viewer, rs-record): ROS 1 bags with the SDK's own topics.
+"""Choose the topics of colour, depth and cameras in a bag, also in recordings of the RealSense SDK.
 
 A stream's topics begin with its name, such as /device_0/sensor_1/Color_0. All frame_ids are equal, or missing.
 

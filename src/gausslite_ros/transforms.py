@@ -1,4 +1,4 @@
-"""The tree of coordinate frames that tf messages state, with poses interpolated in time."""
+"""The coordinate frames that tf messages state, as a tree with poses interpolated in time, in a bag or live."""
 
 from __future__ import annotations
 

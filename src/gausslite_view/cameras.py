@@ -1,4 +1,4 @@
-"""The camera's image for a person: the task's region in red, confirmed objects and detections as named boxes."""
+"""The camera images on a page: keyframes with region and objects, of one robot or a team, at the slider's time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colour Gaussians by what they record: their RGB, kappa, the agent that sent them, or the object that they show."""
+"""What the page shows at one moment: a coloured map at the detail of the browser, with its start view."""
 
 from __future__ import annotations
 

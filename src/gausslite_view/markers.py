@@ -1,4 +1,4 @@
-"""Place the names of objects so that they do not cover each other where the page's camera starts."""
+"""Trajectories, keyframe frusta and named objects in the scene, with names that do not cover each other."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def live_page(
 
 
 @contextmanager
-def own_page(port: int, listen: str, is_agent: bool, tls: Tls | None = None) -> Iterator[None]:
+def service_page(port: int, listen: str, is_agent: bool, tls: Tls | None = None) -> Iterator[None]:
     """Serve the page of a service from its own process and log the page's URL. Raises InvalidInputError."""
     with live_page(port, own_address(listen), is_agent, tls) as url:
         _log.info("the page is at %s", url)

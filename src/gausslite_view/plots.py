@@ -1,4 +1,4 @@
-"""A plot of a service's figures over the last minutes."""
+"""Plots over the last minutes: figures of a service, quality of the map, contributions of a team."""
 
 from __future__ import annotations
 

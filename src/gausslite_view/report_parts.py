@@ -1,4 +1,4 @@
-"""Build HTML and SVG as a tree of elements, so that every text is escaped when the tree is written."""
+"""The tables of the report: results folders, figures with units, tasks, nouns, objects and notes."""
 
 from __future__ import annotations
 

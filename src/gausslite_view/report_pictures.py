@@ -1,4 +1,4 @@
-"""Draw a map from above: a rendering with the camera's path, the objects of the task and a scale."""
+"""The pictures of the report: the map from above, equal views of all runs, bars and lines."""
 
 from __future__ import annotations
 

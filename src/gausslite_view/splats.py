@@ -1,4 +1,4 @@
-"""Choose how many splats one browser draws: more, step by step, as long as its frames stay fast enough."""
+"""Draw the splats: a small set for every new browser, then as many for each browser as it draws fast enough."""
 
 from __future__ import annotations
 

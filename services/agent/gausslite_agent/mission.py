@@ -1,4 +1,4 @@
-"""Run one mission of the agent: map its frames, send the rest to the fusion server, write the results."""
+"""Run one mission of the agent: map its frames, send the rest to the fusion server, write and summarise the results."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ async def _serve(settings: AgentSettings) -> int:
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
         if settings.view is not None:
             live = sibling(Sibling.PAGES)
-            stack.enter_context(live.own_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
+            stack.enter_context(live.service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
         run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
         lost = mission.describe_lost_data()

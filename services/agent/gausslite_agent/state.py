@@ -1,4 +1,4 @@
-"""Save and read an agent's mission: the mapping run, its task and its map revision."""
+"""The state of an agent's mission: its phases, counters and end, and how it is saved and read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Convert figures, layers, frames and views of a mission from and to messages."""
+"""Convert a mission's figures, layers, frames and views to messages, and contributions and exports from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Start the fusion server from the command line; SIGTERM and SIGINT end it after open calls."""
+"""Start the fusion server from the command line, or maintain its store: backup, restore, verify, compact."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
     page: AbstractContextManager[None] = nullcontext()
     if settings.view is not None:
         live = sibling(Sibling.PAGES)
-        page = live.own_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
+        page = live.service_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
     with metrics_server(settings.metrics, engine), page:
         await serve_until_stopped(
             settings.listen, [servicer.service()], work_until_stopped, settings.tls, settings.limits, settings.health

@@ -1,4 +1,10 @@
-"""Fit the exposure of a photograph against the map: a gain and an offset for each colour channel."""
+"""Estimate how far the poses and exposures of a recording are off, and fit the exposure of a photograph to the map.
+
+Pose errors come from pairs of frames that show the same surfaces. One frame is warped into the other by its depth and
+both poses. The pair is as far apart in time as the overlap allows. The other frame's pose and exposure are then fitted
+to the warped image, as they would be to a rendered map. With exact poses and fixed exposure the fit changes nothing;
+otherwise it yields the combined error of both views.
+"""
 
 from __future__ import annotations
 

@@ -7,7 +7,11 @@
 | opacities | u8, centres of 64 bins, so never 0 or 1                       | 1/128                          |
 | rgb       | 3 x u8: luma in steps of 1/64, two chroma differences in 1/32 | 0.0235 from -0.5 to 1.5        |
 
-`positions.py` has the means. A decoder returns the float32 nearest to the code's value.
+A decoder returns the float32 nearest to the code's value.
+
+Positions: a voxel is divided into 2^B cells along each axis, at least so many that a cell is at most half of the
+Gaussian's smallest scale. The high bits of a cell's three indices, interleaved, form a Morton code. The Gaussians of a
+voxel are sorted by it, so only the differences of these codes are stored; the low bits follow as they are.
 """
 
 from __future__ import annotations

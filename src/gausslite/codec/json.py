@@ -1,4 +1,4 @@
-"""Encode an agent's task graph and objects as JSON, for the fusion server's store and for reports."""
+"""Encode task graphs and an agent's objects as JSON, for the store, reports and `gausslite parse --json`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The body of a quantised message: about 8 bytes a Gaussian.
 
-One zstd frame with the columns of `_columns`, its size (u32) before it, then the bit fields of `positions.py`. The
+One zstd frame with the columns of `_columns`, its size (u32) before it, then the bit fields of the positions. The
 Gaussians of a voxel are sorted by position and, in one coarse cell, by kappa. Neighbours are then alike, so the first
 scale, the colours and kappa are stored as differences to the Gaussian before. The other two scales are stored as
 differences to the first. All differences wrap at the range of their type.
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gausslite.codec import columns
-from gausslite.codec import columns as positions
 from gausslite.codec.body_layout import (
     MAX_LABEL_BYTES,
     VOXEL_BYTES,
@@ -36,7 +35,7 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 __all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
 
 _SYMBOL_BYTES = 1 + 3 + 1 + 3 + 1 + 3
-_MAX_BIT_FIELD_BYTES = (3 * positions.MAX_FINE_BITS + 7) // 8
+_MAX_BIT_FIELD_BYTES = (3 * columns.MAX_FINE_BITS + 7) // 8
 MAX_GAUSSIAN_BYTES = _SYMBOL_BYTES + _MAX_BIT_FIELD_BYTES + MAX_LABEL_BYTES
 """Upper limit before compression."""
 _FRAME_SIZE = struct.Struct("<I")
@@ -48,12 +47,12 @@ def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
     scales = columns.encode_scales(batch.gaussians.scales_m)
     bits = layout.precision.bits(scales)
     voxel = np.repeat(grid.indices(batch.keys), batch.counts, axis=0)
-    cells = positions.cells_of(batch.gaussians.means_m, voxel, bits, grid)
-    codes = positions.morton_codes(cells, bits, coarse_bits)
+    cells = columns.cells_of(batch.gaussians.means_m, voxel, bits, grid)
+    codes = columns.morton_codes(cells, bits, coarse_bits)
     order = np.lexsort((batch.gaussians.kappa, codes, np.repeat(np.arange(len(batch)), batch.counts)))
     gaussians, scales = batch.gaussians.take(order), scales[order]
     starts = batch.offsets[:-1][batch.counts > 0]
-    lengths, packed = positions.encode_positions(cells[order], codes[order], bits[order], starts, coarse_bits)
+    lengths, packed = columns.encode_positions(cells[order], codes[order], bits[order], starts, coarse_bits)
     largest, others = columns.encode_quats(gaussians.quats_wxyz, columns.quat_steps(scales))
     frame = compress_columns(
         [
@@ -81,10 +80,10 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
     scales = _scale_codes(first, second, third)
     bits, steps = layout.precision.bits(scales), columns.quat_steps(scales)
     starts = offsets[:-1][counts > 0]
-    cells = positions.decode_positions(lengths, packed, bits, starts, layout.precision.coarse_bits)
+    cells = columns.decode_positions(lengths, packed, bits, starts, layout.precision.coarse_bits)
     active, kappa, target = decode_labels(labels)
     gaussians = Gaussians(
-        means_m=positions.centres_of(cells, np.repeat(grid.indices(keys), counts, axis=0), bits, grid),
+        means_m=columns.centres_of(cells, np.repeat(grid.indices(keys), counts, axis=0), bits, grid),
         quats_wxyz=columns.decode_quats(largest, np.stack(rest[:3], axis=1), steps),
         scales_m=columns.decode_scales(scales),
         opacities=columns.decode_opacities(rest[3]),

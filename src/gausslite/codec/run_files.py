@@ -1,4 +1,4 @@
-"""Write and read the camera views of a mission's keyframes: keyframes.json in the results folder."""
+"""Write and read the files beside a map: views of its keyframes, their photographs, and its earlier states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Store named arrays in one checked file: a mapping run on disk between two processes, bit for bit.
+"""Write files atomically: named arrays in one checked file, a mapping run bit for bit, and PNG images.
 
 The file is a safetensors file. Its metadata holds the format's name, its version and a CRC-32 over the names, types,
 shapes and bytes of all arrays. safetensors compares all sizes with the file's before it allocates memory, and the

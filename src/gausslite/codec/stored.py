@@ -1,10 +1,14 @@
-"""Encode free space at two bits a voxel before compression: blocks of 512 voxels, zstd, CRC32C.
+"""Encode what stores and spools keep: exact rows of Gaussians, rows of a voxel, and blocks of free space.
 
     header   "GLFS" | u16 version | u32 blocks | u32 body bytes | f64 voxel size
     body     one zstd frame: block keys i64, then 128 bytes a block, four voxels a byte, the first in the low bits
     trailer  u32 CRC32C of everything before it
 
 The number of blocks determines the size of the body, so a wrong message is refused before memory is allocated.
+
+Gaussians that arrived in quantised messages are stored as the codes of `codec/columns.py`, about 19 bytes each. A row
+begins with the voxel size (float64, little-endian), then has one element of CODES per Gaussian. A voxel with any value
+that such a row would change has exact rows of 63 bytes instead; the lengths tell the two apart.
 """
 
 from __future__ import annotations
@@ -23,7 +27,6 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec import columns
-from gausslite.codec import columns as positions
 from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError, StorageError
 from gausslite.domain.free_space import BLOCK_VOXELS, FreeSpace
 from gausslite.domain.gaussians import Gaussians
@@ -194,7 +197,7 @@ def _codes_of(batch: VoxelBatch, grid: VoxelGrid) -> NDArray[Any]:
     gaussians = _encodable(batch.gaussians)
     codes = np.empty(len(gaussians), CODES)
     voxel = np.repeat(grid.indices(batch.keys), batch.counts, axis=0)
-    codes["fractions"] = positions.fractions_of(gaussians.means_m, voxel, grid)
+    codes["fractions"] = columns.fractions_of(gaussians.means_m, voxel, grid)
     codes["scales"] = columns.encode_scales(gaussians.scales_m)
     largest, codes["quats"] = columns.encode_quats(gaussians.quats_wxyz, columns.quat_steps(codes["scales"]))
     codes["largest_and_opacity"] = largest << _OPACITY_BITS | columns.encode_opacities(gaussians.opacities)
@@ -212,7 +215,7 @@ def _decode(
     voxel = np.repeat(grid.indices(keys), counts, axis=0)
     scales, packed, label = codes["scales"], codes["largest_and_opacity"], codes["active_and_target"]
     return Gaussians(
-        means_m=positions.points_of(codes["fractions"], voxel, grid),
+        means_m=columns.points_of(codes["fractions"], voxel, grid),
         quats_wxyz=columns.decode_quats(packed >> _OPACITY_BITS, codes["quats"], columns.quat_steps(scales)),
         scales_m=columns.decode_scales(scales),
         opacities=columns.decode_opacities(packed & (1 << _OPACITY_BITS) - 1),

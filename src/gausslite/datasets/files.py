@@ -1,4 +1,4 @@
-"""Read and resize colour and depth images; reject damaged files by name."""
+"""Read the images, camera files and text files of a sequence; each error names the file."""
 
 from __future__ import annotations
 

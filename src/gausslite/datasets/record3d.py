@@ -1,4 +1,9 @@
-"""Read recordings of the app Record3D (iPhone and iPad): an .r3d file, or the folder that it unzips to."""
+"""Read recordings of the app Record3D (iPhone and iPad): an .r3d file, or the folder that it unzips to.
+
+The metadata is JSON. Sources: the app's author in the issues of github.com/marek-simonik/record3d: 27, 33 and 36
+(poses), 83 and 99 (intrinsics of each frame), 93 (files) and 108 (depth is aligned to colour, whose intrinsics these
+are).
+"""
 
 from __future__ import annotations
 

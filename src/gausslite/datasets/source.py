@@ -1,4 +1,4 @@
-"""The protocol of every sequence of posed RGB-D frames."""
+"""The protocol of every sequence of posed RGB-D frames, and the choice of its frames for training and test."""
 
 from __future__ import annotations
 

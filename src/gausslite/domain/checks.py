@@ -1,4 +1,4 @@
-"""Check the types of arguments of the Python API: errors name the argument, what was expected and what was received."""
+"""Check values that come from outside: arguments of the Python API, names of agents, missions, frames and nouns."""
 
 from __future__ import annotations
 

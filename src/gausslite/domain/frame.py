@@ -1,4 +1,4 @@
-"""One posed RGB-D image, validated on construction."""
+"""One posed RGB-D image, validated on construction, with its colours, depth jumps and encoded sizes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A set of Gaussians as columns of physical values; raw log-scales and logits live only in `optimize`."""
+"""A set of Gaussians as columns of physical values, with choices of the most important ones and rigid motions."""
 
 from __future__ import annotations
 

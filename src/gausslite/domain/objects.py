@@ -1,4 +1,4 @@
-"""The objects of a task in world coordinates: what one agent reports, and what a team has merged from its reports."""
+"""The objects of a task in world coordinates, their names, and what a detector searches for each noun."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rigid transforms as 4x4 matrices, where `T_a_b` maps points of frame b to frame a; and the up axis of a world."""
+"""Rigid transforms as 4x4 matrices, where `T_a_b` maps points of frame b to frame a; trajectories; corrections."""
 
 from __future__ import annotations
 

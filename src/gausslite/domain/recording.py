@@ -1,4 +1,4 @@
-"""How recorded images differ from those of an ideal camera: lens, rolling shutter, time offset and exposure time."""
+"""What a recording may leave open: lens and times of its camera, registration of its depth, errors of its poses."""
 
 from __future__ import annotations
 

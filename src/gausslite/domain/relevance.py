@@ -1,4 +1,4 @@
-"""Detections, and the per-pixel relevance w(u, v) of a frame to the task."""
+"""The relevance w(u, v) of each pixel to the task, the detections it comes from, and ground-truth regions of space."""
 
 from __future__ import annotations
 
@@ -128,6 +128,7 @@ class Detection:
     """One detected object in one image. box_px is (left, top, right, bottom). rival: None without another class.
 
     is_weak: the score is below the detector's threshold. It supports an object that other frames found, nothing else.
+    is_exact: the mask is ground truth, not a network's.
     """
 
     phrase: str
@@ -136,6 +137,7 @@ class Detection:
     mask: Bool[ndarray, "h w"]
     rival: Rival | None = None
     is_weak: bool = False
+    is_exact: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""State of a component as named arrays, for saving and restoring it independently of the file format."""
+"""State of a component as named arrays, saved and restored independently of the file format."""
 
 from __future__ import annotations
 

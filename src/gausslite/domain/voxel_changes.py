@@ -1,4 +1,4 @@
-"""Find the voxels whose Gaussians changed between two states of a map, without a copy of the earlier state."""
+"""Find the voxels that changed: between two states of a map, since a revision, or between agent and server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The voxel grid, unit of the fusion vote and the uplink (Sec. III-E), boxes, and the votes of a voxel."""
+"""The voxel grid, unit of the fusion vote and the uplink (Sec. III-E), and batches of complete voxels."""
 
 from __future__ import annotations
 

@@ -3,6 +3,10 @@
 Each view has its own PSNR, SSIM and depth error; ROI figures use the region's pixels of that view. The score of a map
 is the mean over its views. Views with fewer than MIN_ROI_PIXELS region pixels count for the whole image only. PSNR is
 capped at MAX_PSNR_DB. SSIM is the single-scale variant.
+
+A robot plans in the map with T_map_odometry · (its odometry's pose). So views are also scored from the odometry's pose
+after the published correction. It comes from the mapped frames around a held-out view, or from the last one before it;
+the view's own image is not used.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Image metrics: PSNR, single-scale SSIM and depth error, over all pixels or inside a mask."""
+"""Metrics of images and trajectories: PSNR, single-scale SSIM, depth error, sharpness and trajectory error."""
 
 from __future__ import annotations
 

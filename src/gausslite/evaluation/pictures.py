@@ -1,4 +1,4 @@
-"""Comparison images: ground truth next to each map's rendering, details of the region, and difference images."""
+"""Comparison images of maps and photographs: renderings, details of the region, differences, and the preview."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Held-out views with the mask of the task's region, and rendering of a finished map from any pose."""
+"""Render a finished map from any pose, and score it on held-out views, also after fitting their pose and exposure.
+
+Poses of real cameras have errors and exposures differ between frames. Without fitting, a sharp map rendered from a
+slightly wrong pose scores below a blurred map. The raw score includes pose errors; the fitted score measures the map.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delete what the mission holds of an agent, and keep the map of a robot that begins anew until it is outgrown."""
+"""Delete what the mission holds of an agent, estimate its frame, and keep its earlier map until it is outgrown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The motion from each agent's frame to the fused map's, with its state: as sent, aligned, corrected, quarantined."""
+"""The motion from each agent's frame to the fused map's, with its state: as sent, aligned, corrected, quarantined.
+
+The agent that contributes first defines the fused frame, unless it declares another one. Each later agent is compared
+with the agents before it. Odometry drifts, so the motion is a sequence of segments: an estimate from the agent's
+updates since the last one applies to these updates and to later ones.
+"""
 
 from __future__ import annotations
 

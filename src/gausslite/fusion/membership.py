@@ -1,4 +1,4 @@
-"""Decide who takes part in a mission: its configuration, the sessions, the bans and the number of agents."""
+"""Decide who takes part in a mission: its configuration, sessions under a lease, bans and the number of agents."""
 
 from __future__ import annotations
 

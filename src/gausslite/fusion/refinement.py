@@ -1,4 +1,4 @@
-"""Refine the fused map by a short joint optimisation on all agents' keyframes (Sec. III-E).
+"""Refine the fused map by a short joint optimisation on all agents' keyframes (Sec. III-E), and render it.
 
 The fused map usually holds only the task's voxels. So a keyframe is compared only with pixels that the map explains:
 inside the footprint of the fused map, and not where the measured surface occludes it.

@@ -1,4 +1,4 @@
-"""The figures of a mission and of its agents: messages, stored data, voxels won."""
+"""The figures of a mission and of its agents: messages, stored data, voxels won, and whether the store can write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Check what an agent states about its updates: Σkappa is computed, kappa and sequence numbers are bounded."""
+"""The way of an update into the store: checked, queued with a fair share for each agent, committed in groups."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The voxel updates as the vote reads them: in the fused map's frame, without quarantined agents."""
+"""The voxel updates as the vote reads them, in the fused frame without quarantined agents; what agents saw as free."""
 
 from __future__ import annotations
 

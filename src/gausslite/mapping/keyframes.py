@@ -1,4 +1,4 @@
-"""Frames to train on: a keyframe with its relevance, and its view prepared for the rasterizer (Sec. III-D.2, MVO)."""
+"""Keyframes with their relevance (Sec. III-D.2, MVO): the window to train on, and the buffer for joint refinement."""
 
 from __future__ import annotations
 

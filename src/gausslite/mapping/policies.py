@@ -1,4 +1,13 @@
-"""Named mapping policies (task, paper, uniform and the baselines), and the flags that disable their parts."""
+"""Named mapping policies (task, paper, uniform and the baselines), and the flags that disable their parts.
+
+A baseline follows no task; seeding, scales, loss weights and density control are those of its system's released
+configuration. Everything else is common to all policies: Adam's rates (ONLINE_RATES), the density limit of seeds near
+the cap, clone and split that preserve appearance, pose refinement, and the views to train on. With so few iterations,
+the released rates would lose several decibels. The task policy trains on the 24 most recent keyframes and 24 frames
+that show the ROI; the baselines train on the 24 most recent keyframes and 24 others, spread over the mission. Two
+values were tuned in the baselines' favour (bench/results): the initial scale of MonoGS and the number of SplaTAM's
+seeds.
+"""
 
 from __future__ import annotations
 

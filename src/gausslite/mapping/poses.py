@@ -1,4 +1,4 @@
-"""The pose of every mapped frame, by the odometry and in the map, and the mean correction between them."""
+"""The pose of every mapped frame, by the odometry and as refined against the map, with the correction between them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ORB features of a frame with their 3D points, and the pose between two frames from matched features (OpenCV)."""
+"""Track the camera against the map: predict its pose, align it, detect a loss, and recover from matched features."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Choose which voxels leave the robot: in the task's region, and changed since they were sent."""
+"""Exchange voxels with the team: send changed ones of the task's region, insert those that others trained more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Record how the map grows during a mission, for the scrub over time of the live view."""
+"""What happens over a mission's time: tasks that change at known frames, the map's states, and a row for each frame."""
 
 from __future__ import annotations
 

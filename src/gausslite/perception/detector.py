@@ -169,7 +169,7 @@ class RegionDetector:
                     masks[name] = self._regions[name].mask(frame)
                 box = bounding_box(masks[name])
                 if box is not None:
-                    found.append(Detection(query, 1.0, box, masks[name]))
+                    found.append(Detection(query, 1.0, box, masks[name], is_exact=True))
         return found
 
     def _names(self, query: str) -> tuple[str, ...]:

@@ -60,10 +60,13 @@ def lift_detections(
 def _object_mask(
     detection: Detection, depth_m: Float32[ndarray, "h w"], camera: Camera, settings: LiftingSettings
 ) -> Bool[ndarray, "h w"]:
-    """Return a detection's mask in its depth layer: filled if its kind is convex, else without background planes."""
+    """Return a detection's mask in its depth layer: filled if its kind is convex, else without background planes.
+
+    An exact mask is not filled: in the demo, the vote's region would lose 0.7 dB.
+    """
     mask = foreground_mask(detection.mask, depth_m, settings)
     if is_convex(detection.phrase):
-        return filled_outline(mask, depth_m, settings)
+        return mask if detection.is_exact else filled_outline(mask, depth_m, settings)
     return without_background_planes(mask, depth_m, camera, settings)
 
 

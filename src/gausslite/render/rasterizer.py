@@ -28,6 +28,8 @@ the velocity -(v + w x p). Its image crosses rows at s px/s, and is recorded whe
 A backend does not render invalid rows: those with a non-finite value in columns 0-13, a quaternion of length zero, or
 an ellipse that is not finite in the backend's precision. A row is visible if the bounding box of its ellipse alpha >=
 1/255 contains the centre of at least one rendered pixel.
+
+Rows hold scales as logarithms and opacities as logits; outside this package and `mapping`, values are physical.
 """
 
 from __future__ import annotations

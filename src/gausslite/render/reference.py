@@ -1,4 +1,4 @@
-"""Blend ellipses front to back, one tile at a time, to bound the memory (3DGS, Kerbl et al. 2023)."""
+"""The reference backend in torch: checks, projection, compositing, the loss of Eq. (1), Adam."""
 
 from __future__ import annotations
 

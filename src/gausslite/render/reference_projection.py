@@ -1,4 +1,4 @@
-"""The image of a moving camera: rows exposed one after the other, each for a while; differentiable, on any device."""
+"""Project rows to ellipses in the image (EWA splatting), also of a moving camera; differentiable, on any device."""
 
 from __future__ import annotations
 

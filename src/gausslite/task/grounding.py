@@ -1,4 +1,4 @@
-"""Build a task graph from a parser's answer, and drop everything that the sentence does not mention."""
+"""Turn a parser's answer into a task graph with named objects, without what the sentence does not mention."""
 
 from __future__ import annotations
 

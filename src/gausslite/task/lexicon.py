@@ -1,4 +1,4 @@
-"""Word lists of the rule parser: determiners, adverbs, adjectives, negations, and nouns that name no object."""
+"""Word lists of the rule parser: nouns, attributes, adverbs, negations, nouns that name no object; plurals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of one clause while its chunks are processed, and the test whether a noun names an object."""
+"""Assign each noun of a clause its role, or the relation by which it locates another noun."""
 
 from __future__ import annotations
 

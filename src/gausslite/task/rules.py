@@ -1,4 +1,4 @@
-"""Parse tasks by rules: deterministic, without a model or a network, in less than a millisecond."""
+"""Parse tasks by rules, without a model or a network, in less than a millisecond; or choose another parser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Part-of-speech tags, and the tag sequence of least cost for a sentence (Viterbi)."""
+"""Choose the part of speech of each word: its possible tags with costs, then the sequence of least cost (Viterbi)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Find distances such as "within 2 m of" and "half a metre behind", and replace each by one marker word."""
+"""Split a sentence into lexical units: words, prepositions, negations, distances, and idioms as plain phrases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One connection to a service: deadlines, retries of idempotent calls, message limits and encryption."""
+"""One connection to a service: address, deadlines, retries of idempotent calls, limits, encryption and health."""
 
 from __future__ import annotations
 

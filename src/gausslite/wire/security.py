@@ -1,4 +1,4 @@
-"""Limit what one caller takes of a server: open calls and bandwidth; and the connections of all callers together."""
+"""Who may call and how much: certificates, roles, limits of calls, bandwidth and connections, a log of refusals."""
 
 from __future__ import annotations
 

@@ -7,6 +7,9 @@ a SQLite file that survives a restart; otherwise it is in memory.
 
 Updates and keyframes share one bandwidth: the highest value per byte is sent first. The value of an update is the
 change of Σkappa, the number of optimiser updates that the server lacks. The value of a keyframe has the same unit.
+
+All keyframes that the agent has selected stay in the spool, also after they were sent. A server may lose its data, and
+a restarted agent needs the list of its selected keyframes. The agent limits their number.
 """
 
 from __future__ import annotations

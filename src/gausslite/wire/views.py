@@ -1,4 +1,4 @@
-"""What a robot sees, for a person: the newest keyframe with its region, and the camera's path, as a message."""
+"""Views of a mission for a person, as messages: the newest keyframe with its region, and a stored one of an agent."""
 
 from __future__ import annotations
 

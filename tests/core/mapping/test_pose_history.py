@@ -12,7 +12,6 @@ from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import CorrectionTrack, inverse, transform_of, translation_m, twist_of
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.mapping import poses as pose_history
 from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
 from gausslite.render.rasterizer import Rendering
 
@@ -67,7 +66,7 @@ def test_the_uncertainty_is_the_change_between_successive_frames() -> None:
 
 
 def test_a_long_mission_keeps_the_newest_poses_and_thins_older_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pose_history, "_MAX_POSES", 20)
+    monkeypatch.setattr("gausslite.mapping.poses._MAX_POSES", 20)
     history = PoseHistory()
     for index in range(100):
         history.record(odometry(index), shift(0.01))

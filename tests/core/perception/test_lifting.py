@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -207,6 +209,8 @@ def test_what_a_convex_object_holds_belongs_to_it():
     ((lifted, _),) = lift_detections([found], depth_m, frame, RelevanceTrackerSettings())
     assert lifted.mask[whole].mean() > 0.98
     assert not lifted.mask[~whole].any()
+    ((exact, _),) = lift_detections([replace(found, is_exact=True)], depth_m, frame, RelevanceTrackerSettings())
+    assert np.array_equal(exact.mask, mask)
 
 
 def test_what_is_behind_or_in_front_of_a_convex_object_is_left_out():

@@ -1,4 +1,4 @@
-"""The gsplat operations of this backend, and an emulation in torch for machines without a GPU.
+"""The gsplat operations of this backend and the projection of rows, with an emulation for machines without a GPU.
 
 gsplat (Ye et al. 2025, Apache-2.0) compiles its kernels for CUDA only. Its torch versions of the two projection steps
 run on the CPU. The emulation replaces sorting and compositing by those of the reference backend, with gsplat's two
