@@ -6,6 +6,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 from jaxtyping import install_import_hook
 from support.postgres_running import PostgresServer, postgres_server
@@ -16,6 +17,10 @@ install_import_hook(
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 
+
+# a busy machine is no failure: no test depends on a time
+hypothesis.settings.register_profile("untimed", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+hypothesis.settings.load_profile("untimed")
 
 # a shell starts background jobs with SIGINT ignored; the tests of interrupts need Python's handler
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -118,7 +118,7 @@ def test_a_missing_map_is_a_map_file_error(tmp_path: Path) -> None:
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_a_flipped_byte_raises_only_map_file_error(data: st.DataObject) -> None:
     file = bytearray(ply_bytes(random_gaussians(2)))
     for _ in range(data.draw(st.integers(1, 3))):

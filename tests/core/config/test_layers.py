@@ -248,7 +248,7 @@ def test_a_child_process_inherits_no_option_variables() -> None:
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.one_of(TEXTS, st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.lists(TEXTS)))
 def test_tomllib_reads_what_to_toml_writes(value: str | bool | int | float | list[str]) -> None:
     assert tomllib.loads(to_toml({"a-key": value, "unset": None})) == {"a-key": value}

@@ -36,7 +36,7 @@ def make_batch(counts: dict[int, int]) -> VoxelBatch:
     return VoxelBatch(np.array(sorted(counts), np.int64), per_voxel.astype(np.uint64), per_voxel, gaussians)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(STEPS)
 def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
     store = MemoryStore()

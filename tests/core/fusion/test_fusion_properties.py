@@ -61,7 +61,7 @@ WORDS = st.tuples(
 """(voxel, kappa) of few Gaussians in few voxels, so that ties are common; tombstone voxels; a seed."""
 TABLES = st.dictionaries(st.sampled_from(AGENTS), WORDS, max_size=4)
 HISTORIES = st.dictionaries(st.sampled_from(AGENTS), st.lists(WORDS, max_size=4), max_size=4)
-few_examples = settings(max_examples=40, deadline=None)
+few_examples = settings(max_examples=40)
 
 
 def batch_from(spec: Spec) -> VoxelBatch:

@@ -52,7 +52,7 @@ def test_a_large_message_does_not_delay_the_messages_of_other_agents() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 3 * SLICE_VOXELS)), max_size=12), st.integers(1, 9000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tuple[str, int]], group: int) -> None:
     queue = UpdateQueue()
     updates = [PendingUpdate("", many_tombstones(name, voxels)) for name, voxels in messages]

@@ -200,7 +200,7 @@ def timings_with_view_costs(views_s: list[float], deadline_slack: float = SLACK_
     return [run_frame(scheduler, clock, {**costs, Stage.VIEW_PREPARATION: view_s})[0] for view_s in views_s]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.lists(st.floats(0.0, 3 * FRAME_S), min_size=1, max_size=8), st.floats(0.0, 1.0))
 def test_frames_overrun_by_the_deadline_slack_at_most(views_s: list[float], deadline_slack: float) -> None:
     behind_s = 0.0
@@ -211,7 +211,7 @@ def test_frames_overrun_by_the_deadline_slack_at_most(views_s: list[float], dead
         behind_s = min(max(0.0, behind_s + timing.seconds - FRAME_S), deadline_slack * FRAME_S)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.data())
 def test_no_frame_is_under_trained_if_the_time_suffices_over_a_few_frames(data: st.DataObject) -> None:
     behind_s, views_s = 0.0, []
@@ -298,7 +298,6 @@ def test_a_stage_that_was_slow_once_is_tried_again() -> None:
         assert frames < 40
 
 
-@settings(deadline=None)
 @given(st.sampled_from(STAGES_OF_RUN_FRAME), st.floats(1.0, 1e6))
 def test_one_stall_of_the_machine_does_not_cost_later_frames_their_iterations(stalled: Stage, frames: float) -> None:
     clock, costs = WorkClock(), {**CHEAP, Stage.WARM_UP: ITERATION_S, Stage.ACTIVE: ITERATION_S}

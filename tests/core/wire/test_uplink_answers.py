@@ -169,7 +169,7 @@ ENQUEUED_BATCHES = st.lists(
 
 
 @given(enqueued=ENQUEUED_BATCHES, faults=FAULTS, together=st.booleans())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_after_any_losses_the_server_has_the_latest_updates(
     enqueued: list[dict[int, list[int]]], faults: list[str], together: bool
 ) -> None:

@@ -28,7 +28,7 @@ KNOWN = {
     grpc.StatusCode.RESOURCE_EXHAUSTED,
     grpc.StatusCode.DATA_LOSS,
 }
-fuzz = settings(max_examples=50, deadline=None)
+fuzz = settings(max_examples=50)
 
 
 @dataclass(frozen=True)
