@@ -150,7 +150,6 @@ def _known_coefficients(location: str, coefficients: list[float]) -> list[float]
 
 
 _MILLIMETRES_PER_METRE = 1000.0
-_SUFFIX_BYTES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
 _DEPTH_HEADER = struct.Struct("<iff")
 """compressedDepth: a format number and the two quantisation parameters stand before the PNG."""
 
@@ -244,7 +243,7 @@ def decode_depth(
 
 def decode_compressed_colour(location: str, message: CompressedImageMessage) -> UInt8[ndarray, "h w 3"]:
     """Return a JPEG or PNG image as RGB. Raises DatasetError with the location."""
-    image = _decode(location, bytes(message.data), cv2.IMREAD_COLOR)
+    image = decode_image(location, bytes(message.data), cv2.IMREAD_COLOR)
     if image.dtype != np.uint8:
         raise DatasetError(f"{location}: expected an image of 8 bits per channel, got {image.dtype}")
     encoding = message.format.partition(";")[0].strip()
@@ -300,15 +299,8 @@ def _pixels(location: str, message: ImageMessage, dtype: np.dtype[Any], channels
     return pixels.reshape((height, width, channels) if channels > 1 else (height, width))
 
 
-def _decode(location: str, data: bytes, flags: int) -> NDArray[Any]:
-    suffix = next((suffix for start, suffix in _SUFFIX_BYTES.items() if data.startswith(start)), None)
-    if suffix is None:
-        raise DatasetError(f"{location}: data: expected a JPEG or a PNG, got other bytes")
-    return decode_image(location, data, suffix, flags)
-
-
 def _decode_16_bit(location: str, data: bytes) -> NDArray[Any]:
-    image = _decode(location, data, cv2.IMREAD_UNCHANGED)
+    image = decode_image(location, data, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise DatasetError(
             f"{location}: expected a 16-bit PNG of one channel, got {image.dtype} of shape {image.shape}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,10 +21,11 @@ from gausslite.domain.checks import require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import image_size
 
-_ENDINGS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
-_ENDING_WINDOW_BYTES = 64
 _MAX_IMAGE_PX = 1 << 26
-_PNG_START = 8
+_PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\x01\xd0-\xd7])", re.DOTALL)
+"""The start of a JPEG segment; other bytes after FF belong to compressed pixels."""
+_JPEG_START, _JPEG_END = b"\xd8", b"\xd9"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,37 +142,53 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
         raise DatasetError(f"{path}: expected an image, got none") from None
     except OSError as error:
         raise DatasetError(f"{path}: expected a readable image, got {type(error).__name__}") from None
-    return decode_image(str(path), data, path.suffix.lower(), flags)
+    return decode_image(str(path), data, flags)
 
 
-def decode_image(location: str, data: bytes, suffix: str, flags: int) -> NDArray[Any]:
-    """Return an encoded image as OpenCV decodes it with these flags; suffix: ".png", ".jpg", ".jpeg", or another.
+def decode_image(location: str, data: bytes, flags: int) -> NDArray[Any]:
+    """Return a PNG or JPEG as OpenCV decodes it with these flags; bytes after the image's end are ignored.
 
-    Size and checksums are checked before memory is taken. Raises DatasetError with the location.
+    The pixels are those stored, without the turn that EXIF may state: depth, intrinsics and pose belong to them. Size
+    and checksums are checked before memory is taken. Raises DatasetError with the location.
     """
-    # decoders fill a truncated file with grey without an error, so check the end marker first
-    ending = _ENDINGS.get(suffix, b"")
-    if ending not in data[-_ENDING_WINDOW_BYTES:]:
-        raise DatasetError(f"{location}: expected a whole image file, got one cut short or of another format")
-    _require_undamaged(location, data, suffix)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if not data.startswith((_PNG_MAGIC, _JPEG_MAGIC)):
+        raise DatasetError(f"{location}: expected a PNG or JPEG image, got another format")
+    size_px = image_size(data)
+    if size_px is not None:
+        require_pixel_count(location, *size_px)
+    # decoders fill a truncated file with grey without an error, so look for the end first
+    is_whole = _is_whole_png(location, data) if data.startswith(_PNG_MAGIC) else _is_whole_jpeg(data)
+    if size_px is None or not is_whole:
+        raise DatasetError(f"{location}: expected a whole image file, got one cut short")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DatasetError(f"{location}: expected an image, got bytes that cannot be decoded")
     return np.asarray(image)
 
 
-def _require_undamaged(location: str, data: bytes, suffix: str) -> None:
-    """Raise DatasetError for an image too large for memory, or a PNG with a wrong checksum, on which libpng prints."""
-    size_px = image_size(data)
-    if size_px is None:
-        raise DatasetError(f"{location}: expected a PNG or JPEG image, got another format")
-    require_pixel_count(location, *size_px)
-    position = _PNG_START if suffix == ".png" else len(data)
+def _is_whole_png(location: str, data: bytes) -> bool:
+    """Return True if the end chunk is there. Raises DatasetError for a wrong checksum, on which libpng prints."""
+    position = len(_PNG_MAGIC)
     while position + 12 <= len(data):
         end = position + 8 + int.from_bytes(data[position : position + 4], "big")
+        if end + 4 > len(data):
+            return False
         if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise DatasetError(f"{location}: expected an undamaged image, got one whose checksum is wrong")
+        if data[position + 4 : position + 8] == b"IEND":
+            return True
         position = end + 4
+    return False
+
+
+def _is_whole_jpeg(data: bytes) -> bool:
+    """Return True if the segments lead to the end marker; images inside a segment, such as thumbnails, do not count."""
+    position = len(_JPEG_MAGIC)
+    while marker := _JPEG_MARKER.search(data, position):
+        if marker.group(1) in (_JPEG_START, _JPEG_END):
+            return marker.group(1) == _JPEG_END
+        position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
+    return False
 
 
 def require_pixel_count(location: str, width_px: int, height_px: int) -> None:

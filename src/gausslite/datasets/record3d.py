@@ -297,7 +297,7 @@ class Record3dSource(FolderSource):
         require_position(self.name, i, len(self))
         number = self._numbers[i]
         name = f"rgbd/{number}.jpg"
-        bgr = decode_image(self._files.path_of(name), self._files.read(name), ".jpg", cv2.IMREAD_COLOR)
+        bgr = decode_image(self._files.path_of(name), self._files.read(name), cv2.IMREAD_COLOR)
         camera = self._metadata.camera_at(f"{self._metadata_path}: perFrameIntrinsicCoeffs {number}", number)
         if bgr.shape[:2] != (camera.height_px, camera.width_px):
             expected = f"{camera.width_px}x{camera.height_px}"

@@ -133,7 +133,7 @@ def write_bytes(name: str, data: bytes) -> Callable[[Path], None]:
         (edit_metadata(dw=31), r"0.depth: expected 2976 bytes, compressed with LZFSE, got 3072 bytes"),
         (edit_metadata(w=62), "0.jpg: expected the size in metadata, 62x48, got 64x48"),
         (write_bytes("rgbd/0.depth", b"abc"), "0.depth: expected 3072 bytes.* got bytes of another format"),
-        (write_bytes("rgbd/0.jpg", b"abc"), "0.jpg: expected a whole image file"),
+        (write_bytes("rgbd/0.jpg", b"abc"), "0.jpg: expected a PNG or JPEG image, got another format"),
     ],
 )
 def test_a_damaged_record3d_recording_gives_one_line(
