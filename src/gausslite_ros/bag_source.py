@@ -256,10 +256,11 @@ class BagSource:
         return None
 
     @property
-    def excluded_frames(self) -> str:
+    def notes(self) -> tuple[str, ...]:
         """Message on the colour images without depth or pose at their stamp."""
         reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
-        return excluded_frames_note(self._recorded - len(self), self._recorded, reason)
+        note = excluded_frames_note(self._recorded - len(self), self._recorded, reason)
+        return (note,) if note else ()
 
     def __len__(self) -> int:
         return len(self._matches)

@@ -90,16 +90,6 @@ def float_field(message: Any, lower_case_name: str) -> Sequence[float]:
     return [float(value) for value in values]
 
 
-_LENS_COEFFICIENTS = 8
-_SDK_MODELS = {
-    "brown conrady": "plumb_bob",
-    "modified brown conrady": "plumb_bob",
-    "inverse brown conrady": "plumb_bob",
-    "kannala brandt4": "equidistant",
-}
-"""The camera's own ROS driver publishes these models under these names."""
-
-
 def camera_of(location: str, info: Any, image_topic: str) -> FolderCamera:
     """Return the camera of a topic's images, and its lens if they are distorted.
 
@@ -107,13 +97,13 @@ def camera_of(location: str, info: Any, image_topic: str) -> FolderCamera:
     projection matrix P describes them, without distortion. Binning and region of interest of the message are applied.
     Raises DatasetError with the location.
     """
+    fx = fy = cx = cy = 0.0
+    lens = None
     if _is_rectified(image_topic):
         values = float_field(info, "p")
         fx, cx, fy, cy = (values[i] for i in (0, 2, 5, 6)) if len(values) == 12 else (0.0,) * 4
-        coefficients: list[float] = []
     else:
-        fx = fy = cx = cy = 0.0
-        coefficients = list(float_field(info, "d"))
+        lens = lens_of(location, str(info.distortion_model), float_field(info, "d"))
     if fx == 0.0:
         values = float_field(info, "k")
         if len(values) != 9 or values[0] == 0.0:
@@ -126,27 +116,11 @@ def camera_of(location: str, info: Any, image_topic: str) -> FolderCamera:
     intrinsics = FileIntrinsics(
         fx / binning[0], fy / binning[1], (cx + 0.5) / binning[0] - 0.5, (cy + 0.5) / binning[1] - 0.5
     )
-    lens = lens_of(location, _model_name(str(info.distortion_model)), _known_coefficients(location, coefficients))
     return FolderCamera(intrinsics.camera(location, size[0] // binning[0], size[1] // binning[1]), lens=lens)
 
 
 def _is_rectified(image_topic: str) -> bool:
     return any(part.startswith("image_rect") for part in image_topic.split("/"))
-
-
-def _model_name(name: str) -> str:
-    """Return ROS's name of a distortion model, also for the names of the RealSense SDK."""
-    return _SDK_MODELS.get(name.lower().replace("_", " "), name)
-
-
-def _known_coefficients(location: str, coefficients: list[float]) -> list[float]:
-    """Return at most 8 coefficients; OpenCV's further ones (thin prism, tilt) must be zero."""
-    if any(coefficients[_LENS_COEFFICIENTS:]):
-        raise DatasetError(
-            f"{location}: expected a lens of at most {_LENS_COEFFICIENTS} coefficients, got {len(coefficients)}; "
-            "rectify the images with image_proc, and use image_rect_color"
-        )
-    return coefficients[:_LENS_COEFFICIENTS]
 
 
 _MILLIMETRES_PER_METRE = 1000.0

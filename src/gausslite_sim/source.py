@@ -121,9 +121,9 @@ class SimulatedHome:
         return None
 
     @property
-    def excluded_frames(self) -> str:
+    def notes(self) -> tuple[str, ...]:
         """Empty: every frame is used."""
-        return ""
+        return ()
 
     def __len__(self) -> int:
         return self._settings.frames

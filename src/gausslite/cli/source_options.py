@@ -63,15 +63,15 @@ class RecordingOptions:
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True) -> Source:
-    """Open a sequence without registration; report the topics of a bag, and excluded frames.
+    """Open a sequence without registration; report the topics of a bag, and the source's notes.
 
     Raises DatasetError, InvalidInputError.
     """
     source = open_source(spec, up_axis, require_poses=require_poses)
     if isinstance(source, sibling(Sibling.BAGS).BagSource):
         print_message(f"{spec}: {source.description}")
-    if source.excluded_frames:
-        print_message(f"{spec}: {source.excluded_frames}")
+    for note in source.notes:
+        print_message(f"{spec}: {note}")
     return source
 
 

@@ -6,7 +6,7 @@ import json
 import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -244,18 +244,25 @@ def find_in_or_above(folder: Path, name: str) -> Path | None:
 
 @dataclass(frozen=True, slots=True)
 class FolderCamera:
-    """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none."""
+    """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none.
+
+    note: message that names a file of another folder; empty if the camera's file is the recording's own.
+    """
 
     camera: Camera
     units_per_metre: float | None = None
     lens: Lens | None = None
+    note: str = ""
 
 
-def read_folder_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera | None:
-    """Return the camera of a camera file in or above the folder; None without such a file.
+def read_folder_camera(
+    folder: Path, width_px: int, height_px: int, published: FolderCamera | None = None
+) -> FolderCamera | None:
+    """Return the camera of a file in the folder, else the published one, else that of a file one folder above.
 
-    Read in this order: cam_params.json (with depth units), camera_info.yaml (ROS), cameras.txt (COLMAP),
-    camera-intrinsics.txt (a matrix). Raises DatasetError.
+    A file above may belong to another recording: it is used only for images of its size, with a note. Read in this
+    order: cam_params.json (with depth units), camera_info.yaml (ROS), cameras.txt (COLMAP), camera-intrinsics.txt (a
+    matrix). Returns None without a camera. Raises DatasetError.
     """
     readers: tuple[tuple[str, Callable[[Path], FolderCamera]], ...] = (
         (CAMERA_FILE, read_json_camera),
@@ -264,9 +271,16 @@ def read_folder_camera(folder: Path, width_px: int, height_px: int) -> FolderCam
         (INTRINSICS_FILE, lambda path: FolderCamera(read_matrix(path).camera(str(path), width_px, height_px))),
     )
     for name, read in readers:
-        path = find_in_or_above(folder, name)
-        if path is not None:
-            return read(path)
+        if (folder / name).is_file():
+            return read(folder / name)
+    if published is not None:
+        return published
+    for name, read in readers:
+        path = folder.absolute().parent / name
+        if path.is_file():
+            found = read(path)
+            if (found.camera.width_px, found.camera.height_px) == (width_px, height_px):
+                return replace(found, note=f"the camera is that of {path}, one folder above; expected it in the folder")
     return None
 
 
@@ -359,22 +373,36 @@ def read_colmap_camera(path: Path) -> FolderCamera:
 
 
 _LENS_MODELS = {
-    "plumb_bob": LensModel.RADTAN,
-    "rational_polynomial": LensModel.RADTAN,
-    "radtan": LensModel.RADTAN,
-    "equidistant": LensModel.FISHEYE,
-    "fisheye": LensModel.FISHEYE,
+    **dict.fromkeys(("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "opencv"), LensModel.RADTAN),
+    **dict.fromkeys(("brownconrady", "modifiedbrownconrady", "inversebrownconrady"), LensModel.RADTAN),
+    **dict.fromkeys(("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4"), LensModel.FISHEYE),
 }
+"""Names of ROS, Kalibr, OpenCV and the RealSense SDK, in lower case, without marks between words."""
+_WITHOUT_LENS = ("", "none", "pinhole", "ideal", "undistorted", "rectified")
+_MAX_COEFFICIENTS = {LensModel.RADTAN: 8, LensModel.FISHEYE: 4}
 
 
 def lens_of(location: str, model: str, coefficients: Iterable[float]) -> Lens | None:
-    """Return the lens of these coefficients in OpenCV's order; None without distortion. Raises DatasetError."""
+    """Return the lens of these coefficients in OpenCV's order; None for a pinhole camera. Raises DatasetError.
+
+    An equidistant lens whose coefficients are all zero is no pinhole camera. OpenCV's thin prism and tilt, after the
+    eighth coefficient, must be zero.
+    """
     values = tuple(float(value) for value in coefficients)
-    if not any(values):
+    name = re.sub(r"[\s_-]", "", str(model).lower())
+    lens_model = _LENS_MODELS.get(name)
+    if lens_model is not LensModel.FISHEYE and not any(values) and (lens_model or name in _WITHOUT_LENS):
         return None
-    if model not in _LENS_MODELS:
-        raise DatasetError(f"{location}: distortion_model: expected one of {', '.join(_LENS_MODELS)}, got {model!r}")
+    if lens_model is None:
+        expected = "plumb_bob, rational_polynomial, radtan, equidistant or fisheye"
+        raise DatasetError(f"{location}: distortion_model: expected {expected}, got {str(model)[:40]!r}")
+    count = _MAX_COEFFICIENTS[lens_model]
+    if any(values[count:]):
+        raise DatasetError(
+            f"{location}: expected a {lens_model} lens of at most {count} coefficients, got {len(values)}; rectify the "
+            "images (a ROS bag: with image_proc, and use image_rect_color)"
+        )
     try:
-        return Lens(_LENS_MODELS[model], values)
+        return Lens(lens_model, values[:count])
     except InvalidInputError as error:
         raise DatasetError(f"{location}: {error}") from None

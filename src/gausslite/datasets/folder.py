@@ -116,6 +116,7 @@ class FolderSource:
 
     _camera: Camera
     _lens: Lens | None
+    _camera_note: str
     _units: DepthUnits
     _up_axis: UpAxis
 
@@ -125,13 +126,23 @@ class FolderSource:
 
     def _set_camera(self, found: FolderCamera, default_units: DepthUnits) -> None:
         """Use this camera and its depth units, if it states them."""
-        self._camera, self._lens = found.camera, found.lens
+        self._camera, self._lens, self._camera_note = found.camera, found.lens, found.note
         self._units = replace(default_units, per_metre=found.units_per_metre or default_units.per_metre)
 
     @property
     def name(self) -> str:
         """Name of the folder."""
         return self._folder.name
+
+    @property
+    def excluded_frames(self) -> str:
+        """Message on the recorded frames that are not used; empty if all are."""
+        return ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Messages on a camera file of another folder, and on excluded frames."""
+        return tuple(note for note in (self._camera_note, self.excluded_frames) if note)
 
     @property
     def camera(self) -> Camera:

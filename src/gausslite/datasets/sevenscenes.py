@@ -34,8 +34,8 @@ _UP_POSES = 64
 class SevenScenesSource(NumberedFolderSource):
     """A folder of frame-%06d.color.{png,jpg}, .depth.png (mm; 0 and 65535 invalid) and .pose.txt (camera to world).
 
-    The camera comes from cam_params.json (with the depth units) or camera-intrinsics.txt in or above the folder;
-    otherwise 640x480 images get the intrinsics that the 7-Scenes authors publish. Frames whose pose has no finite
+    The camera comes from a camera file, see `read_folder_camera`; otherwise 640x480 images get the intrinsics that the
+    7-Scenes authors publish. Frames whose pose has no finite
     number, or only zeros, are excluded. Times are the frame numbers at 30 Hz. Raises DatasetError.
     """
 

@@ -88,8 +88,8 @@ class Source(Protocol):
         ...
 
     @property
-    def excluded_frames(self) -> str:
-        """Message on the recorded frames that the sequence excludes, and why; empty if there are none."""
+    def notes(self) -> tuple[str, ...]:
+        """Messages for the operator: which recorded frames are excluded and why, a camera file of another folder."""
         ...
 
     def __len__(self) -> int: ...
@@ -121,7 +121,7 @@ def require_position(source_name: str, i: int, count: int) -> None:
 
 
 def excluded_frames_note(count: int, recorded: int, reason: str) -> str:
-    """Return the message of `Source.excluded_frames`."""
+    """Return the message on recorded frames that a sequence excludes; empty if there are none."""
     return f"{count} of {recorded} colour images are skipped: {reason}" if count else ""
 
 
@@ -268,9 +268,9 @@ class WrappedSource:
         return self._source.regions_file
 
     @property
-    def excluded_frames(self) -> str:
-        """Message of the wrapped source."""
-        return self._source.excluded_frames
+    def notes(self) -> tuple[str, ...]:
+        """Messages of the wrapped source."""
+        return self._source.notes
 
     def __len__(self) -> int:
         return len(self._source)

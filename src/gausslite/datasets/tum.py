@@ -185,16 +185,18 @@ def _read_poses(path: Path, required: bool) -> PoseTrack | None:
 def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
     """Return the camera of a file in the folder, else the published one of fr1, fr2 or fr3 by the folder's name.
 
-    Raises DatasetError.
+    A link's own name counts, and that of its target. Raises DatasetError.
     """
-    from_file = read_folder_camera(folder, width_px, height_px)
-    if from_file is not None:
-        return from_file
-    group = re.search(r"(?:freiburg|fr)([123])", folder.resolve().name)
-    if group is None:
+    names = f"{folder.absolute().name} {folder.resolve().name}"
+    group = re.search(r"(?:freiburg|fr)([123])", names)
+    published = None
+    if group is not None:
+        camera = _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px)
+        published = FolderCamera(camera, lens=_LENSES.get(group.group(1)))
+    found = read_folder_camera(folder, width_px, height_px, published)
+    if found is None:
         raise DatasetError(
             f"{folder}: the camera is unknown: expected a folder named after fr1, fr2 or fr3 (or freiburg1 ...), "
             f"or the file {INTRINSICS_FILE} or {CAMERA_FILE}"
         )
-    camera = _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px)
-    return FolderCamera(camera, lens=_LENSES.get(group.group(1)))
+    return found

@@ -27,7 +27,7 @@ class Recording:
     def __init__(self, home: Source, translation_m: float, rotation_deg: float, gain: float = 0.0) -> None:
         self._frames = [home.frame(i) for i in range(FRAMES)]
         self.name, self.camera, self.up_axis = "recording", home.camera, home.up_axis
-        self.depth_registered, self.excluded_frames = True, ""
+        self.depth_registered, self.notes = True, ()
         self.camera_ideal = self.poses_exact = False
         self.lens, self.world_frame, self.regions_file = None, "recording", None
         self.damaged: set[int] = set()

@@ -75,7 +75,7 @@ class EnlargedSource:
         k = small.camera
         self.camera = k.resized(4 * k.width_px, 4 * k.height_px)
         self.name, self.up_axis, self.depth_registered = "enlarged", small.up_axis, False
-        self.excluded_frames = ""
+        self.notes = ()
         self.camera_ideal = self.poses_exact = False
         self.lens, self.world_frame, self.regions_file = None, self.name, None
 
@@ -121,7 +121,7 @@ class UnregisteredSource:
         self._T_colour_depth = truth.extrinsics()
         self.name, self.camera, self.up_axis = "unregistered", DEPTH_CAMERA, self._home.up_axis
         self.depth_registered = False
-        self.excluded_frames = ""
+        self.notes = ()
         self.camera_ideal = self.poses_exact = False
         self.lens, self.world_frame, self.regions_file = None, self.name, None
         self.damaged: int | None = None

@@ -30,7 +30,7 @@ class Numbered:
     depth_registered = True
     camera_ideal = poses_exact = True
     world_frame, regions_file = "numbered", None
-    excluded_frames = ""
+    notes = ()
     lens = None
 
     def __init__(self, numbers: list[int]) -> None:

@@ -61,7 +61,7 @@ class Wall:
     poses_exact: bool = True
     world_frame: str = "wall"
     regions_file: None = None
-    excluded_frames: str = ""
+    notes: tuple[str, ...] = ()
     lens: None = None
     camera: Camera = CAMERA
     broken_at: int | None = None
