@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.calibrate import calibrate
+from gausslite.calibration.calibrate import StatedValues, calibrate
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
@@ -120,13 +120,14 @@ def open_sequence(
     return open_source(str(spec), up_axis, depth_registration)
 
 
-def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None) -> CalibratedSequence:
+def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None, force: bool = False) -> CalibratedSequence:
     """Open a sequence and estimate what it does not state, as `gausslite map` does; takes ten to thirty seconds.
 
-    Nothing is estimated that the source guarantees, such as the exact poses of a simulated home. Raises DatasetError,
-    PoseError, InvalidInputError.
+    Nothing is estimated that the source guarantees, such as the exact poses of a simulated home. force: use poses and
+    depth that contradict the images; otherwise they raise DatasetError. Raises DatasetError, PoseError,
+    InvalidInputError.
     """
-    found = calibrate(open_source(str(spec), up_axis))
+    found = calibrate(open_source(str(spec), up_axis), StatedValues(force=force))
     notes = tuple(str(evidence) for evidence in found.evidence if not evidence.guaranteed)
     return CalibratedSequence(found.source, found.pose_prior, notes)
 

@@ -2,6 +2,7 @@
 
 A value that the user states is used. Where the source guarantees a value, no estimate is made. The rest is estimated
 from the frames: registration first, then the camera from registered frames, then the pose prior from corrected ones.
+Before all of it, poses and depth that contradict the images are refused.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gausslite.calibration.camera_estimate import estimate_camera
+from gausslite.calibration.consistency import find_contradiction
 from gausslite.calibration.errors import estimate_pose_exposure_prior
 from gausslite.calibration.registration import find_registration
 from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Lens
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 
 _NONE = "none"
@@ -27,7 +30,7 @@ class StatedValues:
     """What the user states of a recording; None leaves a value to the source's guarantee or to an estimate.
 
     depth_as_recorded: depth is used without registration. lens: kept where the camera is estimated, in place of the
-    lens that the source's files state.
+    lens that the source's files state. force: poses and depth are used although they contradict the images.
     """
 
     registration: DepthRegistration | None = None
@@ -35,6 +38,7 @@ class StatedValues:
     correction: CameraCorrection | None = None
     lens: Lens | None = None
     pose_prior: PoseExposurePrior | None = None
+    force: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +79,12 @@ def calibrate(
 ) -> Calibration:
     """Return the source as it should be mapped, and its pose prior. Estimates take ten to thirty seconds.
 
-    report: called with the evidence of each value as soon as it is known. Raises DatasetError, PoseError,
-    InvalidInputError.
+    report: called with the evidence of each value as soon as it is known. Raises DatasetError, also for poses or depth
+    that contradict the images, PoseError, InvalidInputError.
     """
     stated = stated or StatedValues()
+    if not stated.force:
+        _require_consistent(source)
     found: list[Evidence] = []
 
     def decide(evidence: Evidence) -> None:
@@ -100,6 +106,16 @@ def calibrate(
     if prior is None:
         prior = _pose_prior_of(source, decide)
     return Calibration(source, registration, correction, prior, tuple(found))
+
+
+def _require_consistent(source: Source) -> None:
+    if source.poses_exact or source.camera_ideal:
+        return
+    contradiction = find_contradiction(source)
+    if contradiction is not None:
+        raise DatasetError(
+            f"{source.name}: {contradiction}; correct the recording, or map it as it is with --set force=true"
+        )
 
 
 def _registration_of(source: Source, decide: Callable[[Evidence], None]) -> DepthRegistration | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import MISSING, asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +137,9 @@ class MapOptions:
     )
     overwrite: bool = option(False, "replace a map in --out (resume does so without this option)")
     strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
+    force: bool = option(
+        False, "map although poses or depth contradict the images (default: end with what would agree)"
+    )
     task_at: tuple[str, ...] = option(
         (), "switch to another task at this frame number", metavar="FRAME:TASK", repeats=True
     )
@@ -198,7 +201,7 @@ def _map(options: argparse.Namespace) -> int:
         if isinstance(roi, TaskGraph):
             estimators.require_detector()
         stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
-        inputs = inputs.calibrated(stated)
+        inputs = inputs.calibrated(replace(stated, force=options.force))
     mapper = build_task_mapper(inputs.mission, estimators, roi)
     if saved is not None:
         saved.restore(mapper)

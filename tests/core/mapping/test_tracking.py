@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from gausslite.calibration.alignment import align
+from gausslite.calibration.features import detect_features, relative_pose
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import MotionModel
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.evaluation.metrics import trajectory_error
-from gausslite.mapping.tracking import CameraTracker, detect_features, relative_pose
+from gausslite.mapping.tracking import CameraTracker
 from gausslite.mission.build import build_mapper, build_tracker
 from gausslite.mission.settings import MissionSettings, PoseMode
 from gausslite.mission.task_mapper import TaskMapper

@@ -1,0 +1,157 @@
+"""Poses or depth that contradict the images are refused with the convention, clock or unit that would agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.calibration.calibrate import StatedValues, calibrate
+from gausslite.calibration.consistency import find_contradiction
+from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
+from gausslite.datasets.open import open_source
+from gausslite.datasets.source import Source, WrappedSource
+from gausslite.domain.errors import DatasetError
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import Trajectory, transform_of
+from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
+
+Poses = Float64[ndarray, "n 4 4"]
+SIZE = (160, 120)
+NOTHING_ESTIMATED = StatedValues(correction=CameraCorrection(), pose_prior=PoseExposurePrior())
+
+
+class Recording(WrappedSource):
+    """Frames of a simulated home that state neither exact poses nor an ideal camera; 30 frames a second."""
+
+    camera_ideal = poses_exact = False
+
+    def __init__(self, home: Source, positions: list[int]) -> None:
+        super().__init__(home)
+        self.frames = [home.frame(position, SIZE) for position in positions]
+        self.poses = np.array([frame.T_world_camera for frame in self.frames])
+        self.depth_factor = 1.0
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        depth_m = self.frames[i].depth_m * np.float32(self.depth_factor)
+        return replace(self.frames[i], depth_m=depth_m, T_world_camera=self.poses[i])
+
+    def trajectory(self) -> Trajectory:
+        return Trajectory(np.arange(len(self.frames)) / 30.0, self.poses)
+
+
+@pytest.fixture(scope="module")
+def home() -> Source:
+    return open_source("sim:home?size=160x120")
+
+
+@pytest.fixture
+def recording(home: Source) -> Recording:
+    return Recording(home, list(range(14)))
+
+
+def with_w_first(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+    """Return the pose of a file that states w x y z where x y z w is read."""
+    return pose_from_quaternion("pose", T[:3, 3], np.roll(quat_xyzw(T[:3, :3]), 1))
+
+
+def with_axes(x: tuple[int, ...], y: tuple[int, ...], z: tuple[int, ...]) -> Callable[[Poses], Poses]:
+    """Return poses of a camera frame with these axes, each given in x right, y down, z forward."""
+    axes = np.eye(4)
+    axes[:3, :3] = np.array([x, y, z]).T
+    return lambda poses: poses @ axes
+
+
+def transposed_rotations(poses: Poses) -> Poses:
+    turned = poses.copy()
+    turned[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    return turned
+
+
+def mirrored(poses: Poses) -> Poses:
+    """Return the poses in left-handed worlds and cameras with y up."""
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    return mirror @ poses @ mirror
+
+
+def in_millimetres(poses: Poses) -> Poses:
+    scaled = poses.copy()
+    scaled[:, :3, 3] *= 1000.0
+    return scaled
+
+
+CONVENTIONS: dict[str, tuple[Callable[[Poses], Poses], str]] = {
+    "inverse": (np.linalg.inv, "poses read as world-to-camera poses would agree"),
+    "opengl": (with_axes((1, 0, 0), (0, -1, 0), (0, 0, -1)), "x right, y up, z backward \\(OpenGL\\) would agree"),
+    "body": (with_axes((0, 0, 1), (-1, 0, 0), (0, -1, 0)), "x forward, y left, z up \\(robot's body\\) would agree"),
+    "left-handed": (mirrored, "camera axes x right, y up, z forward would agree"),
+    "quaternion": (lambda poses: np.array([with_w_first(T) for T in poses]), "quaternions with w first would agree"),
+    "rotations": (transposed_rotations, "rotations from world to camera would agree"),
+    "millimetres": (in_millimetres, "depth multiplied by (990|1000) "),
+}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_another_convention_of_poses_is_named(recording: Recording, name: str) -> None:
+    change, message = CONVENTIONS[name]
+    recording.poses = change(recording.poses)
+    with pytest.raises(DatasetError, match=f"do not fit the images .* {message}.*--set force=true"):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(0.2, "multiplied by (4.9|5|5.1)"), (0.5, "multiplied by 2"), (10.0, "divided by (9.9|10)")]
+)
+def test_another_unit_of_depth_is_named(recording: Recording, factor: float, words: str) -> None:
+    recording.depth_factor = factor
+    with pytest.raises(DatasetError, match=f"depth {words} "):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def test_another_clock_is_named(home: Source) -> None:
+    recording = Recording(home, [*range(24), *range(22, -1, -1)])
+    recording.poses = np.roll(recording.poses, 6, axis=0)
+    contradiction = find_contradiction(recording)
+    assert contradiction is not None
+    assert "poses 0.20 s later (clocks" in contradiction
+
+
+def test_poses_of_another_recording_are_refused(recording: Recording) -> None:
+    recording.poses = recording.poses[np.random.default_rng(1).permutation(len(recording.poses))]
+    with pytest.raises(DatasetError, match="no other convention, clock or unit of depth agrees"):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def test_right_poses_agree_also_with_their_usual_errors(recording: Recording) -> None:
+    assert find_contradiction(recording) is None
+    rng = np.random.default_rng(0)
+    errors = rng.normal(0.0, [0.005] * 3 + [0.005] * 3, (len(recording.poses), 6))
+    recording.poses = np.array([T @ transform_of(error) for T, error in zip(recording.poses, errors, strict=True)])
+    recording.depth_factor = 1.05
+    assert find_contradiction(recording) is None
+
+
+def test_a_camera_at_rest_and_images_without_features_give_no_verdict(home: Source, recording: Recording) -> None:
+    still = Recording(home, [3] * 12)
+    still.poses = np.linalg.inv(still.poses)
+    assert find_contradiction(still) is None
+    recording.frames = [replace(frame, rgb=np.zeros_like(frame.rgb)) for frame in recording.frames]
+    recording.poses = np.linalg.inv(recording.poses)
+    assert find_contradiction(recording) is None
+
+
+def test_contradictory_poses_are_used_on_request(recording: Recording) -> None:
+    recording.poses = np.linalg.inv(recording.poses)
+    assert calibrate(recording, replace(NOTHING_ESTIMATED, force=True)).source.trajectory() is not None
+
+
+@pytest.mark.parametrize("name", ["tum_fr1", "redkitchen", "hololens_kitchenette"])
+def test_real_recordings_agree(shared_dir, name: str) -> None:
+    assert find_contradiction(open_source(str(shared_dir / "data" / name))) is None
