@@ -17,6 +17,7 @@ from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
+from gausslite.process import print_message
 from gausslite_view.contents import ViewContents
 from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
@@ -119,7 +120,7 @@ def _read_team(folder: Path, report: Mapping[str, object]) -> list[RunResults]:
     for name in _FUSED_MAPS:
         file = folder / f"{name}.ply"
         if file.is_file():
-            contents = replace(ViewContents.of_one_agent(read_ply(file)), objects=objects)
+            contents = replace(ViewContents.of_one_agent(read_ply(file, print_message)), objects=objects)
             runs.append(RunResults(name, file, contents, read_world_frame(file), {}, _mapping(maps.get(name))))
     return runs
 

@@ -16,6 +16,7 @@ from gausslite.datasets.folder import read_pose_rows
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import TRAJECTORY, read_report
+from gausslite.process import print_message
 from gausslite_view.contents import NO_AGENT, ViewContents
 from gausslite_view.time_scrub import PastMap
 
@@ -30,7 +31,7 @@ def read_contents(path: Path) -> ViewContents:
     file = path / _MAP if path.is_dir() else path
     if not file.is_file():
         raise MapFileError(f"{path}: expected a results folder with {_MAP}, a PLY file or HOST:PORT, got neither")
-    gaussians = read_ply(file)
+    gaussians = read_ply(file, print_message)
     if not path.is_dir():
         return ViewContents.of_one_agent(gaussians)
     report = read_report(path)

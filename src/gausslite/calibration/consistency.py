@@ -65,7 +65,8 @@ class _Pair:
         predicted = np.stack(self.camera.pixels(points[..., 0] / z_m, points[..., 1] / z_m), axis=-1) - 0.5
         largest_px = np.maximum(_median_distance(predicted, self.matched.reference_px), self.motion_px)
         largest_px[largest_px < _MIN_MOTION * self.camera.width_px] = np.nan
-        return _median_distance(predicted, self.matched.pixels) / largest_px
+        errors: Float64[ndarray, " h"] = _median_distance(predicted, self.matched.pixels) / largest_px
+        return errors
 
     def scale(self, motion: Float64[ndarray, "4 4"]) -> float:
         """Return the factor of the motion's translation that fits the points best; NaN if they do not show it."""
@@ -210,7 +211,8 @@ def _motions(T_world_camera: Float64[ndarray, "n 4 4"], pairs: Sequence[_Pair]) 
     """Return T_second_first of each pair."""
     first = T_world_camera[[pair.first for pair in pairs]].reshape(-1, 4, 4)
     second = T_world_camera[[pair.second for pair in pairs]].reshape(-1, 4, 4)
-    return np.linalg.inv(second) @ first
+    motions: Float64[ndarray, "p 4 4"] = np.linalg.inv(second) @ first
+    return motions
 
 
 def _readings(trajectory: Trajectory, pairs: Sequence[_Pair]) -> Iterator[_Reading]:
@@ -257,8 +259,8 @@ def _axes() -> list[tuple[str, Float64[ndarray, "4 4"]]]:
         found["camera axes " + ", ".join(words)] = axes
     found = {"": found.pop("camera axes x right, y down, z forward"), **found}
     for known, title in (("x forward, y left, z up", "robot's body"), ("x right, y up, z backward", "OpenGL")):
-        words = f"camera axes {known}"
-        found = {"": found.pop(""), f"{words} ({title})": found.pop(words), **found}
+        axes = found.pop(f"camera axes {known}")
+        found = {"": found.pop(""), f"camera axes {known} ({title})": axes, **found}
     return list(found.items())
 
 

@@ -241,7 +241,7 @@ def _score(
     views = [HeldOutView.of(frame, regions) for frame in frames if frame.has_depth]
     if not views and corrupt.first_error is not None:
         raise corrupt.first_error
-    viewers = view_maps({name: read_ply(path) for name, path in maps.items()}, options.threads)
+    viewers = view_maps({name: read_ply(path, print_message) for name, path in maps.items()}, options.threads)
     return score_team(viewers, views, scenario.fit_views)
 
 

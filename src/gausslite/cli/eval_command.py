@@ -98,7 +98,7 @@ def configure(parser: CommandParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Render the map from every selected frame with depth, and print the mean scores. Returns the exit code."""
-    viewer = view_map(read_ply(options.map), threads=options.threads)
+    viewer = view_map(read_ply(options.map, print_message), threads=options.threads)
     conditions = _Conditions.of(options)
     recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)
     source = calibrate_with_messages(options.source, recorded, conditions.stated).source

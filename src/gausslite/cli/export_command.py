@@ -62,11 +62,12 @@ def run(options: argparse.Namespace) -> int:
     report = read_report(options.map)
     if options.to == "json" and not report and (options.map / "report.json").exists():
         raise InvalidInputError(f"{options.map}/report.json: expected the report of a run, got something else")
-    content = read_map(options.map, region, report, chosen.max_extent_m)
     out = options.out or _default_file(options.map, chosen.suffix)
-    _require_separate(out, options.map)
-    if not options.overwrite:
-        require_absent(out)
+    for file in chosen.files(out):
+        _require_separate(file, options.map)
+        if not options.overwrite:
+            require_absent(file)
+    content = read_map(options.map, region, report, chosen.max_extent_m)
     prepare_folder(out.absolute().parent)
     voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
     min_opacity = _MIN_OPACITY if options.min_opacity is None else options.min_opacity
@@ -81,12 +82,8 @@ def run(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace, content: MapContent, out: Path, part: str) -> None:
     """Print what was written, and on stderr what was left out."""
     chosen, size = FORMATS[options.to], out.stat().st_size
-    if content.left_out:
-        total = content.left_out + len(content.gaussians)
-        print_message(
-            f"left out {content.left_out} of {total} Gaussians: expected coordinates and standard deviations up to "
-            f"{chosen.max_extent_m:g} m, got larger ones"
-        )
+    for note in content.notes:
+        print_message(note)
     if options.json:
         counts = {"gaussians": len(content.chosen), "left_out": content.left_out, "bytes": size}
         print(as_text({"file": str(out), "format": options.to, **counts}))

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     world_frame = _common_world_frame(frames)
     prepare_file(options.out.absolute(), MAP_FILE)
     # the vote's last tie-break is the lower id: number the files in the given order
-    maps = {f"{i:03d} {path}": read_ply(path) for i, path in enumerate(options.maps)}
+    maps = {f"{i:03d} {path}": read_ply(path, print_message) for i, path in enumerate(options.maps)}
     fused = fuse_maps(maps, VoxelGrid(options.voxel_size))
     write_ply(options.out, fused.gaussians, world_frame)
     _print_unnamed(frames, world_frame)

@@ -1,18 +1,22 @@
-"""Read and write maps as standard 3DGS PLY files, binary little-endian, with three additional columns.
+"""Read standard 3DGS PLY files, and write them, binary little-endian with three additional columns.
 
 Columns: x y z | f_dc_0..2 = (rgb - 0.5) / C0 | opacity as logit | scale_0..2 as log | rot_0..3 = w x y z | additional:
 active, kappa, target. All columns are float, because common readers read a row as a run of floats; so kappa is exact
-up to 2^24. The reader finds columns by name, in any order and type. It ignores other tools' columns (normals, f_rest);
-the additional ones may be missing (then inactive, kappa 0, no target). The header may name the map's world frame:
-`comment world_frame NAME`.
+up to 2^24. The reader takes all formats of PLY and finds columns by name, in any order and type. It ignores other
+tools' columns (normals, f_rest) and elements; the additional ones may be missing (then inactive, kappa 0, no target).
+An opacity of ±infinity is 1 or 0, a scale of -infinity is flat. The header may name the map's world frame:
+`comment world_frame NAME`, in ASCII, other characters percent-encoded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import quote, unquote
 
 import numpy as np
 from jaxtyping import Float32
@@ -37,10 +41,26 @@ _STANDARD = (*_POSITIONS, *_COLOURS, "opacity", *_SCALES, *_ROTATIONS)
 _EXTRAS = ("active", "kappa", "target")
 _ROW = np.dtype([(name, "<f4") for name in (*_STANDARD, *_EXTRAS)])
 _PLY_TYPES = {
-    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2"},
-    **{"ushort": "<u2", "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4"},
-    **{"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"},
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
+    **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+_ASCII = "ascii"
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", _ASCII: "<"}
+_PRINTABLE = "".join(chr(code) for code in range(0x20, 0x7F) if chr(code) != "%")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredMap:
+    """The content of a PLY file.
+
+    left_out: why rows are left out, in words, and how many; both are empty for a whole file.
+    """
+
+    gaussians: Gaussians
+    world_frame: str
+    left_out: int = 0
+    reason: str = ""
 
 
 def write_ply(path: Path, gaussians: Gaussians, world_frame: str = "") -> None:
@@ -51,10 +71,27 @@ def write_ply(path: Path, gaussians: Gaussians, world_frame: str = "") -> None:
     write_atomic(path, ply_bytes(gaussians, world_frame))
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Read a map. Raises MapFileError naming the file and the cause."""
+def read_ply(path: Path, warn: Callable[[str], object] = warnings.warn) -> Gaussians:
+    """Read a map. Rows with NaN, or infinite where no map can be, are left out; warn: called with a line that says so.
+
+    Raises MapFileError naming the file and the cause.
+    """
+    stored = read_stored_map(path)
+    if stored.left_out:
+        warn(f"{path}: {left_out_note(stored)}")
+    return stored.gaussians
+
+
+def read_stored_map(path: Path) -> StoredMap:
+    """Read a map and its world frame. Raises MapFileError naming the file and the cause."""
     with _open_map(path) as file:
-        return gaussians_from_ply(file.read())
+        return _stored_map(file.read())
+
+
+def left_out_note(stored: StoredMap) -> str:
+    """Return the message on rows that are left out."""
+    total = stored.left_out + len(stored.gaussians)
+    return f"left out {stored.left_out} of {total} Gaussians: {stored.reason}"
 
 
 def read_world_frame(path: Path) -> str:
@@ -77,10 +114,10 @@ def ply_bytes(gaussians: Gaussians, world_frame: str = "") -> bytes:
         rows[name] = getattr(gaussians, name)
     header = ["ply", "format binary_little_endian 1.0"]
     if world_frame:
-        header.append(_WORLD_FRAME_COMMENT + world_frame)
+        header.append(_WORLD_FRAME_COMMENT + quote(world_frame, _PRINTABLE))
     header.append(f"element vertex {len(gaussians)}")
     header += [f"property float {name}" for name in (*_STANDARD, *_EXTRAS)]
-    return ("\n".join([*header, "end_header"]) + "\n").encode() + rows.tobytes()
+    return ("\n".join([*header, "end_header"]) + "\n").encode("ascii") + rows.tobytes()
 
 
 def world_frame_from_ply(data: bytes) -> str:
@@ -92,7 +129,7 @@ def world_frame_from_ply(data: bytes) -> str:
     if len(comments) > 1:
         raise MapFileError(f"expected one world frame in the header, got {len(comments)}")
     try:
-        name = comments.pop().decode().removeprefix(_WORLD_FRAME_COMMENT)
+        name = unquote(comments.pop().decode().removeprefix(_WORLD_FRAME_COMMENT), errors="strict")
         require_name("world frame", name)
     except (InvalidInputError, UnicodeDecodeError) as error:
         raise MapFileError(f"expected a world frame's name in the header: {error}") from error
@@ -100,31 +137,40 @@ def world_frame_from_ply(data: bytes) -> str:
 
 
 def gaussians_from_ply(data: bytes) -> Gaussians:
-    """Decode the map in the bytes of a PLY file. Raises MapFileError."""
-    count, row, start = _read_header(data)
-    missing = [name for name in _STANDARD if name not in (row.names or ())]
-    if missing:
-        raise MapFileError(f"expected the columns of a 3DGS map, missing {', '.join(missing)}")
-    if len(data) - start < count * row.itemsize:
-        raise MapFileError(f"expected {count} Gaussians of {row.itemsize} bytes, got {len(data) - start} bytes of them")
-    rows = np.frombuffer(data, row, count, start)
-    present = [name for name in (*_STANDARD, *_EXTRAS) if name in (row.names or ())]
-    not_finite = [name for name in present if not np.isfinite(rows[name]).all()]
-    if not_finite:
-        raise MapFileError(f"column {not_finite[0]}: expected finite values, got NaN or infinity")
-    try:
-        with np.errstate(over="raise"):
-            return _to_gaussians({name: rows[name] for name in present}, count)
-    except (InvalidInputError, FloatingPointError) as error:
-        raise MapFileError(str(error)) from error
+    """Decode the map in the bytes of a PLY file. Raises MapFileError, also for a single row that is no Gaussian."""
+    stored = _stored_map(data)
+    if stored.left_out:
+        raise MapFileError(stored.reason)
+    return stored.gaussians
 
 
-def _to_gaussians(raw: dict[str, NDArray[Any]], count: int) -> Gaussians:
+def _stored_map(data: bytes) -> StoredMap:
+    """Decode a PLY file; rows that are no Gaussians are left out. Raises MapFileError, also if no row is left."""
+    columns, count = _read_columns(data)
+    with np.errstate(over="ignore", invalid="ignore"):
+        gaussians = _to_gaussians(columns, count)
+    converted = np.concatenate(
+        [gaussians.means_m, gaussians.rgb, gaussians.opacities[:, None], gaussians.scales_m, gaussians.quats_wxyz],
+        axis=1,
+    )
+    checked = {**dict(zip(_STANDARD, converted.T, strict=True)), **{n: columns[n] for n in _EXTRAS if n in columns}}
+    finite = {name: np.isfinite(values) for name, values in checked.items()}
+    broken = [name for name, values in finite.items() if not values.all()]
+    if not broken:
+        return StoredMap(gaussians, world_frame_from_ply(data))
+    kept = np.logical_and.reduce(list(finite.values()))
+    reason = f"column {broken[0]}: expected finite values, got NaN or infinity"
+    if not kept.any():
+        raise MapFileError(reason)
+    return StoredMap(gaussians.take(kept), world_frame_from_ply(data), int(np.count_nonzero(~kept)), reason)
+
+
+def _to_gaussians(raw: Mapping[str, NDArray[Any]], count: int) -> Gaussians:
     logits = np.clip(raw["opacity"].astype(np.float64), -60, 60)
     return Gaussians(
         means_m=_stack(raw, _POSITIONS),
         quats_wxyz=_stack(raw, _ROTATIONS),
-        scales_m=np.exp(_stack(raw, _SCALES)),
+        scales_m=np.maximum(np.exp(_stack(raw, _SCALES)), np.finfo(np.float32).tiny),
         opacities=(1 / (1 + np.exp(-logits))).astype(np.float32),
         rgb=_stack(raw, _COLOURS) * np.float32(SH_C0) + np.float32(0.5),
         active=raw.get("active", np.zeros(count)) != 0,
@@ -133,26 +179,86 @@ def _to_gaussians(raw: dict[str, NDArray[Any]], count: int) -> Gaussians:
     )
 
 
-def _read_header(data: bytes) -> tuple[int, np.dtype[np.void], int]:
-    """Return the number of rows, the type of a row, and the first row's offset."""
+@dataclass(frozen=True, slots=True)
+class _Element:
+    """An element of the header; fields: type of each column by its name. has_list: its rows differ in size."""
+
+    name: str
+    count: int
+    fields: dict[str, str]
+    has_list: bool = False
+
+
+def _read_columns(data: bytes) -> tuple[Mapping[str, NDArray[Any]], int]:
+    """Return the columns of a map that the file has, by name, and the number of rows. Raises MapFileError."""
+    file_format, elements, start = _read_header(data)
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise MapFileError(f"expected an element 'vertex', got {', '.join(names) or 'none'}")
+    before, vertex = elements[: names.index("vertex")], elements[names.index("vertex")]
+    missing = [name for name in _STANDARD if name not in vertex.fields]
+    if "packed_position" in vertex.fields:
+        raise MapFileError("expected an uncompressed 3DGS map, got SuperSplat's compressed PLY; save it uncompressed")
+    if missing:
+        raise MapFileError(f"expected the columns of a 3DGS map, missing {', '.join(missing)}")
+    present = [name for name in (*_STANDARD, *_EXTRAS) if name in vertex.fields]
+    if file_format == _ASCII:
+        table = _ascii_rows(data[start:], sum(element.count for element in before), vertex)
+        places = list(vertex.fields)
+        return {name: table[:, places.index(name)] for name in present}, vertex.count
+    for element in (*before, vertex):
+        if element.has_list:
+            raise MapFileError(f"element {element.name}: expected columns of one size up to the vertices, got a list")
+    order = _BYTE_ORDERS[file_format]
+    row, *earlier = (_row_type(element, order) for element in (vertex, *before))
+    start += sum(element.count * earlier_row.itemsize for element, earlier_row in zip(before, earlier, strict=True))
+    if len(data) - start < vertex.count * row.itemsize:
+        got = f"{max(len(data) - start, 0)} bytes of them"
+        raise MapFileError(f"expected {vertex.count} Gaussians of {row.itemsize} bytes, got {got}")
+    rows = np.frombuffer(data, row, vertex.count, start)
+    return {name: rows[name] for name in present}, vertex.count
+
+
+def _row_type(element: _Element, byte_order: str) -> np.dtype[np.void]:
+    return np.dtype([(name, byte_order + kind) for name, kind in element.fields.items()])
+
+
+def _ascii_rows(text: bytes, skipped: int, vertex: _Element) -> NDArray[Any]:
+    """Return the numbers of the vertices' rows, which follow this many rows of other elements. Raises MapFileError."""
+    lines = [line for line in text.splitlines() if line.strip()][skipped : skipped + vertex.count]
+    if len(lines) < vertex.count:
+        raise MapFileError(f"expected {vertex.count} rows of Gaussians, got {len(lines)}")
+    numbers = np.zeros((0, len(vertex.fields)))
+    with contextlib.suppress(ValueError):  # not a number, or rows of different lengths
+        numbers = np.array([[float(field) for field in line.split()] for line in lines], np.float64)
+    if vertex.has_list or numbers.size != vertex.count * len(vertex.fields):
+        raise MapFileError(f"expected rows of {len(vertex.fields)} numbers, got other rows")
+    return numbers.reshape(vertex.count, len(vertex.fields))
+
+
+def _read_header(data: bytes) -> tuple[str, list[_Element], int]:
+    """Return the format, the elements, and the first row's offset."""
     end, start = _header_extent(data)
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()[1:]]
     lines = [line for line in lines if line and line[0] not in ("comment", "obj_info")]
     file_format = " ".join(lines[0]) if lines else "nothing"
-    if file_format != "format binary_little_endian 1.0":
-        raise MapFileError(f"expected format binary_little_endian 1.0, got {file_format}")
-    if len(lines) < 2 or lines[1][:2] != ["element", "vertex"] or len(lines[1]) != 3:
-        raise MapFileError("expected 'element vertex COUNT' as the first element")
-    count = _count(lines[1][2])
-    fields: dict[str, str] = {}
-    for line in lines[2:]:
-        # rows of other elements follow the vertices and are not read
-        if line[0] == "element":
-            break
-        if len(line) != 3 or line[0] != "property" or line[1] not in _PLY_TYPES or line[2] in fields:
-            raise MapFileError(f"expected 'property TYPE NAME' once per column, got {' '.join(line)!r}")
-        fields[line[2]] = _PLY_TYPES[line[1]]
-    return count, np.dtype(list(fields.items())), start
+    kind = lines[0][1] if lines and len(lines[0]) == 3 and (lines[0][0], lines[0][2]) == ("format", "1.0") else ""
+    if kind not in _BYTE_ORDERS:
+        raise MapFileError(f"expected a format of {', '.join(_BYTE_ORDERS)} 1.0, got {file_format}")
+    elements: list[_Element] = []
+    for line in lines[1:]:
+        if line[0] == "element" and len(line) == 3 and line[1] not in [element.name for element in elements]:
+            elements.append(_Element(line[1], _count(line[2]), {}))
+        elif elements and line[:2] == ["property", "list"] and len(line) == 5:
+            elements[-1] = replace(elements[-1], has_list=True)
+        elif elements and line[0] == "property" and len(line) == 3 and line[1] in _PLY_TYPES:
+            if line[2] in elements[-1].fields:
+                raise MapFileError(f"expected 'property TYPE NAME' once per column, got {' '.join(line)!r} again")
+            elements[-1].fields[line[2]] = _PLY_TYPES[line[1]]
+        else:
+            expected = "'element NAME COUNT' or 'property TYPE NAME' once per column"
+            raise MapFileError(f"expected {expected}, got {' '.join(line)!r}")
+    return kind, elements, start
 
 
 def _header_extent(data: bytes) -> tuple[int, int]:
@@ -166,7 +272,7 @@ def _header_extent(data: bytes) -> tuple[int, int]:
     return end, start
 
 
-@contextmanager
+@contextlib.contextmanager
 def _open_map(path: Path) -> Iterator[BinaryIO]:
     """Open the file; errors of its content name it."""
     try:
@@ -187,7 +293,7 @@ def _count(text: str) -> int:
 def _to_integers(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
     """Convert to integers, clipped to the type's range, because a float near its limit would overflow."""
     limits = np.iinfo(np.dtype(dtype))
-    return np.clip(values.astype(np.float64), limits.min, limits.max).astype(dtype)
+    return np.clip(np.nan_to_num(values.astype(np.float64)), limits.min, limits.max).astype(dtype)
 
 
 def _fill(rows: NDArray[Any], names: tuple[str, ...], values: NDArray[Any]) -> None:
@@ -195,5 +301,5 @@ def _fill(rows: NDArray[Any], names: tuple[str, ...], values: NDArray[Any]) -> N
         rows[name] = values[:, column]
 
 
-def _stack(raw: dict[str, NDArray[Any]], names: tuple[str, ...]) -> Float32[ndarray, "n k"]:
+def _stack(raw: Mapping[str, NDArray[Any]], names: tuple[str, ...]) -> Float32[ndarray, "n k"]:
     return np.stack([raw[name].astype(np.float32) for name in names], axis=1)

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.codec.ply import read_ply, read_world_frame, write_ply
+from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
 from gausslite.codec.run_files import KeyframeView, read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.export.mesh import Render, write_mesh
-from gausslite.export.occupancy import OccupancySettings, write_nav2, write_octomap
+from gausslite.export.occupancy import NAV2_IMAGE, OccupancySettings, write_nav2, write_octomap
 from gausslite.export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite.export.video import write_video
 from gausslite.process import import_extra
@@ -85,12 +85,13 @@ class MapContent:
     """A map and the other content of its results folder; `views` and `report` are empty for a single PLY file.
 
     gaussians: the whole map. chosen: the Gaussians to write, at least one. left_out: how many Gaussians of the file are
-    in neither, because they are too far away or too large.
+    in neither; notes: why, because they are no numbers, too far away or too large.
     """
 
     gaussians: Gaussians
     chosen: Gaussians
     left_out: int = 0
+    notes: tuple[str, ...] = ()
     world_frame: str = ""
     views: Sequence[KeyframeView] = ()
     report: Mapping[str, object] = field(default_factory=dict)
@@ -114,7 +115,8 @@ class ExportSettings:
 class Format:
     """A file format.
 
-    suffix: of the written file. summary: one line of the help. region_only: if the user selects nothing, write only the
+    suffix: of the written file. companion: suffix of a second file with the same name. summary: one line of the help.
+    region_only: if the user selects nothing, write only the
     Gaussians of the task's region. max_extent_m: the largest coordinate and standard deviation that the format holds.
     """
 
@@ -123,6 +125,20 @@ class Format:
     write: Callable[[Path, MapContent, ExportSettings], None]
     region_only: bool = False
     max_extent_m: float = MAX_EXTENT_M
+    companion: str = ""
+
+    def files(self, out: Path) -> tuple[Path, ...]:
+        """Return the files that are written for this path. Raises InvalidInputError for the suffix of another format.
+
+        Other tools choose the reader by the suffix.
+        """
+        suffixes = (".yaml", ".yml") if self.suffix == ".yaml" else (Path(f"x{self.suffix}").suffix,)
+        if out.suffix.lower() not in suffixes:
+            expected = " or ".join(suffixes)
+            raise InvalidInputError(
+                f"--out {out}: expected a name with the suffix {expected}, such as map{self.suffix}"
+            )
+        return (out, out.with_suffix(self.companion)) if self.companion else (out,)
 
 
 def read_map(
@@ -140,17 +156,27 @@ def read_map(
     folder, file = (path, path / "map.ply") if path.is_dir() else (None, path)
     if not file.is_file():
         raise MapFileError(f"{path}: expected a results folder with map.ply, or a PLY file, got neither")
-    stored = read_ply(file)
-    if not len(stored):
+    stored = read_stored_map(file)
+    if not len(stored.gaussians):
         raise InvalidInputError(f"{path}: expected a map with at least one Gaussian, got an empty map")
-    gaussians = stored.take(_largest_extent_m(stored) <= max_extent_m)
+    gaussians = stored.gaussians.take(_largest_extent_m(stored.gaussians) <= max_extent_m)
     if not len(gaussians):
         raise InvalidInputError(f"{path}: expected Gaussians within {max_extent_m:g} m of the origin, got none")
     chosen = gaussians if region == "all" else gaussians.take(gaussians.active)
     if not len(chosen):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
-    return MapContent(gaussians, chosen, len(stored) - len(gaussians), read_world_frame(file), views, report)
+    notes = (left_out_note(stored),) if stored.left_out else ()
+    if len(gaussians) < len(stored.gaussians):
+        far = len(stored.gaussians) - len(gaussians)
+        notes += (
+            f"left out {far} of {len(stored.gaussians)} Gaussians: expected coordinates and standard deviations up to "
+            f"{max_extent_m:g} m, got larger ones",
+        )
+    total = len(stored.gaussians) + stored.left_out
+    return MapContent(
+        gaussians, chosen, total - len(gaussians), notes, world_frame=stored.world_frame, views=views, report=report
+    )
 
 
 def _largest_extent_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
@@ -203,7 +229,10 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
             region_only=True,
         ),
         "nav2": Format(
-            ".yaml", "2D grid", lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy)
+            ".yaml",
+            "2D grid",
+            lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy),
+            companion=NAV2_IMAGE,
         ),
         "mesh": Format(".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True),
         "video": Format(".mp4", "fly-through along the keyframes", _video),

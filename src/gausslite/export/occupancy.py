@@ -26,6 +26,8 @@ _MAX_SAMPLES = 1 << 28
 _MAX_GRID_CELLS = 1 << 26
 _MAX_OCTOMAP_KEY = 1 << 15
 """OctoMap keys are 16-bit integers with the origin in the middle."""
+NAV2_IMAGE = ".pgm"
+"""Suffix of the image beside a nav2 map."""
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 """Grey values of nav2's trinary map images."""
 _FLOOR_PERCENTILE = 2.0
@@ -100,7 +102,7 @@ def write_octomap(path: Path, gaussians: Gaussians, settings: OccupancySettings)
 
 
 def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) -> None:
-    """Write a nav2 map: `path` is the YAML file, the image next to it has the suffix .pgm.
+    """Write a nav2 map: `path` is the YAML file, the image next to it has the suffix NAV2_IMAGE.
 
     The grid lies in x and y, so the map's z axis must point up. The floor is at the 2nd percentile of the occupied
     heights. Raises InvalidInputError without an occupied voxel or if the grid is too large, StorageError.
@@ -109,7 +111,7 @@ def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) ->
     encoded, data = cv2.imencode(".pgm", image)
     if not encoded:
         raise InvalidInputError(f"nav2: expected an image that OpenCV can encode, got {image.shape}")
-    image_path = path.with_suffix(".pgm")
+    image_path = path.with_suffix(NAV2_IMAGE)
     write_atomic(image_path, data.tobytes())
     description = {
         "image": image_path.name,

@@ -65,25 +65,31 @@ MAP_TO_ODOM, TRAJECTORY = "map_to_odom.txt", "trajectory.txt"
 
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """A kind of file that a command writes; mark: bytes that stand among the first ones of each such file."""
+    """A kind of file that a command writes; mark: bytes that stand among the first ones of each such file.
+
+    suffix: by which other tools know the kind; empty if a file may have any name.
+    """
 
     name: str
     mark: bytes
+    suffix: str = ""
 
     def require_replaceable(self, path: Path) -> None:
-        """Raise StorageError if the path holds a file of another kind, which its user would lose."""
-        if not path.is_file():
-            return
+        """Raise StorageError for another suffix, or if the path holds a file of another kind, which would be lost."""
+        start = b""
         try:
-            with path.open("rb") as file:
-                start = file.read(_FIRST_BYTES)
+            if path.is_file():
+                with path.open("rb") as file:
+                    start = file.read(_FIRST_BYTES)
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
         if start and self.mark not in start:
             raise StorageError(f"{path} exists already and is not {self.name}; choose another name")
+        if not path.name.lower().endswith(self.suffix):
+            raise StorageError(f"{path}: expected a name with the suffix {self.suffix} for {self.name}")
 
 
-MAP_FILE = FileKind("a map", b"ply\nformat ")
+MAP_FILE = FileKind("a map", b"ply\nformat ", ".ply")
 STATE_FILE = FileKind("a saved run", STATE_FORMAT.encode())
 CALIBRATION_FILE = FileKind("a calibration", b"# gausslite calibrate")
 

@@ -46,9 +46,9 @@ def run_with_map(results, folder, gaussians):
     return folder
 
 
-def test_an_empty_map_and_a_mean_that_is_nan_are_refused_by_every_format(results, tmp_path, capsys):
+def test_an_empty_map_and_one_of_nan_are_refused_by_every_format(results, tmp_path, capsys):
     gaussians = read_ply(results / "map.ply")
-    gaussians.means_m[3, 1] = np.nan
+    gaussians.means_m[:, 1] = np.nan
     empty = run_with_map(results, tmp_path / "empty", Gaussians.empty())
     not_finite = run_with_map(results, tmp_path / "nan", gaussians)
     for name in ALL_FORMATS:
@@ -76,6 +76,42 @@ def test_gaussians_far_outside_are_left_out_with_one_line(results, tmp_path, nam
         f"left out 2 of {len(gaussians)} Gaussians: expected coordinates and standard deviations up to "
         f"{FORMATS[name].max_extent_m:g} m, got larger ones"
     ]
+
+
+@pytest.mark.parametrize("name", ALL_FORMATS)
+def test_a_gaussian_of_nan_is_left_out_with_one_line(results, tmp_path, name, capsys):
+    gaussians = read_ply(results / "map.ply")
+    gaussians.means_m[3, 1] = np.nan
+    run = run_with_map(results, tmp_path / "nan", gaussians)
+    assert main(["export", str(run), "--to", name, "--region", "all", "--json", *OPTIONS.get(name, ())]) == 0
+    captured = capsys.readouterr()
+    assert (json.loads(captured.out)["left_out"], np.isnan(gaussians.means_m).sum()) == (1, 1)
+    notes = [line for line in captured.err.splitlines() if "left out" in line]
+    assert notes == [f"left out 1 of {len(gaussians)} Gaussians: column y: expected finite values, got NaN or infinity"]
+
+
+@pytest.mark.parametrize("name", ALL_FORMATS)
+def test_the_suffix_of_another_format_is_refused(results, tmp_path, name, capsys):
+    for suffix in (".ply", ".gltf", ".pgm", ".txt", ""):
+        out = tmp_path / f"map{suffix}"
+        if FORMATS[name].suffix.endswith(suffix or "."):
+            continue
+        assert main(["export", str(results), "--to", name, "--region", "all", "--out", str(out)]) == 2
+        assert f"{out}: expected a name with the suffix" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_image_of_a_grid_replaces_no_file_without_overwrite(results, tmp_path, capsys):
+    image = tmp_path / "plan.pgm"
+    image.write_text("a floor plan")
+    for suffix in (".yaml", ".yml", ".YAML"):
+        command = ["export", str(results), "--to", "nav2", "--voxel", "0.1", "--out", str(tmp_path / f"plan{suffix}")]
+        assert main(command) == 2
+        assert f"{image} exists already" in capsys.readouterr().err
+        assert [file.name for file in tmp_path.iterdir()] == ["plan.pgm"]
+    assert image.read_text() == "a floor plan"
+    assert main([*command, "--overwrite"]) == 0
+    assert image.read_bytes()[:2] == b"P5"
 
 
 @pytest.mark.parametrize("name", ALL_FORMATS)

@@ -82,4 +82,7 @@ def test_a_file_of_another_kind_is_not_replaced(
     notes.write_text("1 0 0 0 0 0 0 1")
     assert fuse(*maps, notes) == 2
     assert "groundtruth.txt exists already and is not a map; choose another name" in capsys.readouterr().err
+    assert fuse(*maps, tmp_path / "fused.spz") == 2
+    assert "fused.spz: expected a name with the suffix .ply for a map" in capsys.readouterr().err
+    assert not (tmp_path / "fused.spz").exists()
     assert notes.read_text() == "1 0 0 0 0 0 0 1"

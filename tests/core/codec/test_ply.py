@@ -94,13 +94,20 @@ def test_columns_are_found_by_name() -> None:
         (lambda data: data[:-1], "expected 3 Gaussians"),
         (lambda data: b"", "expected a PLY file"),
         (lambda data: b"glTF" + data[4:], "expected a PLY file"),
-        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "binary_little_endian 1.0, got format ascii"),
+        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "expected rows of 17 numbers"),
+        (
+            lambda data: data.replace(b"binary_little_endian", b"binary"),
+            "expected a format of .* got format binary 1.0",
+        ),
         (lambda data: data.replace(b"vertex 3", b"vertex 99999999999"), "expected 0 to 100000000 Gaussians"),
         (lambda data: data.replace(b"vertex 3", b"vertex -3"), "Gaussians, got '-3'"),
         (lambda data: data.replace(b"float opacity", b"float opaqueness"), "missing opacity"),
         (lambda data: data.replace(b"float y", b"float x"), "once per column"),
-        (lambda data: data.replace(b"float y", b"list uchar int y"), "once per column"),
-        (lambda data: data[:-68] + b"\x00\x00\xc0\x7f" + data[-64:], "expected finite values"),
+        (lambda data: data.replace(b"float y", b"list uchar int y"), "missing y"),
+        (lambda data: data.replace(b"float y", b"list uchar int n\nproperty float y"), "element vertex: .* got a list"),
+        (lambda data: data.replace(b"float x\n", b"float packed_position\n"), "got SuperSplat's compressed PLY"),
+        (lambda data: data.replace(b"element vertex", b"element point"), "expected an element 'vertex', got point"),
+        (lambda data: data[:-204] + b"\x00\x00\xc0\x7f" * 51, "column x: expected finite values"),
     ],
 )
 def test_the_error_of_a_damaged_map_names_the_file(tmp_path: Path, spoil: object, message: str) -> None:
@@ -148,14 +155,15 @@ def test_a_full_disk_raises_storage_error_and_keeps_the_old_map(tmp_path: Path) 
         write_ply(tmp_path / "no" / "map.ply", random_gaussians(3))
 
 
-@pytest.mark.parametrize("name", ["map", "Küche 2", "end_header", "world frame"])
+@pytest.mark.parametrize("name", ["map", "Küche 2", "日本", "50% %41 \\", "end_header", "world frame"])
 def test_the_world_frame_is_read_back_and_changes_nothing_else(name: str, tmp_path: Path) -> None:
     gaussians = random_gaussians(5)
     write_ply(tmp_path / "map.ply", gaussians, name)
     assert read_world_frame(tmp_path / "map.ply") == name
     assert ply_bytes(read_ply(tmp_path / "map.ply")) == ply_bytes(gaussians_from_ply(ply_bytes(gaussians)))
     assert world_frame_from_ply(ply_bytes(gaussians)) == ""
-    header = f"comment world_frame {name}\n".encode()
+    [header] = (line for line in ply_bytes(gaussians, name).splitlines(keepends=True) if b"world_frame" in line)
+    assert header.isascii()
     assert ply_bytes(gaussians, name).replace(header, b"", 1) == ply_bytes(gaussians)
 
 
@@ -180,3 +188,76 @@ def test_a_signalling_nan_is_refused_without_a_warning() -> None:
     data[start : start + 4] = b"\x01\x00\x80\x7f"
     with pytest.raises(MapFileError, match="column x: expected finite values"):
         gaussians_from_ply(bytes(data))
+
+
+def test_a_world_frame_in_utf_8_of_an_earlier_file_is_read() -> None:
+    data = ply_bytes(random_gaussians(1), "NAME").replace(b"NAME", "Küche".encode())
+    assert world_frame_from_ply(data) == "Küche"
+
+
+COLUMNS = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
+ROW = np.dtype([(name, "<f4") for name in (*COLUMNS, "rot_0", "rot_1", "rot_2", "rot_3")])
+
+
+def other_tools_file(rows: np.ndarray, file_format: str = "binary_little_endian", before: str = "") -> bytes:
+    """Return the rows of ROW as another tool writes them; before: header of an element with one row of one float."""
+    header = f"ply\nformat {file_format} 1.0\ncomment other tool\n{before}element vertex {len(rows)}\n"
+    header += "".join(f"property float {name}\n" for name in ROW.names or ()) + "end_header\n"
+    if file_format == "ascii":
+        lines = ["0.5"] * bool(before) + [" ".join(str(float(value)) for value in row) for row in rows.tolist()]
+        return (header + "\n".join(lines) + "\n").encode()
+    order = ">" if file_format == "binary_big_endian" else "<"
+    return header.encode() + bytes(4 * bool(before)) + rows.astype(ROW.newbyteorder(order)).tobytes()
+
+
+def other_tools_rows(n: int = 9) -> np.ndarray:
+    sent, rows = random_gaussians(n), np.zeros(n, ROW)
+    for i in range(3):
+        rows["xyz"[i]], rows[f"scale_{i}"] = sent.means_m[:, i], np.log(sent.scales_m[:, i])
+    for i in range(4):
+        rows[f"rot_{i}"] = sent.quats_wxyz[:, i]
+    return rows
+
+
+@pytest.mark.parametrize("before", ["", "element intrinsic 1\nproperty float f\n"])
+@pytest.mark.parametrize("file_format", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_every_format_of_ply_is_read_also_after_another_element(file_format: str, before: str) -> None:
+    read = gaussians_from_ply(other_tools_file(other_tools_rows(), file_format, before))
+    np.testing.assert_array_equal(read.means_m, random_gaussians(9).means_m)
+    np.testing.assert_allclose(read.scales_m, random_gaussians(9).scales_m, rtol=1e-5)
+
+
+def test_rows_of_another_length_in_ascii_are_refused() -> None:
+    data = other_tools_file(other_tools_rows(), "ascii")
+    for spoiled in (data[:-40], data.rstrip() + b" 7\n", data[:-8] + b"x" + data[-7:]):
+        with pytest.raises(MapFileError, match=r"expected (9 )?rows of"):
+            gaussians_from_ply(spoiled)
+
+
+@pytest.mark.parametrize("file_format", ["binary_little_endian", "ascii"])
+def test_infinite_logits_are_opaque_or_transparent_and_scales_flat(file_format: str) -> None:
+    rows = other_tools_rows()
+    rows["opacity"][:2], rows["scale_2"][2] = [np.inf, -np.inf], -np.inf
+    read = gaussians_from_ply(other_tools_file(rows, file_format))
+    np.testing.assert_allclose(read.opacities[:2], [1, 0], atol=1e-6)
+    assert 0 < read.scales_m[2, 2] < 1e-30
+    assert np.isfinite(gaussians_from_ply(ply_bytes(read)).scales_m).all()
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("x", np.nan), ("z", np.inf), ("opacity", np.nan), ("scale_0", 90.0), ("rot_1", np.inf)]
+)
+def test_a_row_that_is_no_gaussian_is_left_out_with_one_line(tmp_path: Path, column: str, value: float) -> None:
+    rows = other_tools_rows()
+    rows[column][3] = value
+    (tmp_path / "map.ply").write_bytes(other_tools_file(rows))
+    lines: list[str] = []
+    read = read_ply(tmp_path / "map.ply", lines.append)
+    np.testing.assert_array_equal(read.means_m, np.delete(random_gaussians(9).means_m, 3, axis=0))
+    assert lines == [
+        f"{tmp_path}/map.ply: left out 1 of 9 Gaussians: column {column}: expected finite values, got NaN or infinity"
+    ]
+    with pytest.warns(UserWarning, match="left out 1 of 9"):
+        read_ply(tmp_path / "map.ply")
+    with pytest.raises(MapFileError, match=f"column {column}"):
+        gaussians_from_ply(other_tools_file(rows))
