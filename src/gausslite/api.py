@@ -129,7 +129,7 @@ def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None, force: b
     """
     found = calibrate(open_source(str(spec), up_axis), StatedValues(force=force))
     notes = tuple(str(evidence) for evidence in found.evidence if not evidence.guaranteed)
-    return CalibratedSequence(found.source, found.pose_prior, notes)
+    return CalibratedSequence(found.source, found.pose_prior, (*found.notes, *notes))
 
 
 def create_mapper(

@@ -246,6 +246,11 @@ class BagSource:
         return False
 
     @property
+    def depth_unit_stated(self) -> bool:
+        """True: ROS defines it, or the bag's address states it."""
+        return True
+
+    @property
     def world_frame(self) -> str:
         """Name of the bag."""
         return self.name

@@ -111,6 +111,11 @@ class SimulatedHome:
         return self._settings.drift_percent == 0
 
     @property
+    def depth_unit_stated(self) -> bool:
+        """True: metres."""
+        return True
+
+    @property
     def world_frame(self) -> str:
         """Home and seed: all trajectories through one home share its frame."""
         return f"{self._settings.home_name.replace(':', '-')}-seed-{self._settings.seed}"

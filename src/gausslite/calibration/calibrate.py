@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gausslite.calibration.camera_estimate import estimate_camera
 from gausslite.calibration.consistency import find_contradiction
@@ -30,7 +30,8 @@ class StatedValues:
     """What the user states of a recording; None leaves a value to the source's guarantee or to an estimate.
 
     depth_as_recorded: depth is used without registration. lens: kept where the camera is estimated, in place of the
-    lens that the source's files state. force: poses and depth are used although they contradict the images.
+    lens that the source's files state. force: poses and depth are used although they contradict the images. checked:
+    they are not compared with the images, because that was done before, or because given poses are not used.
     """
 
     registration: DepthRegistration | None = None
@@ -39,6 +40,7 @@ class StatedValues:
     lens: Lens | None = None
     pose_prior: PoseExposurePrior | None = None
     force: bool = False
+    checked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,8 @@ class Calibration:
     """A source with registered depth and corrected images, what was applied to it, and the errors of its poses.
 
     registration: None if depth is used as recorded. correction: the identity if images are. evidence: of each value
-    that the user did not state.
+    that the user did not state. notes: on poses or depth that contradict the images; then nothing is estimated from
+    pairs of frames.
     """
 
     source: Source
@@ -72,6 +75,7 @@ class Calibration:
     correction: CameraCorrection
     pose_prior: PoseExposurePrior
     evidence: tuple[Evidence, ...]
+    notes: tuple[str, ...] = ()
 
 
 def calibrate(
@@ -83,8 +87,13 @@ def calibrate(
     that contradict the images, PoseError, InvalidInputError.
     """
     stated = stated or StatedValues()
-    if not stated.force:
-        _require_consistent(source)
+    notes = () if stated.checked else _contradictions(source, stated.force)
+    if notes:
+        correction, prior = stated.correction, stated.pose_prior
+        lens = stated.lens or (source.lens if source.depth_registered else None)
+        stated = replace(
+            stated, correction=correction or CameraCorrection(lens), pose_prior=prior or PoseExposurePrior()
+        )
     found: list[Evidence] = []
 
     def decide(evidence: Evidence) -> None:
@@ -105,17 +114,24 @@ def calibrate(
     prior = stated.pose_prior
     if prior is None:
         prior = _pose_prior_of(source, decide)
-    return Calibration(source, registration, correction, prior, tuple(found))
+    return Calibration(source, registration, correction, prior, tuple(found), notes)
 
 
-def _require_consistent(source: Source) -> None:
+def _contradictions(source: Source, force: bool) -> tuple[str, ...]:
+    """Return a note on poses or depth that contradict the images, with `force` or if only an assumed unit is wrong.
+
+    Otherwise raises DatasetError.
+    """
     if source.poses_exact or source.camera_ideal:
-        return
-    contradiction = find_contradiction(source)
-    if contradiction is not None:
-        raise DatasetError(
-            f"{source.name}: {contradiction}; correct the recording, or map it as it is with --set force=true"
-        )
+        return ()
+    found = find_contradiction(source)
+    if found is None:
+        return ()
+    if found.only_unit and not source.depth_unit_stated:
+        return (f"{found}; the files do not state the unit of depth: state it as scale in cam_params.json",)
+    if force:
+        return (str(found),)
+    raise DatasetError(f"{source.name}: {found}; correct the recording, or map it as it is with --set force=true")
 
 
 def _registration_of(source: Source, decide: Callable[[Evidence], None]) -> DepthRegistration | None:

@@ -119,8 +119,22 @@ def _errors(readings: Sequence[_Reading], pairs: Sequence[_Pair]) -> Float64[nda
     return errors
 
 
-def find_contradiction(source: Source) -> str | None:
-    """Return how poses or depth contradict the images, and what would agree; None if they do not, or cannot be judged.
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """How poses or depth contradict the images, and what would agree, as one line.
+
+    only_unit: the stated poses and another unit of depth would agree.
+    """
+
+    text: str
+    only_unit: bool = False
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def find_contradiction(source: Source) -> Contradiction | None:
+    """Return how poses or depth contradict the images; None if they do not, or if it cannot be judged.
 
     Frames that cannot be read are ignored. Takes about a second. Raises DatasetError, PoseError.
     """
@@ -136,10 +150,11 @@ def find_contradiction(source: Source) -> str | None:
     off = f"points of {len(pairs)} pairs of frames are off by {error:.0%} of their motion"
     best = _best_reading(list(_readings(trajectory, pairs)), pairs, error, depth)
     if best is not None:
-        return f"poses and depth do not fit the images ({off}); {best} would agree"
+        only_unit = depth is not None and best == depth.words
+        return Contradiction(f"poses and depth do not fit the images ({off}); {best} would agree", only_unit)
     if error < _WRONG:
         return None
-    return (
+    return Contradiction(
         f"poses and depth do not fit the images ({off}); no other convention, clock or unit of depth agrees; "
         "do they belong to this recording and this camera?"
     )

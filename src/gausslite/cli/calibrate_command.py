@@ -12,6 +12,7 @@ from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import to_toml
 from gausslite.config.values import read_correction, read_up_axis
 from gausslite.mission.results import CALIBRATION_FILE, as_text, prepare_file
+from gausslite.process import print_message
 
 _STEPS = 3
 _KNOWN_HELP = "keep these values, and estimate what they leave out (default: the lens that the files state)"
@@ -44,6 +45,8 @@ def run(options: argparse.Namespace) -> int:
             bar.update()
 
         calibration = calibrate(source, StatedValues(lens=lens), count)
+    for note in calibration.notes:
+        print_message(f"{options.source}: {note}")
     text = _as_toml(options.source, calibration)
     if options.out is not None:
         write_atomic(options.out, text.encode())

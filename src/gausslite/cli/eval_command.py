@@ -168,7 +168,7 @@ class _Conditions:
         if from_report:
             print_message(f"from the report next to {options.map.name}: {' '.join(from_report)}")
         # views are scored from the poses as they are, or fitted; `map` has compared them with the images
-        stated = replace(stated_values(registration, correction, PoseExposurePrior()), force=True)
+        stated = replace(stated_values(registration, correction, PoseExposurePrior()), checked=True)
         if poses == PoseMode.TRACK:
             return cls(stated, fit_views, read_trajectory(options.map.parent), None)
         corrections = read_corrections(options.map.parent)

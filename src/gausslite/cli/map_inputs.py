@@ -78,7 +78,7 @@ class MapInputs:
         """Return the inputs with registration, correction and prior: those stated, else guaranteed or estimated."""
         recorded, poses = self.stream.source, self.mission.poses
         if poses is PoseMode.TRACK:
-            stated = replace(stated, force=True)  # given poses are not used
+            stated = replace(stated, checked=True)  # given poses are not used
         if poses is PoseMode.TRACK and stated.correction is None:
             # readout time and offset are estimated from given poses
             stated = replace(stated, correction=CameraCorrection(recorded.lens))
@@ -108,7 +108,7 @@ class MapInputs:
         pose_prior = options.pose_prior
         if pose_prior == AUTO:
             pose_prior = saved.value(MissionSettings, "pose_prior")
-        inputs = self.calibrated(replace(stated_values(registration, correction, pose_prior), force=True))
+        inputs = self.calibrated(replace(stated_values(registration, correction, pose_prior), checked=True))
         saved.require(*inputs._fixed_settings(saved.last_index))
         _report_other_step(saved, self.source.frames)
         return inputs

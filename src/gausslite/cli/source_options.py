@@ -96,7 +96,10 @@ def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> 
             f"{spec}: this layout does not state whether depth is registered to colour; the registration is estimated "
             f"now, --set register-depth={NONE} uses depth as recorded"
         )
-    return calibrate(source, stated, _report_estimate)
+    found = calibrate(source, stated, _report_estimate)
+    for note in found.notes:
+        print_message(f"{spec}: {note}")
+    return found
 
 
 def _report_estimate(evidence: Evidence) -> None:

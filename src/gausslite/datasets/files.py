@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 import zlib
@@ -201,24 +202,55 @@ def _size(image: NDArray[Any]) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
 
 
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_SEPARATORS = re.compile(r"[\s,;\"']+")
+
+
 def read_text(path: Path) -> str:
-    """Return the whole file without a byte-order mark. Raises DatasetError if it is missing or not text."""
+    """Return the whole file without a byte-order mark: UTF-8, UTF-16 with a mark (PowerShell), or else Latin-1.
+
+    Raises DatasetError if it is missing or not text.
+    """
     try:
-        return path.read_text(encoding="utf-8-sig")
+        data = path.read_bytes()
+        if data.startswith(_UTF_16):
+            return data.decode("utf-16")
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("latin-1")
     except FileNotFoundError:
         raise DatasetError(f"{path}: expected a text file, got none") from None
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: expected a readable text file, got {type(error).__name__}") from None
+    if "\0" in text:
+        raise DatasetError(f"{path}: expected a readable text file, got zero bytes; save it as UTF-8")
+    return text
+
+
+def read_lines(path: Path) -> list[tuple[str, str]]:
+    """Return the location ("FILE line 3") and the text of each line, without blank lines and comments (#)."""
+    lines = enumerate(map(str.strip, read_text(path).splitlines()), start=1)
+    return [(f"{path} line {number}", text) for number, text in lines if text and not text.startswith("#")]
 
 
 def read_rows(path: Path) -> list[tuple[str, list[str]]]:
-    """Return the location ("FILE line 3") and the fields of each row, without blank rows and comments (#)."""
-    rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        text = line.strip()
-        if text and not text.startswith("#"):
-            rows.append((f"{path} line {number}", text.split()))
-    return rows
+    """Return the location and the fields of each row of numbers, separated by blanks, commas or semicolons.
+
+    Quotes, empty rows and a header of words are left out, as spreadsheets write them.
+    """
+    rows = [(location, [field for field in _SEPARATORS.split(text) if field]) for location, text in read_lines(path)]
+    rows = [(location, fields) for location, fields in rows if fields]
+    return rows[1:] if rows and not any(map(is_number, rows[0][1])) else rows
+
+
+def is_number(text: str) -> bool:
+    """Return True for text that `float` reads."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def parse_numbers(location: str, fields: list[str], count: int, meaning: str) -> list[float]:

@@ -117,6 +117,7 @@ class FolderSource:
     _camera: Camera
     _lens: Lens | None
     _camera_note: str
+    _unit_stated: bool
     _units: DepthUnits
     _up_axis: UpAxis
 
@@ -127,6 +128,7 @@ class FolderSource:
     def _set_camera(self, found: FolderCamera, default_units: DepthUnits) -> None:
         """Use this camera and its depth units, if it states them."""
         self._camera, self._lens, self._camera_note = found.camera, found.lens, found.note
+        self._unit_stated = found.units_per_metre is not None
         self._units = replace(default_units, per_metre=found.units_per_metre or default_units.per_metre)
 
     @property
@@ -168,6 +170,11 @@ class FolderSource:
     def poses_exact(self) -> bool:
         """False: the files do not state how the poses were found."""
         return False
+
+    @property
+    def depth_unit_stated(self) -> bool:
+        """True if a camera file states it."""
+        return self._unit_stated
 
     @property
     def world_frame(self) -> str:

@@ -263,7 +263,7 @@ class Record3dSource(FolderSource):
         self._recorded = len(recorded)
         self._numbers = [n for n in recorded if self._files.has(f"rgbd/{n}.depth") and self._may_use(n)]
         require_frames(path, len(self._numbers), "rgbd/0.jpg ... with .depth files and poses in metadata")
-        self._set_camera(FolderCamera(self._metadata.camera), DepthUnits(1.0))
+        self._set_camera(FolderCamera(self._metadata.camera, units_per_metre=1.0), DepthUnits(1.0))
         rotations = np.array([self._read_pose(n)[:3, :3] for n in self._numbers])
         self._up_axis = unit_up_axis(up_axis or estimate_up(rotations, _FIRST_VIEW_UP))
 

@@ -78,6 +78,11 @@ class Source(Protocol):
         ...
 
     @property
+    def depth_unit_stated(self) -> bool:
+        """True if the files or the format state the unit of depth; False if it is the layout's usual one."""
+        ...
+
+    @property
     def world_frame(self) -> str:
         """Name of the poses' frame, the same for sequences that share it."""
         ...
@@ -256,6 +261,11 @@ class WrappedSource:
     def poses_exact(self) -> bool:
         """True if the wrapped source's poses are exact."""
         return self._source.poses_exact
+
+    @property
+    def depth_unit_stated(self) -> bool:
+        """As the wrapped source has it."""
+        return self._source.depth_unit_stated
 
     @property
     def world_frame(self) -> str:

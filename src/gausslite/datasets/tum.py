@@ -17,9 +17,11 @@ from gausslite.datasets.files import (
     DepthUnits,
     FolderCamera,
     first_readable_size,
+    is_number,
     load_rgbd,
     parse_numbers,
     read_folder_camera,
+    read_lines,
     read_rows,
 )
 from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, PoseTrack, is_lost, pose_from_quaternion
@@ -31,6 +33,8 @@ from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 
 _UNITS = DepthUnits(per_metre=5000.0)
 _POSES = "groundtruth.txt"
+_SEPARATOR = re.compile(r"[\s,;\"']+")
+"""Separates a time from the rest of its row."""
 _MAX_DEPTH_LAG_S = 0.020
 _MAX_POSE_GAP_S = 0.100
 _MAX_TIME_S = 9e9
@@ -144,13 +148,15 @@ def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int]:
 
 
 def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
-    """Return ascending times in seconds and the image path of each."""
+    """Return ascending times in seconds and the image path of each; a header of words is left out."""
     times, names = [], []
-    for location, fields in read_rows(path):
-        if len(fields) != 2:
-            raise DatasetError(f"{location}: expected a time and a file name, got {len(fields)} fields")
+    rows = [(location, _SEPARATOR.split(text.strip("\"'"), maxsplit=1)) for location, text in read_lines(path)]
+    for location, fields in rows[1:] if rows and not is_number(rows[0][1][0]) else rows:
+        name = _file_name(path.parent, fields[-1])
+        if len(fields) != 2 or name is None:
+            raise DatasetError(f"{location}: expected a time and a file name, got {' '.join(fields)[:60]!r}")
         times += parse_numbers(location, fields[:1], 1, "a time in seconds")
-        names.append(fields[1])
+        names.append(name)
         if not np.isfinite(times[-1]) or (len(times) > 1 and times[-1] < times[-2]):
             raise DatasetError(f"{location}: expected finite times in ascending order, got {fields[0]}")
         if abs(times[-1]) > _MAX_TIME_S:
@@ -158,6 +164,17 @@ def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
     if not times:
         raise DatasetError(f"{path}: expected rows of a time and a file name, got none")
     return np.array(times), names
+
+
+def _file_name(folder: Path, text: str) -> str | None:
+    """Return a file's name without quotes or with Windows' separators; None for further fields after it.
+
+    A name with blanks must exist, because it may be several fields.
+    """
+    name = text.strip(" \t\"'")
+    if "\\" in name and not (folder / name).is_file():
+        name = name.replace("\\", "/")
+    return name if name and (len(name.split()) == 1 or (folder / name).is_file()) else None
 
 
 def _read_poses(path: Path, required: bool) -> PoseTrack | None:

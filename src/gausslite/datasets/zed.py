@@ -95,13 +95,9 @@ def _read_pose_rows(folder: Path, required: bool) -> Mapping[int, tuple[str, Flo
             )
         return {}
     rows = {}
-    for i, (location, fields) in enumerate(read_rows(path)):
-        cells = " ".join(fields).replace(",", " ").split()
-        if i == 0 and cells and cells[0].isalpha():
-            # a header names the columns
-            continue
-        numbers = parse_numbers(location, cells, 8, _MEANING)
+    for location, fields in read_rows(path):
+        numbers = parse_numbers(location, fields, 8, _MEANING)
         if not 0 <= numbers[0] <= 999_999 or numbers[0] != int(numbers[0]):
-            raise DatasetError(f"{location}: expected a frame's number, such as 12 for left000012.png, got {cells[0]}")
+            raise DatasetError(f"{location}: expected a frame's number, such as 12 for left000012.png, got {fields[0]}")
         rows[int(numbers[0])] = location, np.array(numbers[1:])
     return rows

@@ -29,6 +29,7 @@ class Recording(WrappedSource):
     """Frames of a simulated home that state neither exact poses nor an ideal camera; 30 frames a second."""
 
     camera_ideal = poses_exact = False
+    depth_unit_stated = True
 
     def __init__(self, home: Source, positions: list[int]) -> None:
         super().__init__(home)
@@ -119,8 +120,7 @@ def test_another_clock_is_named(home: Source) -> None:
     recording = Recording(home, [*range(24), *range(22, -1, -1)])
     recording.poses = np.roll(recording.poses, 6, axis=0)
     contradiction = find_contradiction(recording)
-    assert contradiction is not None
-    assert "poses 0.20 s later (clocks" in contradiction
+    assert "poses 0.20 s later (clocks" in str(contradiction)
 
 
 def test_poses_of_another_recording_are_refused(recording: Recording) -> None:
@@ -147,9 +147,24 @@ def test_a_camera_at_rest_and_images_without_features_give_no_verdict(home: Sour
     assert find_contradiction(recording) is None
 
 
-def test_contradictory_poses_are_used_on_request(recording: Recording) -> None:
+def test_contradictory_poses_are_used_on_request_without_estimates(recording: Recording) -> None:
     recording.poses = np.linalg.inv(recording.poses)
-    assert calibrate(recording, replace(NOTHING_ESTIMATED, force=True)).source.trajectory() is not None
+    found = calibrate(recording, StatedValues(force=True))
+    assert [(note.split(" (")[0], "world-to-camera" in note) for note in found.notes] == [
+        ("poses and depth do not fit the images", True)
+    ]
+    assert (found.correction.is_identity, found.pose_prior.is_exact) == (True, True)
+    assert calibrate(recording, replace(NOTHING_ESTIMATED, checked=True)).notes == ()
+
+
+def test_a_wrong_unit_that_the_files_do_not_state_is_noted(recording: Recording) -> None:
+    recording.depth_unit_stated, recording.depth_factor = False, 0.2
+    [note] = calibrate(recording).notes
+    assert "depth multiplied by" in note
+    assert note.endswith("state it as scale in cam_params.json")
+    recording.poses = np.linalg.inv(recording.poses)
+    with pytest.raises(DatasetError, match="world-to-camera"):
+        calibrate(recording)
 
 
 @pytest.mark.parametrize("name", ["tum_fr1", "redkitchen", "hololens_kitchenette"])

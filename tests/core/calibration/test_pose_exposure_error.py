@@ -28,7 +28,7 @@ class Recording:
         self._frames = [home.frame(i) for i in range(FRAMES)]
         self.name, self.camera, self.up_axis = "recording", home.camera, home.up_axis
         self.depth_registered, self.notes = True, ()
-        self.camera_ideal = self.poses_exact = False
+        self.camera_ideal = self.poses_exact = self.depth_unit_stated = False
         self.lens, self.world_frame, self.regions_file = None, "recording", None
         self.damaged: set[int] = set()
         rng = np.random.default_rng(0)

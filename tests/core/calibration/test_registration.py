@@ -76,7 +76,7 @@ class EnlargedSource:
         self.camera = k.resized(4 * k.width_px, 4 * k.height_px)
         self.name, self.up_axis, self.depth_registered = "enlarged", small.up_axis, False
         self.notes = ()
-        self.camera_ideal = self.poses_exact = False
+        self.camera_ideal = self.poses_exact = self.depth_unit_stated = False
         self.lens, self.world_frame, self.regions_file = None, self.name, None
 
     def __len__(self) -> int:
@@ -122,7 +122,7 @@ class UnregisteredSource:
         self.name, self.camera, self.up_axis = "unregistered", DEPTH_CAMERA, self._home.up_axis
         self.depth_registered = False
         self.notes = ()
-        self.camera_ideal = self.poses_exact = False
+        self.camera_ideal = self.poses_exact = self.depth_unit_stated = False
         self.lens, self.world_frame, self.regions_file = None, self.name, None
         self.damaged: int | None = None
 

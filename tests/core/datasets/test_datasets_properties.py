@@ -28,7 +28,7 @@ class Numbered:
     camera = Camera(1.0, 1.0, 1.0, 1.0, 2, 2)
     up_axis = (0.0, 0.0, 1.0)
     depth_registered = True
-    camera_ideal = poses_exact = True
+    camera_ideal = poses_exact = depth_unit_stated = True
     world_frame, regions_file = "numbered", None
     notes = ()
     lens = None

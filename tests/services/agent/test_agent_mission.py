@@ -59,6 +59,7 @@ class Wall:
     depth_registered: bool = True
     camera_ideal: bool = True
     poses_exact: bool = True
+    depth_unit_stated: bool = True
     world_frame: str = "wall"
     regions_file: None = None
     notes: tuple[str, ...] = ()
