@@ -2,15 +2,12 @@
 
 import sys
 
-from gausslite.process import end_quietly_while_starting
+from gausslite.process import run_program
 
 
 def main() -> int:
     """Run the command line and return the exit code."""
-    end_quietly_while_starting("gausslite")
-    from gausslite.cli.main import main as run
-
-    return run()
+    return run_program("gausslite", "gausslite.cli.main", "main")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What every program of the package shares: messages, signals, optional packages, and packages beside the core.
 
-Programs call `end_quietly_while_starting` before their other imports, because imports take most of the start-up. The
+Programs call `run_program`, which handles signals before the other imports: those take most of the start-up. The
 handler is our own and not the system's default, because process 1 of a container ignores signals without a handler.
 """
 
@@ -62,6 +62,36 @@ def raise_interrupts() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if isinstance(signal.getsignal(signal.SIGTERM), _QuietEnd):
         signal.signal(signal.SIGTERM, _raise_terminated)
+
+
+def run_program(program: str, module: str, function: str = "run") -> int:
+    """Import the module, call its function and return the exit code; signals are handled from the start.
+
+    A library that is older than its generated code gives one line and exit code 2.
+    """
+    end_quietly_while_starting(program)
+    try:
+        return int(getattr(import_module(module), function)())
+    except Exception as error:
+        package = _outdated_package(error)
+        if package is None:
+            raise
+        reason = " ".join(str(error).split()).partition(". ")[0]
+        print_message(
+            f"{program}: the installed {package} is too old, perhaps because another package has pinned it; "
+            f"run pip install --upgrade {package} ({reason})"
+        )
+        return 2
+
+
+def _outdated_package(error: Exception) -> str | None:
+    """Return the package whose version causes an import to fail; None for other errors."""
+    if type(error).__module__ == "google.protobuf.runtime_version":
+        return "protobuf"
+    if isinstance(error, ImportError) and (error.name or "").startswith("google.protobuf"):
+        return "protobuf"
+    is_generated = isinstance(error, RuntimeError) and "generated code" in str(error)
+    return "grpcio" if is_generated and "grpc package installed" in str(error) else None
 
 
 class Terminated(KeyboardInterrupt):

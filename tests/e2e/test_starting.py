@@ -58,6 +58,32 @@ def test_a_started_program_keeps_its_own_handlers() -> None:
         signal.signal(signal.SIGTERM, before)
 
 
+FAILURES = {
+    "protobuf": "from google.protobuf import runtime_version as v\nraise v.VersionError('gencode 7 runtime 5. More')",
+    "protobuf without the check": "from google.protobuf import no_such_module",
+    "grpcio": "raise RuntimeError('The grpc package installed is at version 1, but the generated code depends on 2')",
+}
+
+
+@pytest.mark.parametrize("name", FAILURES)
+def test_a_library_older_than_its_generated_code_gives_one_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / "program.py").write_text(FAILURES[name])
+    code = "import sys\nfrom gausslite.process import run_program\nsys.exit(run_program('gausslite', 'program'))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, timeout=60, capture_output=True, text=True, check=False
+    )
+    [line] = done.stderr.splitlines()
+    assert done.returncode == 2
+    assert f"pip install --upgrade {name.split()[0]} (" in line
+
+
+def test_another_error_of_an_import_keeps_its_traceback(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text("import no_such_module")
+    code = "from gausslite.process import run_program\nrun_program('gausslite', 'program')"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, timeout=60, capture_output=True, check=False)
+    assert (done.returncode, b"ModuleNotFoundError" in done.stderr) == (1, True)
+
+
 def test_after_the_start_both_signals_raise() -> None:
     code = (
         "import signal\n"

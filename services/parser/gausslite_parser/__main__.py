@@ -2,15 +2,12 @@
 
 import sys
 
-from gausslite.process import end_quietly_while_starting
+from gausslite.process import run_program
 
 
 def main() -> int:
     """Run the program with the command line's arguments and return the exit code."""
-    end_quietly_while_starting("gausslite-parser")
-    from gausslite_parser.program import run
-
-    return run()
+    return run_program("gausslite-parser", "gausslite_parser.program")
 
 
 if __name__ == "__main__":

@@ -166,7 +166,7 @@ def read_map(
     if not len(chosen):
         raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
     views = [] if folder is None else read_keyframe_views(folder)
-    notes = (left_out_note(stored),) if stored.left_out else ()
+    notes: tuple[str, ...] = (left_out_note(stored),) if stored.left_out else ()
     if len(gaussians) < len(stored.gaussians):
         far = len(stored.gaussians) - len(gaussians)
         notes += (

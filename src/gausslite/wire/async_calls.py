@@ -11,7 +11,7 @@ from gausslite.domain.errors import CodecError
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2, parser_service_pb2
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
-from gausslite.wire.channel import require_callable
+from gausslite.wire.channel import proxy_options, require_callable
 
 ENDED_WHILE_SENDING = "ENDED_WHILE_SENDING"
 _LOCAL_ERROR = "Internal error from Core"
@@ -33,7 +33,7 @@ class RawCalls:
     def __init__(self, address: str, service: str) -> None:
         require_callable("RawCalls address", address)
         self._service = service
-        self._channel = grpc.aio.insecure_channel(address)
+        self._channel = grpc.aio.insecure_channel(address, options=proxy_options(address))
 
     async def __aenter__(self) -> RawCalls:
         return self
@@ -126,7 +126,7 @@ class UpdateStreams:
 
     def __init__(self, address: str) -> None:
         require_callable("UpdateStreams address", address)
-        self._channel = grpc.aio.insecure_channel(address)
+        self._channel = grpc.aio.insecure_channel(address, options=proxy_options(address))
         self._stub = pb_grpc.FusionServiceStub(self._channel)
 
     async def __aenter__(self) -> UpdateStreams:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
+import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -12,8 +14,8 @@ import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, RateLimitError, UnavailableError
-from gausslite.wire.security import Tls, open_channel
-from gausslite.wire.status import from_rpc_error
+from gausslite.wire.security import Tls
+from gausslite.wire.status import from_rpc_error, has_reason
 
 PARSER_ADDRESS = "127.0.0.1:50051"
 FUSION_ADDRESS = "127.0.0.1:50052"
@@ -44,6 +46,47 @@ def require_callable(name: str, address: str) -> None:
     _, port = host_and_port(name, address)
     if port == 0:
         raise InvalidInputError(f"{name}: expected the port that the service listens on, got {address!r}")
+
+
+_PROXY_VARIABLES = ("grpc_proxy", "https_proxy", "http_proxy")
+"""The variables from which gRPC takes a proxy, in its order."""
+
+
+def is_local(address: str) -> bool:
+    """Return True for a service of this machine or network, which no proxy of the environment reaches.
+
+    That is a unix socket, an address of a private network, and a name without a domain or with .local.
+    """
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_private
+    except ValueError:
+        return address.startswith(UNIX) or "." not in host or host.endswith((".local", ".localhost"))
+
+
+def proxy_options(address: str) -> tuple[tuple[str, int], ...]:
+    """Return the gRPC options of a connection that uses the proxy of the environment outside this network only."""
+    return (("grpc.enable_http_proxy", 0),) if is_local(address) else ()
+
+
+def _raised(error: grpc.RpcError, name: str, address: str) -> GaussLiteError:
+    """Return the error of a call to the service of this name, with the variable whose proxy the connection used."""
+    raised = from_rpc_error(error, name)
+    variable = next((variable for variable in _PROXY_VARIABLES if os.environ.get(variable)), None)
+    answered = isinstance(error, grpc.Call) and has_reason(error)
+    if answered or not isinstance(raised, UnavailableError) or is_local(address) or variable is None:
+        return raised
+    return UnavailableError(f"{raised}; the variable {variable} states a proxy, no_proxy=HOST excludes a host from it")
+
+
+def open_channel(address: str, tls: Tls | None, options: Sequence[tuple[str, Any]] = ()) -> grpc.Channel:
+    """Open a channel, encrypted with `tls`. The server of a unix socket must have a certificate for localhost."""
+    options = [*options, *proxy_options(address)]
+    if tls is None:
+        return grpc.insecure_channel(address, options=options)
+    if address.startswith(UNIX):
+        options = [*options, ("grpc.ssl_target_name_override", "localhost")]
+    return grpc.secure_channel(address, tls.client_credentials(), options=options)
 
 
 MAX_MESSAGE_BYTES = 16 << 20
@@ -131,7 +174,7 @@ class ServiceChannel:
         try:
             yield
         except grpc.RpcError as error:
-            raise from_rpc_error(error, str(self)) from error
+            raise _raised(error, str(self), self.address) from error
 
     def _call(self, method: Any, request: Any, deadline_s: float | None = None) -> Any:
         self._require_open()
@@ -210,7 +253,7 @@ def _status(address: str, service: str, tls: Tls | None) -> int:
     except grpc.RpcError as error:
         if error.code() is grpc.StatusCode.NOT_FOUND:
             return int(health_pb2.HealthCheckResponse.SERVICE_UNKNOWN)
-        raise UnavailableError(str(from_rpc_error(error, address))) from None
+        raise UnavailableError(str(_raised(error, address, address))) from None
 
 
 _MAX_BACKOFF_S = 5.0

@@ -9,7 +9,7 @@ import os
 import ssl
 import time
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -264,15 +264,6 @@ class Tls:
         """Return a client's credentials."""
         own = (None, None) if self.identity is None else (self.identity.key, self.identity.certificate)
         return grpc.ssl_channel_credentials(self.authorities, *own)
-
-
-def open_channel(address: str, tls: Tls | None, options: Sequence[tuple[str, Any]] = ()) -> grpc.Channel:
-    """Open a channel, encrypted with `tls`. The server of a unix socket must have a certificate for localhost."""
-    if tls is None:
-        return grpc.insecure_channel(address, options=options)
-    if address.startswith("unix:"):
-        options = [*options, ("grpc.ssl_target_name_override", "localhost")]
-    return grpc.secure_channel(address, tls.client_credentials(), options=options)
 
 
 def _read(option: str, path: Path) -> bytes:

@@ -108,6 +108,11 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
     return _BY_CODE.get(code, GaussLiteError)(f"{address}: {code.name}: {first_line}")
 
 
+def has_reason(error: grpc.Call) -> bool:
+    """Return True if a service of this package raised the error, and not the transport."""
+    return _details(error)[0] is not None
+
+
 def _details(error: grpc.Call) -> tuple[str | None, float | None]:
     """Return the ErrorInfo's reason and the RetryInfo's time in seconds; None for what the status does not have."""
     try:

@@ -95,8 +95,8 @@ LONG_COMMANDS = {
     "map": ["map", "SEQUENCE", "--policy", "uniform", "--out", "OUT"],
     "eval": ["eval", "MAP", "SEQUENCE"],
     "calibrate": ["calibrate", "SEQUENCE"],
-    "export": ["export", "MAP", "--to", "splat", "--out", "OUT"],
-    "fuse": ["fuse", "MAP", "OTHER", "--out", "OUT"],
+    "export": ["export", "MAP", "--to", "splat", "--out", "SPLAT"],
+    "fuse": ["fuse", "MAP", "OTHER", "--out", "FUSED"],
     "report": ["report", "RUN", "--out", "OUT"],
     "objects": ["objects", "RUN"],
     "demo": ["demo", "--source", "SEQUENCE", "--task-a", "Find the mug", "--task-b", "Find the mug", "--out", "OUT"],
@@ -124,6 +124,8 @@ def test_a_signal_ends_a_long_command_with_one_line(
         "OTHER": write_run(inputs / "other") / "map.ply",
         "RUN": run,
         "OUT": tmp_path / "out",
+        "SPLAT": tmp_path / "out.splat",
+        "FUSED": tmp_path / "out.ply",
     }
     signal_at_open.folder, signal_at_open.number = inputs, number
     assert main([str(places.get(word, word)) for word in LONG_COMMANDS[command]]) == 128 + number

@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from serving import serving
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.frame import Frame
+from gausslite.wire.channel import is_local, require_serving
 from gausslite.wire.clients import AgentClient, FusionClient
 
 NOBODY = "127.0.0.1:1"
@@ -48,3 +50,32 @@ def test_no_thread_reads_frames_after_a_failed_stream() -> None:
         list(agent.ingest(frames()))
     assert len(readers) == 1
     assert not readers[0].is_alive()
+
+
+@pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])
+def test_a_service_of_this_machine_is_reached_without_the_proxy(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
+    monkeypatch.setenv(variable, f"http://{NOBODY}")
+    with serving([]) as server:
+        port = server.address.rpartition(":")[2]
+        for host in ("127.0.0.1", "localhost"):
+            require_serving(f"{host}:{port}", None)
+
+
+def test_an_error_through_a_proxy_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", f"http://{NOBODY}")
+    with pytest.raises(UnavailableError, match="the variable http_proxy states a proxy"):
+        require_serving("robots.example.org:50052", None)
+    with pytest.raises(UnavailableError, match=f"^{NOBODY}: connection refused$"):
+        require_serving(NOBODY, None)
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        *((address, True) for address in ("127.0.0.1:1", "[::1]:1", "10.0.0.7:1", "192.168.1.2:1", "169.254.3.4:1")),
+        *((address, True) for address in ("localhost:1", "fusion:50052", "husky.local:1", "unix:/tmp/a.sock")),
+        *((address, False) for address in ("8.8.8.8:1", "robots.example.org:1", "[2001:4860:4860::8888]:1")),
+    ],
+)
+def test_only_addresses_outside_this_network_use_a_proxy(address: str, expected: bool) -> None:
+    assert is_local(address) == expected
