@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from gausslite.domain.errors import DatasetError
+from gausslite_ros.bag_parts import SUFFIXES, has_bag, is_bag, open_parts, repair_of
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -20,28 +21,37 @@ if TYPE_CHECKING:
 
 
 PREFIX = "bag:"
-_SUFFIXES = (".bag", ".mcap", ".db3")
-_METADATA = "metadata.yaml"
-_TOLERANCE = re.compile(r"([0-9]{1,4}(?:\.[0-9]{1,3})?)ms")
-_AXES = ("optical", "body")
+_CHOICES = {"aligned": ("yes", "no"), "axes": ("optical", "body")}
+_QUANTITIES = {
+    "depth_unit": ("depth_unit_m", re.compile(r"([0-9]{1,4}(?:\.[0-9]{1,9})?)(mm|m)")),
+    "tolerance": ("tolerance_s", re.compile(r"([0-9]{1,4}(?:\.[0-9]{1,3})?)(ms)")),
+}
+"""Options with a unit, the field that holds each in metres or seconds, and its form."""
 
 
 @dataclass(frozen=True, slots=True)
 class BagOptions:
     """Topics and frames of a bag, as written in its address; an empty text leaves the choice to the reader.
 
-    color, depth: image topics. color_info, depth_info: their camera_info topics. odom: a topic with poses, used instead
-    of tf. body: the frame whose pose that topic states. frame: the world frame in tf. camera: the colour camera's
-    frame. axes: "optical" (z forward) or "body" (x forward), the convention of the camera frames. tolerance_s: largest
-    difference of the stamps of a colour and a depth image.
+    color, depth: image topics. color_info, depth_info: their camera_info topics. camera_file: a file that states the
+    colour camera instead, as in folders. aligned: "yes" or "no", whether depth belongs to the colour pixels.
+    depth_unit_m: metres per unit of depth, 0: as its topic states. odom: a topic with poses, used instead
+    of tf. body: the frame whose pose that topic states. tf, tf_static: topics of tf. frame: the world frame in tf.
+    camera: the colour camera's frame. axes: "optical" (z forward) or "body" (x forward), the convention of the camera
+    frames. tolerance_s: largest difference of the stamps of a colour and a depth image.
     """
 
     color: str = ""
     depth: str = ""
     color_info: str = ""
     depth_info: str = ""
+    camera_file: str = ""
+    aligned: str = ""
+    depth_unit_m: float = 0.0
     odom: str = ""
     body: str = ""
+    tf: str = ""
+    tf_static: str = ""
     frame: str = ""
     camera: str = ""
     axes: str = "optical"
@@ -67,50 +77,50 @@ class BagAddress:
             # a name may have a question mark
             name, query = text, ""
         path = Path(name).expanduser()
-        if not _is_bag(path):
+        if not (has_bag if spec.startswith(PREFIX) else is_bag)(path):
             if spec.startswith(PREFIX):
                 raise DatasetError(f"{spec}: {_reason(path)}")
             return None
         return cls(path, _parse_options(spec, query))
 
 
-def _is_bag(path: Path) -> bool:
-    if path.is_dir():
-        return (path / _METADATA).is_file()
-    return path.is_file() and path.suffix in _SUFFIXES
-
-
 def _reason(path: Path) -> str:
-    expected = f"expected a bag: a file {', '.join('*' + suffix for suffix in _SUFFIXES)}, or a folder with {_METADATA}"
+    expected = f"expected a bag: a file {', '.join('*' + suffix for suffix in SUFFIXES)}, or a folder with such files"
     if path.is_dir():
-        return f"{expected}; got a folder without it"
+        return f"{expected}; got a folder without them"
     return f"{expected}; got {'a file ' + path.name if path.exists() else 'nothing there'}"
 
 
 def _parse_options(spec: str, query: str) -> BagOptions:
-    names = [field.name for field in fields(BagOptions) if field.name not in ("tolerance_s", "axes")]
+    with_form = (*_CHOICES, *(field for field, _ in _QUANTITIES.values()))
+    names = [field.name for field in fields(BagOptions) if field.name not in with_form]
     chosen: dict[str, Any] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
-        if (key in names and value) or (key == "axes" and value in _AXES):
+        name, form = _QUANTITIES.get(key, (key, None))
+        quantity = form.fullmatch(value) if form else None
+        if quantity:
+            chosen[name] = float(quantity[1]) / (1 if quantity[2] == "m" else 1000)
+        elif (key in names and value) or value in _CHOICES.get(key, ()):
             chosen[key] = value
-        elif key == "tolerance" and (match := _TOLERANCE.fullmatch(value)):
-            chosen["tolerance_s"] = float(match.group(1)) / 1000
         else:
-            expected = "&".join([*(f"{name}=..." for name in names), f"axes={'|'.join(_AXES)}", "tolerance=Xms"])
+            choices = (f"{name}={'|'.join(values)}" for name, values in _CHOICES.items())
+            expected = "&".join([*(f"{name}=..." for name in names), *choices, "depth_unit=Xmm", "tolerance=Xms"])
             raise DatasetError(f"{spec}: {key}={value}: expected {expected}, each optional")
     return BagOptions(**chosen)
 
 
 _TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 _ALIASES = {"tf/msg/tfMessage": _TF_MESSAGE}
+_SERIALISATIONS = ("ros1", "cdr")
 _STAMP_ROS1, _STAMP_ROS2 = struct.Struct("<4xII"), (struct.Struct(">4xiI"), struct.Struct("<4xiI"))
 
 
 @dataclass(frozen=True, slots=True)
 class MessageKey:
-    """Where a message is in a bag: its topic, the time when it was recorded, and its rank among equal times."""
+    """Where a message is in a bag: topic, part of the recording, time of recording, and rank among equal times."""
 
     topic: str
+    part: int
     recorded_ns: int
     rank: int
 
@@ -133,15 +143,19 @@ class BagFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._stores: dict[str, Typestore] = {}
-        reader_class = _reader_class(path)
         with self._readable():
-            reader = reader_class(path)
-            reader.open()
-            weakref.finalize(self, reader.close)
-            self._reader = reader
-            self._connections: dict[str, list[Connection]] = {}
-            for connection in reader.connections:
-                self._connections.setdefault(connection.topic, []).append(connection)
+            self._parts = open_parts(path)
+            for part in self._parts:
+                weakref.finalize(self, part.close)
+            self._connections: dict[str, list[tuple[int, Connection]]] = {}
+            self._foreign: dict[str, str] = {}
+            for number, part in enumerate(self._parts):
+                for connection in part.connections:
+                    serialisation = _serialisation(connection)
+                    if serialisation in _SERIALISATIONS:
+                        self._connections.setdefault(connection.topic, []).append((number, connection))
+                    else:
+                        self._foreign[connection.topic] = f"{connection.msgtype} as {serialisation}"
 
     @property
     def path(self) -> Path:
@@ -149,9 +163,18 @@ class BagFile:
         return self._path
 
     @property
+    def notes(self) -> list[str]:
+        """Messages on parts that are not whole."""
+        return [note for part in self._parts if (note := getattr(part, "note", ""))]
+
+    @property
     def types(self) -> dict[str, str]:
-        """Message type of each topic, such as sensor_msgs/msg/Image, sorted by topic; topics without messages too."""
-        return {topic: _type_of(found[0]) for topic, found in sorted(self._connections.items())}
+        """Message type of each topic, such as sensor_msgs/msg/Image, sorted by topic; topics without messages too.
+
+        Topics of other serialisations than those of ROS 1 and ROS 2 are there with its name, and cannot be read.
+        """
+        readable = {topic: _type_of(found[0][1]) for topic, found in self._connections.items()}
+        return dict(sorted((self._foreign | readable).items()))
 
     def first(self, topic: str) -> Any | None:
         """Return the first message of a topic; None if it has none. Raises DatasetError."""
@@ -159,10 +182,8 @@ class BagFile:
 
     def messages(self, topic: str) -> Iterator[Any]:
         """Yield all messages of a topic in the order of recording. Raises DatasetError."""
-        if topic not in self._connections:
-            return
         with self._readable(topic):
-            for connection, _, data in self._reader.messages(connections=self._connections[topic]):
+            for _, connection, _, data in self._serialised(topic):
                 yield self._deserialise(connection, data)
 
     def stamps(self, topic: str) -> list[StampedMessage]:
@@ -171,24 +192,33 @@ class BagFile:
         A header without a stamp counts from the time when the message was recorded. Payloads are not decoded.
         """
         found: list[StampedMessage] = []
-        last_ns, rank = -1, 0
+        last, rank = (-1, -1), 0
         with self._readable(topic):
-            for connection, time_ns, data in self._reader.messages(connections=self._connections[topic]):
-                rank = rank + 1 if time_ns == last_ns else 0
-                last_ns = time_ns
+            for part, connection, time_ns, data in self._serialised(topic):
+                rank = rank + 1 if (part, time_ns) == last else 0
+                last = part, time_ns
                 stamp_ns = _header_stamp_ns(data, _is_ros1(connection)) or time_ns
-                found.append(StampedMessage(MessageKey(topic, time_ns, rank), stamp_ns))
+                found.append(StampedMessage(MessageKey(topic, part, time_ns, rank), stamp_ns))
         return sorted(found, key=lambda message: message.stamp_ns)
 
     def read(self, key: MessageKey) -> Any:
         """Return one message. Raises DatasetError."""
         start_ns = key.recorded_ns
         with self._readable(key.topic):
-            at_time = self._reader.messages(connections=self._connections[key.topic], start=start_ns, stop=start_ns + 1)
+            wanted = [connection for part, connection in self._connections[key.topic] if part == key.part]
+            at_time = self._parts[key.part].messages(wanted, start_ns, start_ns + 1)
             for rank, (connection, _, data) in enumerate(at_time):
                 if rank == key.rank:
                     return self._deserialise(connection, data)
         raise DatasetError(f"{self._path}: {key.topic}: expected a message at {start_ns} ns, got none")
+
+    def _serialised(self, topic: str) -> Iterator[tuple[int, Connection, int, bytes]]:
+        """Yield part, connection, time of recording and serialised message of a topic."""
+        for number, part in enumerate(self._parts):
+            wanted = [connection for found, connection in self._connections.get(topic, ()) if found == number]
+            if wanted:
+                for connection, time_ns, data in part.messages(wanted):
+                    yield number, connection, time_ns, data
 
     def _deserialise(self, connection: Connection, data: bytes) -> Any:
         store, message_type = self._store_of(connection), _type_of(connection)
@@ -212,19 +242,8 @@ class BagFile:
         except Exception as error:
             location = f"{self._path}: {topic}" if topic else str(self._path)
             reason = " ".join(str(error).split())[:160] or type(error).__name__
-            raise DatasetError(f"{location}: expected a readable bag; {reason}") from None
-
-
-def _reader_class(path: Path) -> Callable[[Path], Any]:
-    """Return the reader for a bag. Raises DatasetError without the extra `ros`."""
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-    except ImportError:
-        raise DatasetError(
-            f"{path}: a bag needs the extra `ros`; install it with: pip install 'gausslite[ros]'"
-        ) from None
-    return Reader1 if path.suffix == ".bag" and path.is_file() else Reader2
+            advice = "" if topic else f"; {repair_of(self._path)}"
+            raise DatasetError(f"{location}: expected a readable bag; {reason}{advice}") from None
 
 
 def _typestore(connection: Connection) -> Typestore:
@@ -250,12 +269,13 @@ def _type_of(connection: Connection) -> str:
     return _ALIASES.get(name, name)
 
 
+def _serialisation(connection: Connection) -> str:
+    """Return the name of the messages' serialisation; MCAP files may have several."""
+    return str(getattr(connection.ext, "serialization_format", "ros1"))
+
+
 def _is_ros1(connection: Connection) -> bool:
-    """True for messages in the serialisation of ROS 1, which MCAP files may have too."""
-    serialisation = getattr(connection.ext, "serialization_format", "ros1")
-    if serialisation not in ("ros1", "cdr"):
-        raise DatasetError(f"{connection.topic}: expected messages as ros1 or cdr, got {serialisation!r}")
-    return bool(serialisation == "ros1")
+    return _serialisation(connection) == "ros1"
 
 
 def _header_stamp_ns(data: bytes, is_ros1: bool) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,16 +12,16 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.files import FolderCamera
+from gausslite.datasets.files import FolderCamera, read_camera_file
 from gausslite.datasets.folder import FIRST_VIEW_UP, PoseTrack
-from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.datasets.source import excluded_frames_note, require_matches, require_position
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 from gausslite.domain.relevance import Region
 from gausslite_ros.bag_file import BagAddress, BagFile, BagOptions, MessageKey, StampedMessage
-from gausslite_ros.cameras import FrameConverter, RgbdCamera, join_cameras, optical_pose
+from gausslite_ros.cameras import FrameConverter, RgbdCamera, join_cameras, optical_pose, require_own_camera
 from gausslite_ros.messages import camera_of, frame_name, quaternion_of, stamp_ns, translation_of
 from gausslite_ros.topics import (
     ImageTopic,
@@ -29,11 +30,12 @@ from gausslite_ros.topics import (
     choose_info,
     depth_units_per_metre,
     image_topics,
+    is_aligned,
     stream_transforms,
 )
 from gausslite_ros.transforms import TransformTree, seconds, track_of, transforms_of
 
-TF, TF_STATIC = "/tf", "/tf_static"
+_TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _POSE_TYPES = (
     _ODOMETRY,
@@ -42,7 +44,7 @@ _POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
 )
 _WORLD_FRAMES = ("odom", "map", "world")
-"""Preferred in this order: odometry is continuous, localisation in a map is corrected in jumps."""
+"""Preferred in this order, also as a part of a name: odometry is continuous, a map's localisation has jumps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +58,11 @@ class TreePoses:
     def at(self, time_s: float) -> Float64[ndarray, "4 4"] | None:
         """Return T_world_camera; None without transforms near this time. Raises DatasetError, PoseError."""
         return self.tree.at(self.world, self.camera, time_s)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Times of the first and the last pose."""
+        return self.tree.span_s(self.world, self.camera)
 
     def __str__(self) -> str:
         """Return where the poses come from."""
@@ -79,6 +86,11 @@ class TopicPoses:
         T_body_camera = self.tree.at(self.body, self.camera, time_s)
         return None if T_body_camera is None else T_world_body @ T_body_camera
 
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Times of the first and the last pose."""
+        return float(self.track.times_s[0]), float(self.track.times_s[-1])
+
     def __str__(self) -> str:
         """Return where the poses come from."""
         return f"{self.track.location}, the pose of {self.body}"
@@ -87,13 +99,34 @@ class TopicPoses:
 CameraPoses = TreePoses | TopicPoses
 
 
-def read_tree(bag: BagFile) -> TransformTree:
-    """Return the frames of /tf_static and /tf, or of a RealSense recording. Raises DatasetError."""
+def read_tree(bag: BagFile, colour_topic: str, options: BagOptions) -> TransformTree:
+    """Return the frames of tf_static and tf, or of a RealSense recording. Raises DatasetError."""
     transforms = stream_transforms(bag)
-    for topic, static in ((TF_STATIC, True), (TF, False)):
-        for message in bag.messages(topic):
-            transforms += transforms_of(message.transforms, static)
+    for name, named in (("tf_static", options.tf_static), ("tf", options.tf)):
+        topic = _choose_tf(bag, name, named, colour_topic)
+        for message in bag.messages(topic) if topic else ():
+            transforms += transforms_of(message.transforms, name == "tf_static")
     return TransformTree(transforms)
+
+
+def _choose_tf(bag: BagFile, name: str, named: str, colour_topic: str) -> str | None:
+    """Return the topic of tf that is named, else that of the colour topic's namespace, else the only one.
+
+    Raises DatasetError if the choice is not clear.
+    """
+    found = [topic for topic, kind in bag.types.items() if kind == _TF_MESSAGE and topic.rpartition("/")[2] == name]
+    if named:
+        if bag.types.get(named) != _TF_MESSAGE:
+            raise DatasetError(
+                f"{bag.path}: {name}={named}: expected a topic of {_TF_MESSAGE}, one of {found or 'none'}"
+            )
+        return named
+    around = [topic for topic in found if colour_topic.startswith(topic.removesuffix(name))]
+    if around or not found:
+        return max(around, key=len, default=None)
+    if len(found) > 1:
+        raise DatasetError(f"{bag.path}: {len(found)} topics have tf: {', '.join(found)}; choose one with {name}=TOPIC")
+    return found[0]
 
 
 def choose_poses(bag: BagFile, tree: TransformTree, camera: str, options: BagOptions) -> CameraPoses | None:
@@ -109,7 +142,8 @@ def choose_poses(bag: BagFile, tree: TransformTree, camera: str, options: BagOpt
         tree.require_path(options.frame, camera)
         return TreePoses(tree, options.frame, camera)
     ancestors = tree.ancestors(camera)
-    for world in (*(name for name in _WORLD_FRAMES if name in ancestors), ancestors[-1]):
+    known = [frame for name in _WORLD_FRAMES for frame in ancestors if name in re.split("[/_]", frame)]
+    for world in (*known, ancestors[-1]):
         if tree.changes_over_time(world, camera):
             return TreePoses(tree, world, camera)
     topics = [topic for topic, message_type in bag.types.items() if message_type == _ODOMETRY]
@@ -148,6 +182,18 @@ def _pose(message: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return translation_of(pose.position), quaternion_of(pose.orientation)
 
 
+def _no_poses(bag: BagFile, tree: TransformTree, camera: str) -> str:
+    """Return what a bag without poses has, and what it may lack."""
+    topics = [topic for topic, kind in bag.types.items() if kind == _TF_MESSAGE]
+    above = tree.ancestors(camera)
+    links = f"tf has only {' → '.join(above)}" if len(above) > 1 else f"tf does not have {camera!r}"
+    return (
+        f"expected poses: tf between a world frame and {camera!r}, or an odometry topic, got none: {links}, in "
+        f"{' and '.join(topics) or 'no topic'} with {', '.join(tree.frames) or 'no frames'}; tf_static stands at the "
+        "start of a recording: if this is a later part of several, give the folder of all parts"
+    )
+
+
 _WORLD_UP = (0.0, 0.0, 1.0)
 
 
@@ -183,23 +229,26 @@ class BagSource:
         topics = image_topics(self._bag)
         self._colour = choose_colour(self._bag, topics, address.options)
         self._depth = choose_depth(self._bag, topics, self._colour, address.options)
-        tree = read_tree(self._bag)
+        tree = read_tree(self._bag, self._colour.name, address.options)
         camera_frame = address.options.camera or self._colour.frame
         poses = choose_poses(self._bag, tree, camera_frame, address.options)
         if poses is None and require_poses:
-            raise DatasetError(
-                f"{address.path}: expected poses: tf between a world frame and {camera_frame!r}, or an odometry topic, "
-                f"got none"
-            )
+            raise DatasetError(f"{address.path}: {_no_poses(self._bag, tree, camera_frame)}")
         self._poses = poses
         self._require_poses = require_poses
         colours, depths = self._bag.stamps(self._colour.name), self._bag.stamps(self._depth.name)
         self._cameras = self._read_cameras(tree, colours[0].stamp_ns)
-        units_per_metre = depth_units_per_metre(self._bag, self._depth.name)
+        unit_m = address.options.depth_unit_m
+        stated_units = 1 / unit_m if unit_m else self._cameras.colour.units_per_metre
+        units_per_metre = stated_units or depth_units_per_metre(self._bag, self._depth.name)
         self._converter = FrameConverter(self._cameras, self._colour.name, self._depth.name, units_per_metre)
         self._matches, self._recorded = self._associate(colours, depths), len(colours)
         tolerance = f"{1000 * self._options.tolerance_s:g} ms"
-        require_frames(address.path, len(self._matches), f"a colour image with a pose, and depth within {tolerance}")
+        times_s = {"colour": seconds(colour.stamp_ns for colour in colours).tolist()}
+        times_s["depth"] = seconds(depth.stamp_ns for depth in depths).tolist()
+        times_s |= {} if poses is None else {"poses": poses.span_s}
+        expected = f"a colour image with a pose, and depth within {tolerance}"
+        require_matches(address.path, len(self._matches), expected, times_s)
         self._up_axis = unit_up_axis(up_axis or (_WORLD_UP if poses is not None else FIRST_VIEW_UP))
 
     @property
@@ -211,9 +260,10 @@ class BagSource:
     @property
     def description(self) -> str:
         """Which topics and poses are used, for a message to the user."""
-        depth = "aligned" if self._cameras.depth is None else "registered to colour here"
+        depth = "aligned" if self._cameras.depth is None else "registered to colour here; aligned=yes if it is already"
         poses = "none" if self._poses is None else str(self._poses)
-        return f"color={self._colour.name}, depth={self._depth.name} ({depth}), poses: {poses}"
+        chosen = f"color={self._colour.name}, depth={self._depth.name} ({depth}), poses: {poses}"
+        return "; ".join([chosen, *self._bag.notes])
 
     @property
     def camera(self) -> Camera:
@@ -293,20 +343,25 @@ class BagSource:
 
     def _read_cameras(self, tree: TransformTree, first_ns: int) -> RgbdCamera:
         options = self._options
-        colour = self._read_camera(self._colour, options.color_info, "color_info")
-        if self._depth.frame == self._colour.frame and not options.depth_info:
-            T_colour_depth = np.eye(4)
-            depth = self._read_aligned_camera()
-        else:
-            depth = self._read_camera(self._depth, options.depth_info, "depth_info")
-            T = tree.at(options.camera or self._colour.frame, self._depth.frame, first_ns / 10**9)
-            if T is None:
-                raise DatasetError(
-                    f"{self._bag.path}: tf: no transform from {self._depth.frame!r} to {self._colour.frame!r} at the "
-                    "time of the first colour image; expected it in /tf_static"
-                )
-            T_colour_depth = T
-        return join_cameras(colour, depth, T_colour_depth, options.axes)
+        colour = self._read_colour_camera()
+        if is_aligned(options, self._depth.name, self._depth.frame, self._colour.frame):
+            return join_cameras(colour, self._read_aligned_camera(colour), np.eye(4), options.axes)
+        depth = self._read_camera(self._depth, options.depth_info, "depth_info")
+        T = tree.at(options.camera or self._colour.frame, self._depth.frame, first_ns / 10**9)
+        if T is None:
+            raise DatasetError(
+                f"{self._bag.path}: tf: no transform from {self._depth.frame!r} to {self._colour.frame!r} at the "
+                "time of the first colour image; expected it in tf_static"
+            )
+        if not options.aligned:
+            require_own_camera(f"{self._bag.path}: {self._depth.name}", colour, depth, T)
+        return join_cameras(colour, depth, T, options.axes)
+
+    def _read_colour_camera(self) -> FolderCamera:
+        options = self._options
+        if not options.camera_file:
+            return self._read_camera(self._colour, options.color_info, "color_info")
+        return read_camera_file(Path(options.camera_file).expanduser(), *(self._colour.size or (0, 0)))
 
     def _read_camera(self, image: ImageTopic, named: str, option: str) -> FolderCamera:
         topic = choose_info(self._bag, image, named, option)
@@ -316,13 +371,19 @@ class BagSource:
             raise DatasetError(f"{location}: expected a camera_info message, got none")
         return camera_of(location, message, image.camera_name)
 
-    def _read_aligned_camera(self) -> FolderCamera | None:
-        """Return the camera of depth with the colour camera's frame; None if the bag does not state it."""
+    def _read_aligned_camera(self, colour: FolderCamera) -> FolderCamera | None:
+        """Return the camera of aligned depth; None if it is colour's, or if the bag does not state it.
+
+        Depth has the stated camera, or is stated to be aligned, if it has colour's size.
+        """
         try:
-            topic = choose_info(self._bag, self._depth, "", "depth_info")
+            topic = choose_info(self._bag, self._depth, self._options.depth_info, "depth_info")
         except DatasetError:
             return None
-        return self._read_camera(self._depth, topic, "depth_info")
+        depth = self._read_camera(self._depth, topic, "depth_info")
+        sizes = [(camera.camera.width_px, camera.camera.height_px) for camera in (colour, depth)]
+        stated = self._options.aligned or self._options.camera_file
+        return None if stated and sizes[0] == sizes[1] else depth
 
     def _associate(self, colours: Sequence[StampedMessage], depths: Sequence[StampedMessage]) -> list[_Match]:
         """Return the colour images with depth and a pose; without poses they get the identity if none is required."""

@@ -89,6 +89,18 @@ def join_cameras(
     return RgbdCamera.of(colour, depth, T_colour_depth)
 
 
+def require_own_camera(
+    location: str, colour: FolderCamera, depth: FolderCamera, T_colour_depth: Float64[ndarray, "4 4"]
+) -> None:
+    """Raise DatasetError for a depth camera beside colour with exactly its intrinsics: such depth may be aligned."""
+    beside_m = float(np.linalg.norm(T_colour_depth[:3, 3]))
+    if (depth.camera, depth.lens) == (colour.camera, colour.lens) and beside_m > 0:
+        raise DatasetError(
+            f"{location}: has the intrinsics of colour and the frame of a camera {1000 * beside_m:.0f} mm beside it; "
+            "is this depth aligned to colour? State aligned=yes or aligned=no"
+        )
+
+
 def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[ndarray, "4 4"]:
     """Return the pose with optical axes of a camera frame whose axes are "optical" or "body"."""
     return T_world_camera @ _BODY_TO_OPTICAL if axes == "body" else T_world_camera
@@ -96,12 +108,12 @@ def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameConverter:
-    """The cameras of a colour and a depth topic, and the units per metre of 16-bit depth."""
+    """The cameras of a colour and a depth topic, and the units per metre of depth; None: those of its encoding."""
 
     cameras: RgbdCamera
     colour_topic: str
     depth_topic: str
-    units_per_metre: float
+    units_per_metre: float | None
 
     def frame(
         self,
@@ -129,6 +141,6 @@ def _colour_image(location: str, message: Any) -> UInt8[ndarray, "h w 3"]:
     return decode_compressed_colour(location, message) if compressed else decode_colour(location, message)
 
 
-def _depth_image(location: str, message: Any, units_per_metre: float) -> Float32[ndarray, "h w"]:
+def _depth_image(location: str, message: Any, units_per_metre: float | None) -> Float32[ndarray, "h w"]:
     compressed = isinstance(message, CompressedImageMessage)
     return (decode_compressed_depth if compressed else decode_depth)(location, message, units_per_metre)

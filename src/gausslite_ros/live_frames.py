@@ -17,15 +17,16 @@ from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite_ros.bag_file import BagOptions
-from gausslite_ros.cameras import FrameConverter, join_cameras, optical_pose
+from gausslite_ros.cameras import FrameConverter, join_cameras, optical_pose, require_own_camera
 from gausslite_ros.messages import TransformMessage, camera_of, frame_name, stamp_ns
-from gausslite_ros.topics import camera_name
+from gausslite_ros.topics import camera_name, is_aligned
 from gausslite_ros.transforms import MAX_GAP_S, TransformWindow, transforms_of
 
 MAX_WAIT_S = 1.5
 """Localisation nodes publish map → odom once a second."""
 _MAX_IMAGES = 64
-_MILLIMETRES_PER_METRE = 1000.0
+_LATE_IN_A_ROW = 5
+"""So many ascending stamps, each before those of earlier images, come from a clock that was set back."""
 _PLACE = "topics"
 
 
@@ -34,6 +35,7 @@ class LiveCounters:
     """Colour images received, and what became of them; those that wait are not counted yet.
 
     not_ready: camera_info or the transform to the depth camera was missing. overflow: too many images were waiting.
+    clock_jumps: times that the stamps went back, after which all that waited was dropped as out of order.
     """
 
     received: int = 0
@@ -44,6 +46,7 @@ class LiveCounters:
     damaged: int = 0
     out_of_order: int = 0
     overflow: int = 0
+    clock_jumps: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,9 @@ class LiveFrames:
 
     options: the topics (their names state whether images are rectified); frame: the world frame in tf. A colour image
     waits until a depth image and transforms of its time or later have arrived, at most max_wait_s by the images'
-    stamps. Depth with another frame than colour, or with depth_info=, is registered to colour.
+    stamps. Depth that is not aligned to colour, see `is_aligned`, is registered to it. If the stamps of images go back,
+    by more than max_wait_s or several times in a row, the clock has jumped: a playback began again, a simulator was
+    reset, or a stamp was of the future. Then everything of the old clock is forgotten.
     """
 
     def __init__(self, options: BagOptions, max_wait_s: float = MAX_WAIT_S) -> None:
@@ -71,6 +76,7 @@ class LiveFrames:
         self._depths: list[tuple[int, int, Any]] = []
         self._depths_received = 0
         self._newest_ns = self._last_taken_ns = -1
+        self._late_ns: dict[str, list[int]] = {"colour": [], "depth": []}
         self._counters = LiveCounters()
         self._problem = ""
 
@@ -94,7 +100,9 @@ class LiveFrames:
         pending = _Pending(self._counters.received, stamp_ns(message.header), message)
         self._count("received")
         latest_ns = self._pending[-1].time_ns if self._pending else self._last_taken_ns
-        if pending.time_ns <= latest_ns:
+        if self._clock_has_jumped("colour", pending.time_ns, latest_ns):
+            self._forget()
+        elif pending.time_ns <= latest_ns:
             self._count("out_of_order")
             return
         self._pending.append(pending)
@@ -106,6 +114,8 @@ class LiveFrames:
     def add_depth(self, message: Any) -> None:
         """Add a depth image, raw or compressed."""
         time_ns = stamp_ns(message.header)
+        if self._clock_has_jumped("depth", time_ns, self._depths[-1][0] if self._depths else -1):
+            self._forget()
         self._newest_ns = max(self._newest_ns, time_ns)
         # the number keeps equal stamps in order, so that messages are not compared
         insort(self._depths, (time_ns, self._depths_received, message))
@@ -123,6 +133,26 @@ class LiveFrames:
     def add_transforms(self, messages: Iterable[TransformMessage], static: bool) -> None:
         """Add the transforms of one tf message; static: of /tf_static. Raises DatasetError for too long names."""
         self._transforms.add(transforms_of(messages, static))
+
+    def _clock_has_jumped(self, stream: str, time_ns: int, latest_ns: int) -> bool:
+        """True if a stamp is far before the latest of its stream, or the last of several ascending ones before it."""
+        late_ns = self._late_ns[stream]
+        if time_ns > latest_ns or (late_ns and time_ns <= late_ns[-1]):
+            late_ns.clear()
+        if time_ns <= latest_ns:
+            late_ns.append(time_ns)
+        return latest_ns - time_ns > self._max_wait_ns or len(late_ns) >= _LATE_IN_A_ROW
+
+    def _forget(self) -> None:
+        """Forget images, depths and moving transforms, which have stamps of another clock."""
+        for _ in self._pending:
+            self._count("out_of_order")
+        self._count("clock_jumps")
+        self._pending.clear()
+        self._depths.clear()
+        self._transforms.forget_moving()
+        self._newest_ns = self._last_taken_ns = -1
+        self._late_ns = {"colour": [], "depth": []}
 
     def take(self) -> list[Frame]:
         """Return the frames that have become complete, in the order of their stamps."""
@@ -167,7 +197,8 @@ class LiveFrames:
             self._problem = f"waiting for {'camera_info' if self._colour_info is None else 'depth images'}"
             return None
         camera_frame, depth_frame = self._camera_frame(), frame_name(self._depths[0][2].header.frame_id)
-        aligned = depth_frame == frame_name(self._pending[0].message.header.frame_id) and not options.depth_info
+        colour_frame = frame_name(self._pending[0].message.header.frame_id)
+        aligned = is_aligned(options, options.depth, depth_frame, colour_frame)
         T_colour_depth: Float64[ndarray, "4 4"] | None = np.eye(4)
         depth: FolderCamera | None = None
         try:
@@ -179,6 +210,8 @@ class LiveFrames:
                 depth = _camera(self._depth_info, options.depth)
                 tree = self._transforms.tree((camera_frame, depth_frame))
                 T_colour_depth = tree.at(camera_frame, depth_frame, time_ns / 10**9)
+                if T_colour_depth is not None and not options.aligned:
+                    require_own_camera(f"{_PLACE}: {options.depth}", colour, depth, T_colour_depth)
         except InvalidInputError as error:
             self._problem = str(error)
             return None
@@ -186,7 +219,8 @@ class LiveFrames:
             self._problem = f"tf: no transform from {depth_frame!r} to {camera_frame!r} at the time of an image"
             return None
         cameras = join_cameras(colour, depth, T_colour_depth, options.axes)
-        return FrameConverter(cameras, options.color, options.depth, _MILLIMETRES_PER_METRE)
+        units_per_metre = 1 / options.depth_unit_m if options.depth_unit_m else None
+        return FrameConverter(cameras, options.color, options.depth, units_per_metre)
 
     def _depth_has_passed(self, time_ns: int) -> bool:
         return bool(self._depths) and self._depths[-1][0] >= time_ns
@@ -205,7 +239,7 @@ class LiveFrames:
         """True if no later transform can change the pose at this time."""
         world, camera = self._options.frame, self._camera_frame()
         try:
-            return self._transforms.tree((world, camera)).last_time_s(world, camera) >= time_ns / 10**9
+            return self._transforms.tree((world, camera)).span_s(world, camera)[1] >= time_ns / 10**9
         except InvalidInputError as error:
             self._problem = str(error)
             return False

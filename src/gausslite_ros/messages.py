@@ -124,6 +124,8 @@ def _is_rectified(image_topic: str) -> bool:
 
 
 _MILLIMETRES_PER_METRE = 1000.0
+_PNG, _JPEG = b"\x89PNG", b"\xff\xd8\xff"
+RECORD_DEPTH = "record the raw topic or its compressedDepth"
 _DEPTH_HEADER = struct.Struct("<iff")
 """compressedDepth: a format number and the two quantisation parameters stand before the PNG."""
 
@@ -148,10 +150,19 @@ _CHANNEL_ORDERS = {
     "8UC3": (3, (2, 1, 0)),
     "rgba8": (4, (0, 1, 2)),
     "bgra8": (4, (2, 1, 0)),
+    "8UC4": (4, (2, 1, 0)),
+    "rgb16": (3, (0, 1, 2)),
+    "bgr16": (3, (2, 1, 0)),
+    "16UC3": (3, (2, 1, 0)),
+    "rgba16": (4, (0, 1, 2)),
+    "bgra16": (4, (2, 1, 0)),
 }
-"""Bytes per pixel of an encoding, and the places of red, green and blue."""
-_COLOUR_ENCODINGS = (*_CHANNEL_ORDERS, *_CONVERSION_CODES)
+"""Channels of an encoding, and the places of red, green and blue."""
+_PLANAR = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_YUV2RGB_NV21}
+"""Encodings with a plane of brightness and one of colour at half its height; OpenCV's conversions to RGB."""
+COLOUR_ENCODINGS = (*_CHANNEL_ORDERS, *_CONVERSION_CODES, *_PLANAR)
 _GREY = ("mono8", "8UC1")
+DEPTH_ENCODINGS = ("16UC1", "32FC1")
 
 
 class ImageKind(Enum):
@@ -165,22 +176,30 @@ class ImageKind(Enum):
 
 def kind_of_encoding(encoding: str) -> ImageKind:
     """Return what images of this encoding of sensor_msgs/Image show."""
-    if encoding in ("16UC1", "32FC1"):
+    if encoding in DEPTH_ENCODINGS:
         return ImageKind.DEPTH
     if encoding in _GREY:
         return ImageKind.GREY
-    return ImageKind.COLOUR if encoding in _COLOUR_ENCODINGS else ImageKind.OTHER
+    return ImageKind.COLOUR if encoding in COLOUR_ENCODINGS else ImageKind.OTHER
 
 
-def kind_of_format(text: str) -> ImageKind:
-    """Return what images of this format of sensor_msgs/CompressedImage show, such as "rgb8; jpeg compressed bgr8"."""
+def kind_of_compressed(text: str, data: bytes) -> ImageKind:
+    """Return what a compressed image shows, by its format, such as "rgb8; jpeg compressed bgr8", and its first bytes.
+
+    JPEG has 8 bits per value: depth in it is of no use.
+    """
     encoding = text.partition(";")[0].strip()
-    if "compressedDepth" in text or encoding in ("16UC1", "32FC1"):
+    is_depth = encoding in DEPTH_ENCODINGS
+    if "compressedDepth" in text:
         return ImageKind.DEPTH
-    if encoding in _GREY:
-        return ImageKind.GREY
-    known = any(name in text.lower() for name in ("jpeg", "jpg", "png"))
-    return ImageKind.COLOUR if known and encoding != "mono16" else ImageKind.OTHER
+    if data.startswith(_JPEG):
+        return ImageKind.OTHER if is_depth else ImageKind.GREY if encoding in _GREY else ImageKind.COLOUR
+    if not data.startswith(_PNG):
+        return ImageKind.OTHER
+    bits, channels = data[24:26]  # of the header, which is the first chunk
+    if is_depth or (bits == 16 and channels == 0 and encoding != "mono16"):
+        return ImageKind.DEPTH
+    return ImageKind.GREY if encoding in _GREY else ImageKind.OTHER if bits == 16 else ImageKind.COLOUR
 
 
 def decode_colour(location: str, message: ImageMessage) -> UInt8[ndarray, "h w 3"]:
@@ -188,25 +207,29 @@ def decode_colour(location: str, message: ImageMessage) -> UInt8[ndarray, "h w 3
     encoding = message.encoding
     if encoding in _CHANNEL_ORDERS:
         channels, order = _CHANNEL_ORDERS[encoding]
-        return np.ascontiguousarray(_pixels(location, message, np.dtype(np.uint8), channels)[..., order])
-    if encoding not in _CONVERSION_CODES:
-        known = ", ".join(_COLOUR_ENCODINGS)
+        has_16_bits = "16" in encoding
+        pixels = _pixels(location, message, np.dtype(np.uint16 if has_16_bits else np.uint8), channels)[..., order]
+        return np.ascontiguousarray((pixels >> 8).astype(np.uint8) if has_16_bits else pixels)
+    if encoding in _PLANAR:
+        rows, channels, code = int(message.height) * 3 // 2, 1, _PLANAR[encoding]
+    elif encoding in _CONVERSION_CODES:
+        rows, (channels, code) = int(message.height), _CONVERSION_CODES[encoding]
+    else:
+        known = ", ".join(COLOUR_ENCODINGS)
         raise DatasetError(f"{location}: encoding: expected one of {known}, got {encoding[:40]!r}")
-    channels, code = _CONVERSION_CODES[encoding]
     try:
-        rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(_pixels(location, message, np.dtype(np.uint8), channels), code)
+        pixels = _pixels(location, message, np.dtype(np.uint8), channels, rows)
+        rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(pixels, code)
     except cv2.error:
         size = f"{message.width}x{message.height}"
         raise DatasetError(f"{location}: {encoding}: expected an even width and height, got {size}") from None
     return rgb
 
 
-def decode_depth(
-    location: str, message: ImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
-) -> Float32[ndarray, "h w"]:
-    """Return depth in metres, 0 where invalid, of 32FC1 in metres or 16-bit integers in these units.
+def decode_depth(location: str, message: ImageMessage, units_per_metre: float | None = None) -> Float32[ndarray, "h w"]:
+    """Return depth in metres, 0 where invalid, of 16-bit integers or 32FC1 in these units.
 
-    Raises DatasetError with the location.
+    None: millimetres and metres, as ROS defines them. Raises DatasetError with the location.
     """
     dtype = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}.get(message.encoding)
     if dtype is None:
@@ -229,7 +252,7 @@ def decode_compressed_colour(location: str, message: CompressedImageMessage) -> 
 
 
 def decode_compressed_depth(
-    location: str, message: CompressedImageMessage, units_per_metre: float = _MILLIMETRES_PER_METRE
+    location: str, message: CompressedImageMessage, units_per_metre: float | None = None
 ) -> Float32[ndarray, "h w"]:
     """Return depth in metres, 0 where invalid, of a 16-bit PNG, with the header of compressedDepth or without.
 
@@ -253,27 +276,36 @@ def decode_compressed_depth(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         depth_m = np.float32(a) / (image.astype(np.float32) - np.float32(b))
     depth_m[image == 0] = 0.0
-    return _valid(depth_m)
+    return _in_metres(depth_m, units_per_metre)
 
 
-def _pixels(location: str, message: ImageMessage, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
-    """Return the pixels of a raw image in this machine's byte order. The sizes are checked first."""
-    width, height, step = int(message.width), int(message.height), int(message.step)
+def _pixels(
+    location: str, message: ImageMessage, dtype: np.dtype[Any], channels: int, rows: int | None = None
+) -> NDArray[Any]:
+    """Return the pixels of a raw image in this machine's byte order. The sizes are checked first.
+
+    rows: those of the data, by default those of the image. A step of 0, which some drivers leave, is that of rows
+    without padding.
+    """
+    width, height = int(message.width), int(message.height) if rows is None else rows
     require_pixel_count(location, width, height)
     row_bytes = width * channels * dtype.itemsize
+    step = int(message.step) or row_bytes
     if step < row_bytes:
         raise DatasetError(f"{location}: step: expected at least {row_bytes} bytes a row, got {step}")
     data = np.frombuffer(message.data, np.uint8)
     if len(data) < step * (height - 1) + row_bytes:
         raise DatasetError(f"{location}: data: expected {height} rows of {step} bytes, got {len(data)} bytes")
-    rows = np.lib.stride_tricks.as_strided(data, (height, row_bytes), (step, 1), writeable=False)
-    pixels = np.ascontiguousarray(rows).view(dtype)
+    lines = np.lib.stride_tricks.as_strided(data, (height, row_bytes), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(lines).view(dtype)
     if bool(message.is_bigendian) != (sys.byteorder == "big"):
         pixels = pixels.byteswap()
     return pixels.reshape((height, width, channels) if channels > 1 else (height, width))
 
 
 def _decode_16_bit(location: str, data: bytes) -> NDArray[Any]:
+    if data.startswith(_JPEG):
+        raise DatasetError(f"{location}: expected depth as a 16-bit PNG, got JPEG, which has 8 bits; {RECORD_DEPTH}")
     image = decode_image(location, data, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise DatasetError(
@@ -282,10 +314,10 @@ def _decode_16_bit(location: str, data: bytes) -> NDArray[Any]:
     return image
 
 
-def _in_metres(image: NDArray[Any], units_per_metre: float) -> Float32[ndarray, "h w"]:
+def _in_metres(image: NDArray[Any], units_per_metre: float | None) -> Float32[ndarray, "h w"]:
     if image.dtype == np.float32:
-        return _valid(image.copy())
-    return image.astype(np.float32) / np.float32(units_per_metre)
+        return _valid(image / np.float32(units_per_metre or 1.0))
+    return image.astype(np.float32) / np.float32(units_per_metre or _MILLIMETRES_PER_METRE)
 
 
 def _valid(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:

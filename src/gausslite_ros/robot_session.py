@@ -23,12 +23,14 @@ from gausslite_ros.topics import camera_name
 _AXES = ("optical", "body")
 _LIMITS = (
     ("tolerance_ms", 0.0, 1e4),
+    ("depth_unit_mm", 0.0, 1e4),
     ("max_wait_s", 0.0, 60.0),
     ("transform_tolerance_s", 0.0, 10.0),
     ("tf_period_s", 0.01, 10.0),
     ("period_s", 0.05, 60.0),
     ("drain_s", 0.0, 86400.0),
 )
+_ALIGNED = {"auto": "", "yes": "yes", "no": "no"}
 _HANDOVER = {"agent": None, "yes": True, "no": False}
 
 
@@ -37,8 +39,8 @@ class NodeParameters:
     """Parameters by their names in ROS; docs/guides/bag.md lists them.
 
     color_info, depth_info "": the camera_info beside the images. camera "": the frame of the colour images.
-    transform_tolerance_s: added to the time of the published tf. drain_s 0: as the agent's options. Raises
-    InvalidInputError.
+    aligned "auto": by frame and topic of depth. depth_unit_mm 0: as its encoding. transform_tolerance_s: added to the
+    time of the published tf. drain_s 0: as the agent's options. Raises InvalidInputError.
     """
 
     agent: str = "127.0.0.1:50053"
@@ -48,6 +50,8 @@ class NodeParameters:
     depth_info: str = ""
     frame: str = "odom"
     camera: str = ""
+    aligned: str = "auto"
+    depth_unit_mm: float = 0.0
     axes: str = "optical"
     tolerance_ms: float = 20.0
     max_wait_s: float = 1.5
@@ -70,7 +74,7 @@ class NodeParameters:
         for name in ("agent", "color", "depth", "frame", "map_frame"):
             if not getattr(self, name):
                 raise InvalidInputError(f"parameter {name}: expected a name, got an empty text")
-        for name, choices in (("axes", _AXES), ("handover", tuple(_HANDOVER))):
+        for name, choices in (("aligned", tuple(_ALIGNED)), ("axes", _AXES), ("handover", tuple(_HANDOVER))):
             if getattr(self, name) not in choices:
                 expected = " or ".join(choices)
                 raise InvalidInputError(f"parameter {name}: expected {expected}, got {getattr(self, name)!r}")
@@ -121,6 +125,8 @@ class NodeParameters:
             depth_info=self.depth_info,
             frame=self.frame.removeprefix("/"),
             camera=self.camera.removeprefix("/"),
+            aligned=_ALIGNED[self.aligned],
+            depth_unit_m=self.depth_unit_mm / 1000,
             axes=self.axes,
             tolerance_s=self.tolerance_ms / 1000,
         )

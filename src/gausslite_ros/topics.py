@@ -18,13 +18,17 @@ import numpy as np
 
 from gausslite.datasets.folder import pose_from_quaternion
 from gausslite.domain.errors import DatasetError
+from gausslite.domain.frame import image_size
 from gausslite.domain.pose import inverse
 from gausslite_ros.bag_file import BagFile, BagOptions
 from gausslite_ros.messages import (
+    COLOUR_ENCODINGS,
+    DEPTH_ENCODINGS,
+    RECORD_DEPTH,
     ImageKind,
     frame_name,
+    kind_of_compressed,
     kind_of_encoding,
-    kind_of_format,
     quaternion_of,
     translation_of,
 )
@@ -34,7 +38,6 @@ IMAGE_END, INFO_END = "/image/data", "/info/camera_info"
 _EXTRINSICS = re.compile(r"(/device_\d+/sensor_\d+/\w+)/tf/(\d+)")
 _SENSOR = re.compile(r"(/device_\d+/sensor_\d+)/")
 _DEPTH_UNITS = re.compile(r"/option/Depth.Units/value")
-_DEFAULT_UNITS_PER_METRE = 1000.0
 
 
 def stream_of(image_topic: str) -> str | None:
@@ -60,8 +63,8 @@ def stream_transforms(bag: BagFile) -> list[Transform]:
     return found
 
 
-def depth_units_per_metre(bag: BagFile, depth_topic: str) -> float:
-    """Return the units of 16-bit depth: of the option "Depth Units" of the stream's sensor, else millimetres.
+def depth_units_per_metre(bag: BagFile, depth_topic: str) -> float | None:
+    """Return the units of depth by the option "Depth Units" of the stream's sensor; None without it.
 
     Raises DatasetError for units that are not positive.
     """
@@ -76,12 +79,13 @@ def depth_units_per_metre(bag: BagFile, depth_topic: str) -> float:
                 raise DatasetError(f"{bag.path}: {topic}: expected a positive unit in metres, got {unit_m}")
             # the unit is stored as float32: 0.001 has to become 1000
             return float(np.float32(1.0) / np.float32(unit_m))
-    return _DEFAULT_UNITS_PER_METRE
+    return None
 
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TRANSPORTS = ("/compressed", "/compressedDepth")
+_ALIGNED = re.compile(r"aligned_depth|depth_registered|depth_to_(?:color|rgb)")
 _MAX_LISTED = 20
 
 
@@ -94,6 +98,7 @@ class ImageTopic:
     kind: ImageKind
     encoding: str
     frame: str
+    size: tuple[int, int] | None
 
     @property
     def camera_name(self) -> str:
@@ -102,7 +107,7 @@ class ImageTopic:
 
     def __str__(self) -> str:
         """Return the name with the encoding, for messages."""
-        return f"{self.name} ({self.encoding})"
+        return f"{self.name} ({self.encoding or 'format not stated'})"
 
 
 def camera_name(image_topic: str) -> str:
@@ -124,13 +129,15 @@ def image_topics(bag: BagFile) -> list[ImageTopic]:
             continue
         compressed = message_type == COMPRESSED
         encoding = str(message.format if compressed else message.encoding)[:60]
-        kind = kind_of_format(encoding) if compressed else kind_of_encoding(encoding)
+        data = bytes(message.data) if compressed else b""
+        kind = kind_of_compressed(encoding, data) if compressed else kind_of_encoding(encoding)
         stream = stream_of(name)
         if stream is not None and encoding == "mono16":
             # the RealSense SDK names the encoding of its depth so
             kind = ImageKind.DEPTH
         frame = stream or frame_name(message.header.frame_id)
-        found.append(ImageTopic(name, compressed, kind, encoding, frame))
+        size = image_size(data) if compressed else (int(message.width), int(message.height))
+        found.append(ImageTopic(name, compressed, kind, encoding, frame, size))
     return found
 
 
@@ -145,21 +152,41 @@ def choose_colour(bag: BagFile, topics: Sequence[ImageTopic], options: BagOption
         candidates = _without_copies(topic for topic in topics if topic.kind is kind)
         if candidates:
             return _only(bag, candidates, "colour", "color")
-    raise DatasetError(f"{bag.path}: expected a topic with colour images (sensor_msgs/Image), got {_listed(bag)}")
+    raise DatasetError(
+        f"{bag.path}: expected a topic with colour images ({', '.join(COLOUR_ENCODINGS)}), got {_listed(bag, topics)}; "
+        "choose one with color=TOPIC"
+    )
 
 
 def choose_depth(bag: BagFile, topics: Sequence[ImageTopic], colour: ImageTopic, options: BagOptions) -> ImageTopic:
     """Return the topic of depth=, else the only one with depth, or the only one that is aligned to colour.
 
-    Depth is aligned if it has the colour camera's frame. Raises DatasetError with a list if the choice is not clear.
+    Raises DatasetError with a list if the choice is not clear.
     """
     if options.depth:
         return _named(bag, topics, options.depth, "depth")
     candidates = _without_copies(topic for topic in topics if topic.kind is ImageKind.DEPTH)
-    if not candidates:
-        raise DatasetError(f"{bag.path}: expected a topic with depth (16UC1 or 32FC1), got {_listed(bag)}")
-    aligned = [topic for topic in candidates if topic.frame == colour.frame]
-    return _only(bag, aligned or candidates, "depth", "depth")
+    if candidates:
+        aligned = [topic for topic in candidates if is_aligned(options, topic.name, topic.frame, colour.frame)]
+        return _only(bag, aligned or candidates, "depth", "depth")
+    for topic in topics:
+        if topic.kind is ImageKind.OTHER and topic.encoding.startswith(DEPTH_ENCODINGS):
+            raise DatasetError(f"{bag.path}: {topic}: depth as JPEG has 8 bits, too few to be used; {RECORD_DEPTH}")
+    raise DatasetError(
+        f"{bag.path}: expected a topic with depth ({', '.join(DEPTH_ENCODINGS)}), got {_listed(bag, topics)}; "
+        "if one of them is depth, as mono16 may be, name it with depth=TOPIC"
+    )
+
+
+def is_aligned(options: BagOptions, depth_topic: str, depth_frame: str, colour_frame: str) -> bool:
+    """True if depth belongs to the colour pixels, as aligned= states.
+
+    Else depth is aligned if it has the colour camera's frame, or the name that drivers give to aligned depth, and no
+    camera of its own is chosen with depth_info=.
+    """
+    if options.aligned:
+        return options.aligned == "yes"
+    return not options.depth_info and (depth_frame == colour_frame or bool(_ALIGNED.search(depth_topic)))
 
 
 def choose_info(bag: BagFile, image: ImageTopic, named: str, option: str) -> str:
@@ -186,6 +213,7 @@ def choose_info(bag: BagFile, image: ImageTopic, named: str, option: str) -> str
     got = ", ".join(infos) or "no camera_info topic"
     raise DatasetError(
         f"{bag.path}: {image.name}: expected its camera in {neighbours[0]}, got {got}; choose one with {option}=TOPIC"
+        + (", or state the camera with camera_file=FILE" if option == "color_info" else ", or state aligned=yes")
     )
 
 
@@ -219,7 +247,11 @@ def _without_copies(topics: Iterable[ImageTopic]) -> list[ImageTopic]:
     return [topic for topic in found if not topic.compressed or topic.camera_name not in raw]
 
 
-def _listed(bag: BagFile) -> str:
+def _listed(bag: BagFile, topics: Sequence[ImageTopic]) -> str:
+    """Return the image topics with their encodings; the others with their types if there are none."""
     types = bag.types
-    names = [f"{name} ({message_type})" for name, message_type in types.items()][:_MAX_LISTED]
-    return ", ".join(names) + (" ..." if len(types) > _MAX_LISTED else "") or "an empty bag"
+    read = {topic.name: str(topic) for topic in topics}
+    images = [name for name, message_type in types.items() if message_type in (IMAGE, COMPRESSED)]
+    others = [f"{name} ({message_type})" for name, message_type in types.items()]
+    names = [read.get(name, f"{name} (no message)") for name in images] or others
+    return ", ".join(names[:_MAX_LISTED]) + (" ..." if len(names) > _MAX_LISTED else "") or "an empty bag"

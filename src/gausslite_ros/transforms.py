@@ -67,6 +67,7 @@ class TransformTree:
                 grouped.setdefault((transform.child, transform.parent), []).append(transform)
         self._tracks: dict[str, dict[str, PoseTrack]] = {}
         self._static: set[tuple[str, str]] = set()
+        self._known_chains: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
         for (child, parent), measured in grouped.items():
             fixed = [transform for transform in measured if transform.time_ns is None]
             if fixed:
@@ -85,50 +86,77 @@ class TransformTree:
         while chain[-1] in self._tracks:
             parents = list(self._tracks[chain[-1]])
             if len(parents) > 1:
-                raise DatasetError(f"tf: {chain[-1]}: expected one parent frame, got {', '.join(sorted(parents))}")
+                raise DatasetError(_two_parents(chain[-1], parents))
             if parents[0] in chain or len(chain) > _MAX_DEPTH:
                 raise DatasetError(f"tf: {frame}: expected a tree of frames, got a loop or a chain over {_MAX_DEPTH}")
             chain.append(parents[0])
         return chain
 
     def changes_over_time(self, ancestor: str, frame: str) -> bool:
-        """True if a transform between a frame and one of its ancestors changes over time."""
-        chain = self.ancestors(frame)
-        return any(link not in self._static for link in pairwise(chain[: chain.index(ancestor) + 1]))
+        """True if a transform between a frame and one of its ancestors changes over time. Raises DatasetError."""
+        return any(link not in self._static for link in pairwise(self._chains(ancestor, frame)[1]))
 
     def require_path(self, target: str, source: str) -> None:
-        """Raise DatasetError unless the transforms connect two frames."""
-        if target == source or self.ancestors(target)[-1] == self.ancestors(source)[-1]:
-            return
-        frames = self.frames
-        known = ", ".join(frames[:_MAX_LISTED]) + (" ..." if len(frames) > _MAX_LISTED else "")
-        raise DatasetError(
-            f"tf: no transform between {target!r} and {source!r}; expected it in /tf_static or /tf, "
-            f"which have {'the frames ' + known if frames else 'no transforms'}"
-        )
+        """Raise DatasetError unless the transforms connect two frames, in one way."""
+        self._chains(target, source)
 
-    def last_time_s(self, target: str, source: str) -> float:
-        """Return the time until which all moving transforms between two frames are known; infinite if none moves.
+    def span_s(self, target: str, source: str) -> tuple[float, float]:
+        """Return the times between which all moving transforms between two frames are known; infinite if none moves.
 
         Raises DatasetError.
         """
-        self.require_path(target, source)
-        up_target, up_source = self.ancestors(target), self.ancestors(source)
-        common = next(frame for frame in up_source if frame in up_target)
-        links = [link for chain in (up_target, up_source) for link in pairwise(chain[: chain.index(common) + 1])]
-        moving = [self._tracks[child][parent] for child, parent in links if (child, parent) not in self._static]
-        return min((float(track.times_s[-1]) for track in moving), default=np.inf)
+        links = [link for chain in self._chains(target, source) for link in pairwise(chain)]
+        moving = [self._tracks[child][parent].times_s for child, parent in links if (child, parent) not in self._static]
+        first_s = max((float(times_s[0]) for times_s in moving), default=-np.inf)
+        return first_s, min((float(times_s[-1]) for times_s in moving), default=np.inf)
 
     def at(self, target: str, source: str, time_s: float) -> Float64[ndarray, "4 4"] | None:
         """Return T_target_source at a time; None if a transform has no pose near it. Raises DatasetError, PoseError."""
-        self.require_path(target, source)
-        up_target, up_source = self.ancestors(target), self.ancestors(source)
-        common = next(frame for frame in up_source if frame in up_target)
-        T_common_source = self._chain(up_source[: up_source.index(common) + 1], time_s)
-        T_common_target = self._chain(up_target[: up_target.index(common) + 1], time_s)
+        up_target, up_source = self._chains(target, source)
+        T_common_source = self._chain(up_source, time_s)
+        T_common_target = self._chain(up_target, time_s)
         if T_common_source is None or T_common_target is None:
             return None
-        return T_common_source if target == common else inverse(T_common_target) @ T_common_source
+        return T_common_source if len(up_target) == 1 else inverse(T_common_target) @ T_common_source
+
+    def _chains(self, target: str, source: str) -> tuple[list[str], list[str]]:
+        """Return the frames from target and from source up to the nearest one above both. Raises DatasetError.
+
+        Frames above that have further parents do no harm.
+        """
+        if (target, source) in self._known_chains:
+            return self._known_chains[target, source]
+        above_target, above_source = self._above(target), self._above(source)
+        common = next((frame for frame in above_source if frame in above_target), None)
+        if common is None:
+            known = ", ".join(self.frames[:_MAX_LISTED]) + (" ..." if len(self.frames) > _MAX_LISTED else "")
+            raise DatasetError(
+                f"tf: no transform between {target!r} and {source!r}; expected it in tf_static or tf, "
+                f"which have {'the frames ' + known if known else 'no transforms'}"
+            )
+        found = self._only_chain(above_target[common], target), self._only_chain(above_source[common], source)
+        self._known_chains[target, source] = found
+        return found
+
+    def _above(self, frame: str) -> dict[str, list[list[str]]]:
+        """Return the chains from a frame up to each frame above it, at most two, the nearest frames first."""
+        chains = {frame: [[frame]]}
+        waiting = deque([[frame]])
+        while waiting:
+            chain = waiting.popleft()
+            for parent in self._tracks.get(chain[-1], ()):
+                if parent not in chain and len(chain) <= _MAX_DEPTH and len(chains.get(parent, ())) < 2:
+                    chains.setdefault(parent, []).append([*chain, parent])
+                    waiting.append([*chain, parent])
+        return chains
+
+    def _only_chain(self, chains: list[list[str]], frame: str) -> list[str]:
+        if len(chains) == 1:
+            return chains[0]
+        raise DatasetError(
+            f"tf: expected one way from {frame} to {chains[0][-1]}, got {' → '.join(chains[0])} and "
+            f"{' → '.join(chains[1])}; choose a frame that only one of them has with frame="
+        )
 
     def _chain(self, upwards: list[str], time_s: float) -> Float64[ndarray, "4 4"] | None:
         """Return the pose of the first frame in the last, through the frames between them."""
@@ -139,6 +167,10 @@ class TransformTree:
                 return None
             T = T_parent_child if T is None else T_parent_child @ T
         return np.eye(4) if T is None else T
+
+
+def _two_parents(frame: str, parents: Iterable[str]) -> str:
+    return f"tf: {frame}: expected one parent frame, got {' and '.join(sorted(parents))}; choose one with frame="
 
 
 def track_of(location: str, poses: Mapping[int, tuple[tuple[float, ...], tuple[float, ...]]]) -> PoseTrack:
@@ -160,7 +192,7 @@ _MAX_FRAMES = 10_000
 
 
 class TransformWindow:
-    """Keeps static transforms, and others until they are `keep_s` older than the latest of the same two frames."""
+    """Keeps static transforms, and others within `keep_s` of the latest of the same two frames."""
 
     def __init__(self, keep_s: float) -> None:
         self._keep_ns = round(keep_s * 1e9)
@@ -177,8 +209,15 @@ class TransformWindow:
             elif kept and kept[0].time_ns is None:
                 continue
             kept.append(transform)
-            while self._is_old(kept[0], transform):
+            while self._is_far(kept[0], transform):
                 kept.popleft()
+
+    def forget_moving(self) -> None:
+        """Forget the transforms that are not static."""
+        for parents in self._by_child.values():
+            for kept in parents.values():
+                if kept and kept[0].time_ns is not None:
+                    kept.clear()
 
     def tree(self, frames: Iterable[str]) -> TransformTree:
         """Return the frames from these up to their roots, with the transforms between them."""
@@ -194,7 +233,8 @@ class TransformWindow:
                 waiting.append(parent)
         return TransformTree(chosen)
 
-    def _is_old(self, first: Transform, latest: Transform) -> bool:
+    def _is_far(self, first: Transform, latest: Transform) -> bool:
         if first.time_ns is None or latest.time_ns is None:
             return False
-        return latest.time_ns - first.time_ns > self._keep_ns
+        # of the future: from before the clock was set back
+        return abs(latest.time_ns - first.time_ns) > self._keep_ns

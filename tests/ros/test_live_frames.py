@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from robot_bag import BASE, COLOUR, COLOUR_INFO, DELAYS_NS, DEPTH, arrivals, feed, load_write_bag, write_robot_bag
@@ -13,6 +16,7 @@ from gausslite.domain.frame import Frame
 from gausslite_ros.bag_file import BagAddress, BagOptions
 from gausslite_ros.bag_source import BagSource
 from gausslite_ros.live_frames import LiveFrames
+from gausslite_ros.messages import stamp_ns
 from gausslite_ros.transforms import Transform, TransformWindow
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
@@ -122,6 +126,57 @@ def test_the_window_keeps_only_what_interpolation_needs() -> None:
     window.add(Transform("odom", "other", i, *still) for i in range(10))
     tree = window.tree((BASE,))
     assert tree.frames == [BASE, "odom"]
-    assert tree.last_time_s("odom", BASE) == pytest.approx(9.99)
+    assert tree.span_s("odom", BASE)[1] == pytest.approx(9.99)
     assert tree.at("odom", BASE, 6.5) is None
     assert tree.at("odom", BASE, 7.5) is not None
+
+
+def shifted(message: Any, shift_ns: int) -> Any:
+    """Return a copy of a message whose stamps are later."""
+    message = copy.deepcopy(message)
+    for part in getattr(message, "transforms", [message]):
+        time_ns = stamp_ns(part.header) + shift_ns
+        object.__setattr__(part.header.stamp, "sec", time_ns // 10**9)
+        object.__setattr__(part.header.stamp, "nanosec", time_ns % 10**9)
+    return message
+
+
+@pytest.mark.parametrize("shifts_s", [(0, 0, 0), (120, 60, 0), (0, 3600, 0), (0, -1, -2)])
+def test_a_clock_that_goes_back_or_forth_costs_a_few_frames(tmp_path: Path, shifts_s: tuple[int, ...]) -> None:
+    options = write_robot_bag(tmp_path / "b.mcap", frames=30)
+    live = LiveFrames(options)
+    for k, shift_s in enumerate(shifts_s):
+        frames: list[Frame] = []
+        for topic, message in arrivals(tmp_path / "b.mcap", {}):
+            # as of the node: static transforms and cameras come once
+            if topic in (COLOUR, DEPTH, "/tf") or k == 0:
+                feed(live, options, topic, shifted(message, shift_s * 10**9))
+                frames += live.take()
+        assert len(frames) >= 20, (shift_s, live.counters, live.problem)
+        steps_m = [b.T_world_camera[0, 3] - a.T_world_camera[0, 3] for a, b in pairwise(frames)]
+        assert all(0 < step_m < 0.05 for step_m in steps_m), "poses of both clocks are never mixed"
+
+
+@pytest.mark.parametrize("topic_of_the_future", [COLOUR, DEPTH, "/tf"])
+def test_one_stamp_of_the_future_costs_a_few_frames(tmp_path: Path, topic_of_the_future: str) -> None:
+    options = write_robot_bag(tmp_path / "b.mcap", frames=60)
+    live, frames, seen = LiveFrames(options), [], 0
+    for topic, message in arrivals(tmp_path / "b.mcap", {}):
+        seen += topic == topic_of_the_future
+        is_wrong = topic == topic_of_the_future and seen == 20
+        feed(live, options, topic, shifted(message, 10**18) if is_wrong else message)
+        frames += live.take()
+    assert len(frames) >= 45, (live.counters, live.problem)
+
+
+def test_images_that_are_a_little_late_are_left_out(tmp_path: Path) -> None:
+    options = write_robot_bag(tmp_path / "b.mcap", frames=20)
+    live, frames = LiveFrames(options), []
+    for topic, message in arrivals(tmp_path / "b.mcap", {COLOUR: 0}):
+        feed(live, options, topic, message)
+        if topic == COLOUR:
+            feed(live, options, topic, shifted(message, -250_000_000))
+        frames += live.take()
+    assert [frame.capture_time_ns for frame in frames] == sorted(frame.capture_time_ns for frame in frames)
+    assert live.counters.out_of_order == 20
+    assert live.counters.clock_jumps == 0

@@ -15,6 +15,7 @@ from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
     RecordingOptions,
+    depth_unit_advice,
     report_region_file,
     selected_regions,
     stated_values,
@@ -66,7 +67,6 @@ from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.channel import MAX_PORT
 
 _LEAST_DEPTH_M = 0.05
-_ADVICE = "check the depth unit, `scale` in cam_params.json"
 
 
 def require_mappable_depth(source: str, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
@@ -76,14 +76,16 @@ def require_mappable_depth(source: str, result: MissionResult, keyframes: Sequen
     if result.stopped_by is None:
         raise DatasetError(
             f"{source}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
-            f"{_median_depth_m(keyframes):.3g} m; {_ADVICE}"
+            f"{_median_depth_m(keyframes):.3g} m; {depth_unit_advice(source)}"
         )
 
 
-def depth_notes(keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
+def depth_notes(source: str, keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
     """Return a note if the median depth is nearer than any depth camera measures."""
     median_m = _median_depth_m(keyframes)
-    return (f"the median depth is {median_m:.2g} m; {_ADVICE}",) if median_m < _LEAST_DEPTH_M else ()
+    if median_m >= _LEAST_DEPTH_M:
+        return ()
+    return (f"the median depth is {median_m:.2g} m; {depth_unit_advice(source)}",)
 
 
 def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:
@@ -266,7 +268,7 @@ class _Run:
             *self._mapper.notes,
             *_unseen_notes(options, result),
             *_unreached_notes(self._inputs.schedule, result.last_index),
-            *depth_notes(self._mapper.keyframes()),
+            *depth_notes(options.source, self._mapper.keyframes()),
         )
         self._report = {
             **self._inputs.report(),

@@ -75,6 +75,13 @@ def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True)
     return source
 
 
+def depth_unit_advice(spec: str) -> str:
+    """Return how to state the unit of a sequence's depth images."""
+    is_bag = sibling(Sibling.BAGS).BagAddress.parse(spec) is not None
+    way = "depth_unit=Xmm in the address of the bag" if is_bag else "`scale` in cam_params.json"
+    return f"check the depth unit, {way}"
+
+
 def stated_values(
     registration: DepthRegistration | str | None,
     correction: CameraCorrection | str | None,

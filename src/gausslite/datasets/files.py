@@ -296,24 +296,32 @@ def read_folder_camera(
     order: cam_params.json (with depth units), camera_info.yaml (ROS), cameras.txt (COLMAP), camera-intrinsics.txt (a
     matrix). Returns None without a camera. Raises DatasetError.
     """
-    readers: tuple[tuple[str, Callable[[Path], FolderCamera]], ...] = (
-        (CAMERA_FILE, read_json_camera),
-        *((name, read_camera_info) for name in CAMERA_INFO_FILES),
-        (COLMAP_FILE, read_colmap_camera),
-        (INTRINSICS_FILE, lambda path: FolderCamera(read_matrix(path).camera(str(path), width_px, height_px))),
-    )
-    for name, read in readers:
-        if (folder / name).is_file():
-            return read(folder / name)
+    names = (CAMERA_FILE, *CAMERA_INFO_FILES, COLMAP_FILE, INTRINSICS_FILE)
+    for path in (folder / name for name in names):
+        if path.is_file():
+            return read_camera_file(path, width_px, height_px)
     if published is not None:
         return published
-    for name, read in readers:
-        path = folder.absolute().parent / name
+    for path in (folder.absolute().parent / name for name in names):
         if path.is_file():
-            found = read(path)
+            found = read_camera_file(path, width_px, height_px)
             if (found.camera.width_px, found.camera.height_px) == (width_px, height_px):
                 return replace(found, note=f"the camera is that of {path}, one folder above; expected it in the folder")
     return None
+
+
+def read_camera_file(path: Path, width_px: int, height_px: int) -> FolderCamera:
+    """Return the camera of a file by its name: *.json, *.yaml, cameras.txt of COLMAP, or another text with a matrix.
+
+    The size is that of the images; only a matrix does not state it. Raises DatasetError.
+    """
+    if path.suffix == ".json":
+        return read_json_camera(path)
+    if path.suffix in (".yaml", ".yml"):
+        return read_camera_info(path)
+    if path.name == COLMAP_FILE:
+        return read_colmap_camera(path)
+    return FolderCamera(read_matrix(path).camera(str(path), width_px, height_px))
 
 
 def read_matrix(path: Path) -> FileIntrinsics:

@@ -136,6 +136,17 @@ def require_frames(folder: Path, count: int, expected: str) -> None:
         raise DatasetError(f"{folder}: expected {expected}, got none")
 
 
+def require_matches(folder: Path, count: int, expected: str, times_s: Mapping[str, Sequence[float]]) -> None:
+    """Raise DatasetError with the ranges of all times if no image has what belongs to it at its time."""
+    if count == 0:
+        ranges = (
+            f"{name} from {min(times):.3f} to {max(times):.3f} s" for name, times in times_s.items() if len(times)
+        )
+        raise DatasetError(
+            f"{folder}: expected {expected}, got none: {', '.join(ranges)}; are these times of the same clock?"
+        )
+
+
 _DOWNSCALED_PIXELS = 320 * 240
 
 

@@ -25,7 +25,7 @@ from gausslite.datasets.files import (
     read_rows,
 )
 from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, PoseTrack, is_lost, pose_from_quaternion
-from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.datasets.source import excluded_frames_note, require_matches, require_position
 from gausslite.domain.camera import FileIntrinsics, Lens, LensModel
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
@@ -143,7 +143,9 @@ def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int]:
             depth = folder / depth_names[nearest]
             matches.append(_Match(number, float(time_s), folder / name, depth, T_world_camera))
     expected = "a colour image with depth within 20 ms (rgb.txt, depth.txt) and poses around it (groundtruth.txt)"
-    require_frames(folder, len(matches), expected)
+    times_s = {"colour": colour_times.tolist(), "depth": depth_times.tolist()}
+    times_s |= {} if trajectory is None else {"poses": trajectory.times_s.tolist()}
+    require_matches(folder, len(matches), expected, times_s)
     return matches, len(colour_names)
 
 
