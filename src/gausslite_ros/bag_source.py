@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.files import FolderCamera, read_camera_file
-from gausslite.datasets.folder import FIRST_VIEW_UP, PoseTrack
+from gausslite.datasets.folder import FIRST_VIEW_UP, Origin, PoseTrack
 from gausslite.datasets.source import excluded_frames_note, require_matches, require_position
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError
@@ -242,13 +242,16 @@ class BagSource:
         stated_units = 1 / unit_m if unit_m else self._cameras.colour.units_per_metre
         units_per_metre = stated_units or depth_units_per_metre(self._bag, self._depth.name)
         self._converter = FrameConverter(self._cameras, self._colour.name, self._depth.name, units_per_metre)
-        self._matches, self._recorded = self._associate(colours, depths), len(colours)
+        matches, self._recorded = self._associate(colours, depths), len(colours)
         tolerance = f"{1000 * self._options.tolerance_s:g} ms"
         times_s = {"colour": seconds(colour.stamp_ns for colour in colours).tolist()}
         times_s["depth"] = seconds(depth.stamp_ns for depth in depths).tolist()
         times_s |= {} if poses is None else {"poses": poses.span_s}
         expected = f"a colour image with a pose, and depth within {tolerance}"
-        require_matches(address.path, len(self._matches), expected, times_s)
+        require_matches(address.path, len(matches), expected, times_s)
+        self._origin = Origin.near(np.array([match.T_world_camera[:3, 3] for match in matches]))
+        moved = self._origin.moved
+        self._matches = [replace(match, T_world_camera=moved(match.T_world_camera)) for match in matches]
         self._up_axis = unit_up_axis(up_axis or (_WORLD_UP if poses is not None else FIRST_VIEW_UP))
 
     @property
@@ -302,8 +305,8 @@ class BagSource:
 
     @property
     def world_frame(self) -> str:
-        """Name of the bag."""
-        return self.name
+        """Name of the bag, with an origin that is not zero."""
+        return self._origin.frame(self.name)
 
     @property
     def regions_file(self) -> Path | None:
@@ -312,10 +315,10 @@ class BagSource:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Message on the colour images without depth or pose at their stamp."""
+        """Messages on the colour images without depth or pose at their stamp, and on an origin that is not zero."""
         reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
         note = excluded_frames_note(self._recorded - len(self), self._recorded, reason)
-        return (note,) if note else ()
+        return tuple(filter(None, (note, self._origin.note)))
 
     def __len__(self) -> int:
         return len(self._matches)

@@ -269,3 +269,14 @@ def test_streams_of_different_clocks_are_named_with_their_times(tmp_path: Path, 
     bag = write_small_bag(tmp_path / "b.mcap", depth=depth, colour=colour if late == "tf" else None)
     with pytest.raises(DatasetError, match=r"colour from \S+ to \S+ s, depth from \S+ to \S+ s, poses from 1000.000"):
         frames_of(bag)
+
+
+def test_tf_far_from_the_origin_is_mapped_from_a_stated_origin(tmp_path: Path) -> None:
+    def far(bag: Writer) -> None:
+        bag.write("/tf_static", TF, START_NS, link(START_NS, "utm", "odom", 5_429_380.0))
+
+    address = BagAddress.parse(f"bag:{write_small_bag(tmp_path / 'b.mcap', extra=far)}?frame=utm")
+    assert address is not None
+    source = BagSource(address)
+    assert source.world_frame == "b from 5430000 0 0"
+    np.testing.assert_allclose(source.frame(2).T_world_camera[:3, 3], (-620 + 0.02, 0, 0), atol=1e-8)

@@ -18,7 +18,7 @@ from gausslite.datasets.regions import REGIONS_FILE, balls_for_small_objects, lo
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError, PoseError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import MAX_COORDINATE_M, Frame
 from gausslite.domain.pose import Trajectory, UpAxis, require_rigid
 from gausslite.domain.relevance import Region
 
@@ -108,6 +108,50 @@ def estimate_up(
     return (float(up[0]), float(up[1]), float(up[2]))
 
 
+_ORIGIN_STEP_M = 10_000.0
+_EARTH_DIAMETER_M = 1.3e7
+_ORIGIN_POSES = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The point of a recording's world that is the map's origin: zero, but for poses far away, such as those of UTM.
+
+    It is a multiple of 10 km, so that recordings of one place have the same.
+    """
+
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def near(cls, positions_m: Float64[ndarray, "n 3"]) -> Origin:
+        """Return the origin for cameras at these positions; single outliers do no harm."""
+        finite_m = positions_m[np.isfinite(positions_m).all(axis=1)]
+        median_m = np.median(finite_m, axis=0) if len(finite_m) else np.zeros(3)
+        if not MAX_COORDINATE_M < np.abs(median_m).max() < _EARTH_DIAMETER_M:
+            return cls()
+        x_m, y_m, z_m = (np.round(median_m / _ORIGIN_STEP_M) * _ORIGIN_STEP_M).tolist()
+        return cls((x_m, y_m, z_m))
+
+    def moved(self, T_world_camera: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+        """Return the pose in the map."""
+        T = T_world_camera.copy()
+        T[:3, 3] -= self.position_m
+        return T
+
+    def frame(self, world: str) -> str:
+        """Return the name of the map's frame: the world's own, or one with the origin."""
+        return f"{world} from {self}" if any(self.position_m) else world
+
+    @property
+    def note(self) -> str:
+        """Message on an origin that is not zero; empty otherwise."""
+        return f"positions are far away; the map's origin is at {self} m" if any(self.position_m) else ""
+
+    def __str__(self) -> str:
+        """Return the coordinates."""
+        return " ".join(f"{value:.0f}" for value in self.position_m)
+
+
 _RATE_HZ = 30
 
 
@@ -120,6 +164,7 @@ class FolderSource:
     _unit_stated: bool
     _units: DepthUnits
     _up_axis: UpAxis
+    _origin = Origin()
 
     def __init__(self, folder: Path) -> None:
         """Subclasses also call `_set_camera` and set `_up_axis`."""
@@ -144,7 +189,7 @@ class FolderSource:
     @property
     def notes(self) -> tuple[str, ...]:
         """Messages on a camera file of another folder, and on excluded frames."""
-        return tuple(note for note in (self._camera_note, self.excluded_frames) if note)
+        return tuple(filter(None, (self._camera_note, self.excluded_frames, self._origin.note)))
 
     @property
     def camera(self) -> Camera:
@@ -178,8 +223,8 @@ class FolderSource:
 
     @property
     def world_frame(self) -> str:
-        """Name of the recording, also where the folder is given as "."."""
-        return self.name or self._folder.resolve().name
+        """Name of the recording, also where the folder is given as ".", with an origin that is not zero."""
+        return self._origin.frame(self.name or self._folder.resolve().name)
 
     @property
     def regions_file(self) -> Path | None:
@@ -215,6 +260,9 @@ class NumberedFolderSource(FolderSource, ABC):
         self._require_poses = require_poses
         self._numbers = [number for number in self._colours if not require_poses or not self._is_lost(number)]
         require_frames(self._folder, len(self._numbers), "frames with a pose")
+        some = self._numbers[:: -(-len(self._numbers) // _ORIGIN_POSES)]
+        positions_m = [self._read_matrix(number)[:3, 3] for number in some if self._has_pose(number)]
+        self._origin = Origin.near(np.array(positions_m).reshape(-1, 3))
 
     @abstractmethod
     def _depth_path(self, number: int) -> Path:
@@ -270,7 +318,7 @@ class NumberedFolderSource(FolderSource, ABC):
     def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
         if not self._require_poses and not self._has_pose(number):
             return np.eye(4)
-        return nearest_rigid(self._pose_location(number), self._read_matrix(number))
+        return self._origin.moved(nearest_rigid(self._pose_location(number), self._read_matrix(number)))
 
     def _has_pose(self, number: int) -> bool:
         try:

@@ -94,7 +94,7 @@ class Source(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages for the operator: which recorded frames are excluded and why, a camera file of another folder."""
+        """Messages for the operator: excluded frames and why, a camera file of another folder, a moved origin."""
         ...
 
     def __len__(self) -> int: ...

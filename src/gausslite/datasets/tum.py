@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from gausslite.datasets.files import (
     read_lines,
     read_rows,
 )
-from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, PoseTrack, is_lost, pose_from_quaternion
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, Origin, PoseTrack, is_lost, pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_matches, require_position
 from gausslite.domain.camera import FileIntrinsics, Lens, LensModel
 from gausslite.domain.errors import DatasetError
@@ -73,7 +73,10 @@ class TumSource(FolderSource):
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
-        self._matches, self._recorded = _associate(folder, require_poses)
+        matches, self._recorded = _associate(folder, require_poses)
+        self._origin = Origin.near(np.array([match.T_world_camera[:3, 3] for match in matches]))
+        moved = self._origin.moved
+        self._matches = [replace(match, T_world_camera=moved(match.T_world_camera)) for match in matches]
         size_px = first_readable_size(match.colour for match in self._matches)
         self._set_camera(read_tum_camera(folder, *size_px), _UNITS)
         has_poses = require_poses or (folder / _POSES).is_file()

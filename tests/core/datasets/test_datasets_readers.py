@@ -209,3 +209,36 @@ def test_a_smaller_frame_keeps_its_recorded_image(tmp_path: Path, write: Callabl
     assert small.recorded_rgb is not None
     assert np.array_equal(small.sharpest_rgb, full.rgb)
     assert small.rgb.shape == (full.rgb.shape[0] // 2, full.rgb.shape[1] // 2, 3)
+
+
+FAR_M = np.array([458_074.0, 5_429_380.0, 120.0])
+"""As an INS states it in UTM."""
+
+
+def move_tum(folder: Path) -> None:
+    rows = np.loadtxt(folder / "groundtruth.txt")
+    rows[:, 1:4] += FAR_M
+    np.savetxt(folder / "groundtruth.txt", rows, fmt="%.6f")
+
+
+def move_seven_scenes(folder: Path) -> None:
+    for file in folder.glob("*.pose.txt"):
+        T = np.loadtxt(file)
+        T[:3, 3] += FAR_M
+        np.savetxt(file, T, fmt="%.6f")
+
+
+@pytest.mark.parametrize(("write", "move"), [(write_tum, move_tum), (write_seven_scenes, move_seven_scenes)])
+def test_poses_far_from_the_origin_are_mapped_from_a_stated_origin(
+    tmp_path: Path, write: Callable[[Path], Path], move: Callable[[Path], None]
+) -> None:
+    folder = write(tmp_path / "fr1")
+    expected = open_source(str(folder))
+    positions_m = [expected.frame(i).T_world_camera[:3, 3] for i in range(3)]
+    move(folder)
+    source = open_source(str(folder))
+    offsets_m = [source.frame(i).T_world_camera[:3, 3] - positions_m[i] for i in range(3)]
+    np.testing.assert_allclose(offsets_m, np.tile(FAR_M - (460_000, 5_430_000, 0), (3, 1)), atol=1e-5)
+    assert (expected.world_frame, source.world_frame) == ("fr1", "fr1 from 460000 5430000 0")
+    assert any("the map's origin is at 460000 5430000 0 m" in note for note in source.notes)
+    assert expected.notes == ()
