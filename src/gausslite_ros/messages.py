@@ -61,8 +61,11 @@ class TransformMessage(Protocol):
 
 
 def stamp_ns(header: Header) -> int:
-    """Return a header's time in nanoseconds."""
-    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    """Return a header's time in nanoseconds; rospy names its parts in another way than bags and ROS 2."""
+    stamp = header.stamp
+    if hasattr(stamp, "secs"):
+        return int(stamp.secs) * 10**9 + int(stamp.nsecs)
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def frame_name(name: str) -> str:

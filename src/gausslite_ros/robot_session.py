@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
@@ -159,6 +160,7 @@ _CUBE, _TEXT = 1, 9
 _COLOURS = {ObjectRole.TARGET: (0.1, 0.8, 0.2), ObjectRole.ANCHOR: (0.2, 0.5, 1.0)}
 _MIN_SIDE_M = 0.01
 _TEXT_HEIGHT_M = 0.08
+_MAX_SILENCE_S = 3.0
 
 
 def correction_transform(T_map_odometry: Float64[ndarray, "4 4"], frames: tuple[str, str], stamp_ns: int) -> Fields:
@@ -301,8 +303,11 @@ PUBLICATIONS = {
 class RobotSession:
     """Converts the robot's messages to frames for the agent, and the agent's status to messages. Not thread-safe."""
 
-    def __init__(self, parameters: NodeParameters, link: AgentLink) -> None:
-        self._parameters, self._link = parameters, link
+    def __init__(
+        self, parameters: NodeParameters, link: AgentLink, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._parameters, self._link, self._clock = parameters, link, clock
+        self._seen_images, self._seen_at_s = 0, clock()
         self._live = LiveFrames(parameters.topic_options(), parameters.max_wait_s)
         self._message_problem = ""
         if parameters.task:
@@ -368,8 +373,17 @@ class RobotSession:
         self._link.assign_task(str(message.data))
 
     def _problems(self) -> tuple[str, ...]:
-        silent = "" if self._live.counters.received else f"no colour images on {self._parameters.color} yet"
-        return (*self._link.problems, silent, self._live.problem, self._message_problem)
+        return (*self._link.problems, self._silence(), self._live.problem, self._message_problem)
+
+    def _silence(self) -> str:
+        """Return the problem of a camera that sends no images, or no more; empty without it."""
+        received, topic = self._live.counters.received, self._parameters.color
+        if received != self._seen_images:
+            self._seen_images, self._seen_at_s = received, self._clock()
+        silent_s = self._clock() - self._seen_at_s
+        if received == 0:
+            return f"no colour images on {topic} yet"
+        return f"no colour images on {topic} for {silent_s:.0f} s" if silent_s > _MAX_SILENCE_S else ""
 
 
 def _image_type(topic: str) -> str:

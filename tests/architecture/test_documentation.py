@@ -113,6 +113,8 @@ def test_flags_named_in_pages_exist(help_texts: str) -> None:
     # of pip, docker and our own scripts
     others = {"--check", "--editable", "--no-index", "--build", "--python"}
     others |= {"--masks", "--homes", "--gains", "--pose-noise"}
+    # of venv and rosbag
+    others |= {"--system-site-packages", "--clock"}
     # of cibuildwheel, mkdocs, pytest-xdist and cmake
     others |= {"--platform", "--output-dir", "--site-dir", "--dist", "--parallel"}
     unknown = []

@@ -21,6 +21,7 @@ NEED_AN_EXTRA = {
     "torch": ("gausslite.render.reference", "gausslite.render.cuda"),
     "psycopg": ("gausslite.fusion.postgres_",),
     "rclpy": ("gausslite_ros.node",),
+    "rospy": ("gausslite_ros.node_ros1",),
     "viser": ("gausslite_view", "gausslite_bench.view_rates"),
 }
 """Modules that are imported where an option chooses them, by the package that they need."""

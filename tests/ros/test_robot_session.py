@@ -139,6 +139,29 @@ def test_a_task_topic_assigns_the_task() -> None:
         assert status.message == f"mapping: no colour images on {COLOUR} yet"
 
 
+def test_a_camera_that_sends_no_more_images_is_a_warning(tmp_path: Path) -> None:
+    write_robot_bag(tmp_path / "b.mcap")
+    with agent() as running:
+        parameters, now_s = replace(PARAMETERS, agent=running.client.address), [100.0]
+        link = AgentLink(AgentClient(parameters.agent), parameters.link_settings())
+        session = RobotSession(parameters, link, lambda: now_s[0])
+        readers = {each.topic: each.callback for each in session.subscriptions()}
+
+        def problems(silent_s: float) -> list[str]:
+            now_s[0] += silent_s
+            values = session.status(NOW_NS)[0].fields["status"][0]["values"]
+            return [pair["value"] for pair in values if pair["key"].startswith("problem")]
+
+        messages = list(arrivals(tmp_path / "b.mcap", {}))
+        for topic, message in messages:
+            readers[topic](message)
+        assert not any("no colour images" in text for text in problems(0.0))
+        assert f"no colour images on {COLOUR} for 8 s" in problems(8.0)
+        readers[COLOUR](next(message for topic, message in messages if topic == COLOUR))
+        assert not any("no colour images" in text for text in problems(8.0))
+        link.close(end_mission=False)
+
+
 def test_a_message_that_cannot_be_read_is_reported_and_does_not_stop_the_node(tmp_path: Path) -> None:
     options = write_robot_bag(tmp_path / "b.mcap")
     with agent() as running, opened(running, PARAMETERS) as (session, _):

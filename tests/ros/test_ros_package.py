@@ -1,4 +1,4 @@
-"""The colcon package is consistent: entry point, parameters file, dependencies, and rclpy only in the node."""
+"""The colcon package is consistent: entry point, parameters file, dependencies, and ROS only in the nodes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from gausslite_ros.robot_session import PUBLICATIONS, NodeParameters
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "gausslite_ros"
 MODULES = PACKAGE.parents[1] / "src" / "gausslite_ros"
 ROS_MODULES = {"rclpy", "rosidl_runtime_py", "launch", "launch_ros", "ament_index_python"}
+ROS1_MODULES = {"rospy", "genpy", "roslib", "rosgraph"}
 AMENT = {"ament_index_python"}
 """Comes with launch_ros."""
 
@@ -34,9 +35,10 @@ def declared() -> set[str]:
     return {element.text or "" for element in root.findall("exec_depend")}
 
 
-def test_only_the_node_and_the_launch_file_import_ros() -> None:
+def test_only_the_nodes_and_the_launch_file_import_ros() -> None:
     importing = {path.name for path in python_files() if imports(path) & ROS_MODULES}
     assert importing == {"node.py", "gausslite.launch.py"}
+    assert {path.name for path in python_files() if imports(path) & ROS1_MODULES} == {"node_ros1.py"}
 
 
 def test_the_manifest_declares_what_is_imported_and_published() -> None:

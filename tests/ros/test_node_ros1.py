@@ -1,0 +1,55 @@
+"""The node of ROS 1 publishes messages that rospy can send, and reads those of rospy; it needs rospy."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pytest
+from test_robot_session import MUG, NOW_NS, SNAPSHOT
+
+from gausslite.wire.robot import SentFrames
+from gausslite_ros.live_frames import LiveCounters
+from gausslite_ros.messages import CompressedImageMessage, stamp_ns
+from gausslite_ros.robot_session import (
+    DIAGNOSTICS,
+    OBJECTS,
+    PUBLICATIONS,
+    TF,
+    correction_transform,
+    diagnostics,
+    object_markers,
+)
+
+pytest.importorskip("rospy", reason="the node of ROS 1 needs rospy")
+node: Any = pytest.importorskip("gausslite_ros.node_ros1")
+
+FIELDS = {
+    TF: correction_transform(np.eye(4), ("map", "odom"), NOW_NS),
+    OBJECTS: object_markers((MUG,), "map", NOW_NS),
+    DIAGNOSTICS: diagnostics(SNAPSHOT, (LiveCounters(), SentFrames()), ("a problem",), NOW_NS, "agent"),
+}
+
+
+@pytest.mark.parametrize("topic", PUBLICATIONS)
+def test_messages_survive_a_round_through_rospys_serialisation(topic: str) -> None:
+    kind = node._message_class(PUBLICATIONS[topic])
+    message, buffer = node._filled(kind(), FIELDS[topic]), BytesIO()
+    message.serialize(buffer)
+    read = kind().deserialize(buffer.getvalue())
+    again = BytesIO()
+    read.serialize(again)
+    assert again.getvalue() == buffer.getvalue()
+    header = read.header if topic == DIAGNOSTICS else (read.markers if topic == OBJECTS else read.transforms)[0].header
+    assert stamp_ns(header) == NOW_NS
+
+
+def test_private_names_are_those_of_ros_1() -> None:
+    assert [node._name(topic) for topic in ("~/task", "/tf")] == ["~task", "/tf"]
+
+
+def test_a_compressed_image_of_rospy_is_known_as_one() -> None:
+    kind = node._message_class("sensor_msgs/msg/CompressedImage")
+    assert isinstance(kind(), CompressedImageMessage)
+    assert not isinstance(node._message_class("sensor_msgs/msg/Image")(), CompressedImageMessage)
