@@ -17,7 +17,7 @@ from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import VoxelBatch, empty_batch
 from gausslite.wire.convert import MapUpdate
 
@@ -153,24 +153,6 @@ def _as_rgb(colour: UInt8[ndarray, "3"]) -> tuple[int, int, int]:
 
 
 DEFAULT_LIMIT = 150_000
-_LEVEL_OF_DETAIL_GOLDEN_RATIO = 0.618033988749895
-_LEAST_OPACITY = 1e-3
-
-
-def spread_order(gaussians: Gaussians) -> Int64[ndarray, " n"]:
-    """Return all indices so that each prefix is spread evenly over the map, opaque Gaussians first.
-
-    The task's region (active) and the background take turns until one of them is used up.
-    """
-    # multiples of the golden ratio, modulo 1, are evenly spread over the memory order, which follows space
-    priority = ((np.arange(1, len(gaussians) + 1) * _LEVEL_OF_DETAIL_GOLDEN_RATIO) % 1.0) / np.maximum(
-        gaussians.opacities.astype(np.float64), _LEAST_OPACITY
-    )
-    turn = np.empty(len(gaussians), np.int64)
-    for part in (np.flatnonzero(gaussians.active), np.flatnonzero(~gaussians.active)):
-        turn[part[np.argsort(priority[part], kind="stable")]] = np.arange(len(part))
-    order: Int64[ndarray, " n"] = np.argsort(turn, kind="stable")
-    return order
 
 
 def covariances_m2(gaussians: Gaussians) -> Float32[ndarray, "n 3 3"]:
@@ -268,6 +250,11 @@ _BESIDE, _ABOVE = 0.5, 0.4
 """Distances from the map's centre along the horizontal axes and upwards, as shares of its extent."""
 _MIN_EXTENT_M = 0.1
 """Of a map that is a point: the camera is never at the point that it looks at."""
+_REGION_DISTANCES = 3.0
+_MIN_DISTANCE_M = 0.8
+"""From the task's region, in multiples of its diagonal and at least this: its surroundings are seen, too."""
+_MAX_REGION_SHARE = 0.5
+"""Of the map's diagonal: a larger region is the map itself."""
 Vector = tuple[float, float, float]
 
 
@@ -281,10 +268,19 @@ class StartView:
 
 
 def start_view(contents: ViewContents) -> StartView:
-    """Return the start view of a map with Gaussians: a map without a trajectory, as a team's, is seen from beside."""
+    """Return the start view of a map with Gaussians: of the task's region, as the camera that shows it best saw it.
+
+    Without a region, a robot's map is seen from behind its first pose, a map without a trajectory from beside.
+    """
     poses = [keyframe.T_world_camera for keyframe in contents.keyframes] or list(contents.T_world_camera)
+    poses += [view.T_world_camera for path in contents.paths for view in path.keyframes]
     up = _up(poses)
     low, centre, high = np.percentile(contents.gaussians.means_m.astype(np.float64), (5, 50, 95), axis=0)
+    region = _region(contents)
+    if region is not None and np.linalg.norm(region[1] - region[0]) < _MAX_REGION_SHARE * np.linalg.norm(high - low):
+        view = _view_of_region(*region, poses, up)
+        if view is not None:
+            return view
     if not len(contents.times_ns):
         low = np.min([low, *(landmark.extent_m.min_m for landmark in contents.objects)], axis=0)
         high = np.max([high, *(landmark.extent_m.max_m for landmark in contents.objects)], axis=0)
@@ -298,6 +294,37 @@ def start_view(contents: ViewContents) -> StartView:
     position = first[:3, 3] - _BEHIND_M * forward + 0.5 * _BEHIND_M * up
     distance_m = max(1.0, float(np.dot(centre - first[:3, 3], forward)))
     return StartView(_vector(position), _vector(first[:3, 3] + distance_m * forward), _vector(up))
+
+
+def _region(contents: ViewContents) -> tuple[Float64[ndarray, "3"], Float64[ndarray, "3"]] | None:
+    """Return the ends of the box of the confirmed target with most of the region's Gaussians, or else of these."""
+    means_m = contents.gaussians.means_m[contents.gaussians.active].astype(np.float64)
+    boxes = [landmark.extent_m for landmark in contents.objects if landmark.role is ObjectRole.TARGET]
+    if boxes:
+        inside = [np.all((means_m >= box.min_m) & (means_m <= box.max_m), axis=1).sum() for box in boxes]
+        box = boxes[int(np.argmax(inside))]
+        return np.array(box.min_m), np.array(box.max_m)
+    if not len(means_m):
+        return None
+    low, high = np.percentile(means_m, (10, 90), axis=0)
+    return low, high
+
+
+def _view_of_region(
+    low: Float64[ndarray, "3"], high: Float64[ndarray, "3"], poses: Sequence[Float64[ndarray, "4 4"]], up: np.ndarray
+) -> StartView | None:
+    """Return a view on the line to the camera that saw the region near and in its middle; None if none saw it."""
+    centre = 0.5 * (low + high)
+    offsets_m = np.array([(centre - pose[:3, 3]) @ pose[:3, :3] for pose in poses]).reshape(-1, 3)
+    distances_m = np.linalg.norm(offsets_m, axis=1)
+    beside = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) / np.maximum(offsets_m[:, 2], 1e-9)
+    costs = np.where((offsets_m[:, 2] > _MIN_EXTENT_M) & (beside < 1.0), distances_m * (1 + 2 * beside), np.inf)
+    if not np.isfinite(costs).any():
+        return None
+    best = int(np.argmin(costs))
+    distance_m = max(_MIN_DISTANCE_M, _REGION_DISTANCES * float(np.linalg.norm(high - low)))
+    share = min(1.0, distance_m / float(distances_m[best]))
+    return StartView(_vector(centre + share * (poses[best][:3, 3] - centre)), _vector(centre), _vector(up))
 
 
 def _up(poses: Sequence[Float64[ndarray, "4 4"]]) -> Float64[ndarray, "3"]:

@@ -19,12 +19,12 @@ from gausslite_view.contents import (
     colours_of,
     covariances_m2,
     legend_of,
-    spread_order,
     start_view,
 )
+from gausslite_view.levels import SplatLevels, Splats
 from gausslite_view.local_server import LOOPBACK, LocalServer
 from gausslite_view.markers import SceneMarkers
-from gausslite_view.splats import SplatLayer, Splats
+from gausslite_view.splats import SplatLayer
 from gausslite_view.time_scrub import PastMap, TimeScrub
 
 _THOUSAND = 1000
@@ -164,11 +164,9 @@ class MapPage:
             self._legend.content = legend_html(legend_of(contents, mode))
             if not len(rows):
                 return
-            rows = rows[spread_order(contents.gaussians.take(rows))]
             shown = contents.gaussians.take(rows)
-            self._layer.show(
-                Splats(shown.means_m, covariances_m2(shown), colours_of(contents, mode)[rows], shown.opacities)
-            )
+            splats = Splats(shown.means_m, covariances_m2(shown), colours_of(contents, mode)[rows], shown.opacities)
+            self._layer.show(SplatLevels(splats, self._start_view or start_view(contents)))
 
 
 def legend_html(entries: Sequence[tuple[str, tuple[int, int, int]]]) -> str:

@@ -8,9 +8,10 @@ from itertools import combinations, product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
+from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite_view.contents import AgentPath, StartView, ViewContents, category_colour
@@ -93,9 +94,11 @@ def _axes(view: StartView) -> tuple[Float64[ndarray, "3"], Float64[ndarray, "3"]
     return right, np.cross(right, forward), forward
 
 
-_MAX_FRUSTA = 60
-_MAX_TEAM_FRUSTA = 20
+_MAX_FRUSTA = 6
+_MAX_TEAM_FRUSTA = 3
 """Of each agent of a team."""
+_CLEAR = 0.7
+"""Around the start view's camera, within this share of the way to its focus, no marker of a camera is drawn."""
 _MAX_TRAJECTORY_POINTS = 5000
 _TRAJECTORY_RGB, _KEYFRAME_RGB, _ROBOT_RGB = (40, 90, 220), (90, 140, 230), (220, 40, 40)
 _TARGET_RGB, _ANCHOR_RGB = (20, 150, 60), (200, 130, 20)
@@ -138,8 +141,7 @@ class SceneMarkers:
                 return
             objects = contents.objects if self._switches["Objects"].value else ()
             self._replace("objects", self._objects(objects))
-            views = contents.keyframes if self._switches["Keyframes"].value else ()
-            views = views[:: max(1, -(-len(views) // _MAX_FRUSTA))]
+            views = self._spread(contents.keyframes, _MAX_FRUSTA)
             frusta = [self._frustum(f"/keyframes/{v.index}", v.camera, v.T_world_camera, _KEYFRAME_RGB) for v in views]
             self._replace("keyframes", frusta)
             self._replace("team", [handle for path in contents.paths for handle in self._path(path)])
@@ -158,16 +160,17 @@ class SceneMarkers:
             step = max(1, -(-(frame + 1) // _MAX_TRAJECTORY_POINTS))
             points_m = contents.T_world_camera[: frame + 1 : step, :3, 3].astype(np.float32)
             camera = contents.keyframes[0].camera if contents.keyframes else _UNKNOWN_CAMERA
-            handles = [self._frustum("/robot", camera, contents.T_world_camera[frame], _ROBOT_RGB, 0.16)]
-            self._replace("trajectory", [*handles, *self._line("/trajectory", points_m, _TRAJECTORY_RGB)])
+            handles = self._line("/trajectory", points_m, _TRAJECTORY_RGB)
+            if self._is_clear(points_m[-1:]).all():
+                handles.append(self._frustum("/robot", camera, contents.T_world_camera[frame], _ROBOT_RGB, 0.16))
+            self._replace("trajectory", handles)
 
     def _path(self, path: AgentPath) -> list[Any]:
         """Draw an agent's keyframes, the line through them, and the agent's name at the newest one."""
         colour, name, views = category_colour(path.colour_index), f"/team/{path.agent}", path.keyframes
         handles: list[Any] = []
-        if views and self._switches["Keyframes"].value:
-            shown = views[:: max(1, -(-len(views) // _MAX_TEAM_FRUSTA))]
-            handles += [self._frustum(f"{name}/{v.index}", v.camera, v.T_world_camera, colour) for v in shown]
+        shown = self._spread(views, _MAX_TEAM_FRUSTA)
+        handles += [self._frustum(f"{name}/{v.index}", v.camera, v.T_world_camera, colour) for v in shown]
         if views and self._switches["Trajectory"].value:
             points_m = np.array([view.T_world_camera[:3, 3] for view in views], np.float32)
             handles += self._line(f"{name}/line", points_m, colour)
@@ -176,10 +179,28 @@ class SceneMarkers:
         return handles
 
     def _line(self, name: str, points_m: Float32[ndarray, "n 3"], colour: tuple[int, int, int]) -> list[Any]:
-        if len(points_m) < 2:
+        is_clear = self._is_clear(points_m)
+        segments = np.stack([points_m[:-1], points_m[1:]], axis=1)[is_clear[:-1] & is_clear[1:]]
+        if not len(segments):
             return []
-        segments = np.stack([points_m[:-1], points_m[1:]], axis=1)
-        return [self._server.scene.add_line_segments(name, segments, colour, thickness=0.008)]
+        return [self._server.scene.add_line_segments(name, segments, colour, thickness=0.005)]
+
+    def _spread(self, views: Sequence[KeyframeView], most: int) -> list[KeyframeView]:
+        """Return at most this many keyframes, evenly spread, of those that do not cover the start view."""
+        if not views or not self._switches["Keyframes"].value:
+            return []
+        is_clear = self._is_clear(np.array([view.T_world_camera[:3, 3] for view in views]))
+        clear = [view for view, shown in zip(views, is_clear, strict=True) if shown]
+        return clear[:: max(1, -(-len(clear) // most))]
+
+    def _is_clear(self, points_m: np.ndarray) -> Bool[ndarray, " n"]:
+        """Return which points are not near to the start view's camera, where markers would cover what it shows."""
+        if self._view is None:
+            return np.ones(len(points_m), np.bool_)
+        eye_m = np.array(self._view.position_m)
+        reach_m = float(np.linalg.norm(np.subtract(self._view.look_at_m, eye_m)))
+        clear: Bool[ndarray, " n"] = np.linalg.norm(points_m - eye_m, axis=1) > _CLEAR * reach_m
+        return clear
 
     def _objects(self, objects: Sequence[ObjectLandmark]) -> list[Any]:
         if self._view is None:
@@ -189,7 +210,8 @@ class SceneMarkers:
 
     def _object(self, index: int, landmark: ObjectLandmark, label_m: Float64[ndarray, "3"]) -> list[Any]:
         """Draw an object's box and its name, with a line between them if the name had to move up."""
-        colour = _TARGET_RGB if landmark.role is ObjectRole.TARGET else _ANCHOR_RGB
+        is_target = landmark.role is ObjectRole.TARGET
+        colour, thickness_m = (_TARGET_RGB, 0.004) if is_target else (_ANCHOR_RGB, 0.002)
         low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
         high = np.maximum(high, low + _MIN_BOX_M)
         scene, name = self._server.scene, f"/objects/{index}"
@@ -197,7 +219,7 @@ class SceneMarkers:
         edges_m = np.concatenate([_box_edges_m(low, high), np.stack([inside_m, label_m])[None].astype(np.float32)])
         # a label is drawn as text, never as HTML
         return [
-            scene.add_line_segments(f"{name}/box", edges_m, colour, thickness=0.004),
+            scene.add_line_segments(f"{name}/box", edges_m, colour, thickness=thickness_m),
             scene.add_label(f"{name}/label", label_text(landmark), position=label_m, anchor="bottom-center"),
         ]
 

@@ -22,16 +22,18 @@ from gausslite_view.pages import open_page
 from gausslite_view.plots import HistoryPlot, QualityPlot
 
 _INTERVAL_S = 1.0
+_MOST_SHARE = 0.2
+"""Of the mission's time that drawing takes at most."""
 _NS_PER_S = 1e9
 
 
 class MissionView:
-    """Draws at most once a second; call it from the thread that maps."""
+    """Draws at most once a second, less often where drawing is slow; call it from the thread that maps."""
 
     def __init__(self, page: MapPage, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]) -> None:
         self._page, self._mapper, self._task_at = page, mapper, task_at
         self._started_s = time.monotonic()
-        self._drawn_s = -_INTERVAL_S
+        self._due_s = 0.0
         self._detected: DetectedImage | None = None
         gui = page.server.gui
         self._camera = CameraPanel(page)
@@ -41,12 +43,11 @@ class MissionView:
             self._quality = QualityPlot(gui)
 
     def update(self, outcome: FrameOutcome) -> None:
-        """Draw the map after a frame, if the last drawing is older than a second."""
+        """Draw the map after a frame, if the next drawing is due."""
         now_s = time.monotonic()
         self._detected = outcome.detected or self._detected
-        if now_s - self._drawn_s < _INTERVAL_S or not outcome.gaussians:
+        if now_s < self._due_s or not outcome.gaussians:
             return
-        self._drawn_s = now_s
         keyframes = self._mapper.keyframes()
         contents = self._contents(outcome.index, keyframes)
         if keyframes:
@@ -59,6 +60,8 @@ class MissionView:
         self._roi.add(now_s - self._started_s, [100 * outcome.roi_share])
         self._page.remember(contents)
         self._page.show(contents)
+        ended_s = time.monotonic()
+        self._due_s = max(now_s + _INTERVAL_S, ended_s + (ended_s - now_s) * (1 / _MOST_SHARE - 1))
 
     def _contents(self, index: int, keyframes: list[Keyframe]) -> ViewContents:
         graph, trajectory = self._task_at(index), self._mapper.poses.trajectory()

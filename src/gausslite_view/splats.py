@@ -1,4 +1,4 @@
-"""Draw the splats: a small set for every new browser, then as many for each browser as it draws fast enough."""
+"""Draw the splats: a coarse level for every new browser, then as fine a level for each as it draws fast enough."""
 
 from __future__ import annotations
 
@@ -6,61 +6,43 @@ import statistics
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-from jaxtyping import Float32, UInt8
-from numpy import ndarray
-
+from gausslite_view.levels import SplatLevels
 from gausslite_view.local_server import LocalServer
 
-PREVIEW_COUNT = 2_000
-"""Splats that a new browser gets first: in software rendering about 20 frames a second."""
+PREVIEW_COUNT = 3_000
+"""Merged splats that a new browser gets first: in software rendering about 10 frames a second."""
+HARDWARE_RESPONSE_S = 0.07
+"""A browser that answers faster with the first level has a GPU, and gets all splats at once."""
 RESPONSE_LIMIT_S = 0.3
 """A browser that takes longer to answer a message gets fewer splats. An answer takes about two frames."""
-_STEPS = (PREVIEW_COUNT, 5_000, 10_000, 20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
+_STEPS = (PREVIEW_COUNT, 10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000)
 _OPTIMISM = 2.0
 """An answer takes less than in proportion to the splats: more are tried if the proportion gives twice the limit."""
 _REST_S = 0.7
 """A camera that has not moved for this long is at rest; more splats are sent only then."""
 _FIRST_PAUSE_S = 2.0
-"""A new browser keeps the small set for this long, so that a first move does not wait for the next step."""
+"""A browser without a GPU keeps the first level for this long, so that a first move does not wait for the next."""
 _RETRY_S = 30.0
 """A slow browser tries the next step again after this time, then after twice the time, and so on."""
 _ANSWERS = 5
 _ANSWER_LIMIT_S = 60.0
 _STORAGE_KEY = "gausslite-answer"
-_SPLATS = "/splats"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Splats:
-    """What a browser draws, in the order in which it is added: each prefix is spread evenly over the map."""
-
-    means_m: Float32[ndarray, "n 3"]
-    covariances_m2: Float32[ndarray, "n 3 3"]
-    rgb: UInt8[ndarray, "n 3"]
-    opacities: Float32[ndarray, " n"]
-
-    def __len__(self) -> int:
-        return len(self.means_m)
-
-    def add_to(self, scene: Any, count: int) -> Any:
-        """Add the first `count` splats to a scene of viser, in place of those of before; return their handle."""
-        arrays = (self.means_m, self.covariances_m2, self.rgb, self.opacities[:, None])
-        return scene.add_gaussian_splats(_SPLATS, *(array[:count] for array in arrays))
-
-
-def next_count(shown: int, total: int, response_s: float) -> int:
-    """Return how many of `total` splats to try after `shown` with a response of response_s, `shown` if slow."""
-    larger = min(total, next((step for step in _STEPS if step > shown), total))
-    return larger if response_s * larger <= _OPTIMISM * RESPONSE_LIMIT_S * shown else shown
+def next_limit(limit: int, total: int, response_s: float) -> int:
+    """Return the most splats to try after a response of response_s with `limit` of `total`, `limit` if it was slow."""
+    larger = next((step for step in _STEPS if step > limit), limit)
+    allowed = _OPTIMISM * RESPONSE_LIMIT_S * min(limit, total)
+    return larger if response_s * min(larger, total) <= allowed else limit
 
 
 class BrowserDetail:
     """Owns the splats of one browser and the thread that sends them.
 
-    The thread draws more splats when the camera rests, measures the answers, and goes back one step if they are slow.
+    If the first answers are those of a GPU, the thread draws all splats. Otherwise it draws more when the camera rests,
+    measures the answers, and goes back one step if they are slow.
     """
 
     def __init__(self, client: Any, folder: Any, is_adaptive: bool, is_connected: Callable[[], bool]) -> None:
@@ -73,17 +55,16 @@ class BrowserDetail:
             self._note = client.gui.add_html("")
         self._changed = threading.Condition()
         self._is_adaptive, self._is_restarted, self._is_closed = is_adaptive, False, False
-        self._splats: Splats | None = None
+        self._splats: SplatLevels | None = None
         self._moved_s = time.monotonic()
         # only the thread uses what follows
-        self._drawn: Splats | None = None
+        self._drawn: SplatLevels | None = None
         self._handle: Any = None
         self._start_again()
-        self._retry_at_s = self._moved_s + _FIRST_PAUSE_S
         client.camera.on_update(lambda _: self._note_motion())
         threading.Thread(target=self._run, name="browser-detail", daemon=True).start()
 
-    def show(self, splats: Splats) -> None:
+    def show(self, splats: SplatLevels) -> None:
         """Replace the splats; a slow browser keeps its number of them."""
         with self._changed:
             self._splats = splats
@@ -111,7 +92,7 @@ class BrowserDetail:
                 if splats is self._drawn:
                     self._grow(splats)
                 else:
-                    self._draw(splats, self._count if self._is_adaptive else len(splats))
+                    self._draw(splats, self._limit if self._is_adaptive else len(splats))
         except (ConnectionError, TimeoutError):
             return
         except RuntimeError:
@@ -119,7 +100,7 @@ class BrowserDetail:
             if self._is_connected():
                 raise
 
-    def _wait_for_work(self) -> Splats | None:
+    def _wait_for_work(self) -> SplatLevels | None:
         """Return splats to draw, or those that are drawn if more of them can be tried; None at the end."""
         with self._changed:
             while not self._is_closed:
@@ -141,31 +122,39 @@ class BrowserDetail:
         return max(self._moved_s + _REST_S, self._retry_at_s) - time.monotonic()
 
     def _start_again(self) -> None:
-        self._count, self._usable = PREVIEW_COUNT, 0
+        self._limit, self._usable, self._is_first = PREVIEW_COUNT, 0, True
         self._retry_at_s, self._retry_pause_s = 0.0, _RETRY_S
 
-    def _grow(self, splats: Splats) -> None:
-        """Measure what is drawn; draw one step more, or the last usable number of splats."""
-        count, response_s = min(self._count, len(splats)), self._response_s()
-        if response_s > RESPONSE_LIMIT_S and 0 < self._usable < count:
+    def _grow(self, splats: SplatLevels) -> None:
+        """Measure what is drawn; draw all, one step more, or the last usable number of splats."""
+        limit, response_s, total = self._limit, self._response_s(), len(splats)
+        if self._is_first:
+            self._is_first = False
+            if response_s < HARDWARE_RESPONSE_S:
+                self._usable = limit
+                self._draw(splats, _STEPS[-1])
+            else:
+                self._retry_at_s = time.monotonic() + _FIRST_PAUSE_S
+            return
+        if response_s > RESPONSE_LIMIT_S and 0 < self._usable < limit:
             chosen, is_slow = self._usable, True
         else:
-            self._usable, chosen = count, next_count(count, len(splats), response_s)
-            is_slow = chosen == count < len(splats)
-        if chosen != count:
+            self._usable, chosen = limit, next_limit(limit, total, response_s)
+            is_slow = chosen == limit < total
+        if chosen != limit:
             self._draw(splats, chosen)
         if is_slow:
             self._retry_at_s = time.monotonic() + self._retry_pause_s
             self._retry_pause_s *= 2
         self._note.content = _note_html(self._usable) if is_slow else ""
 
-    def _draw(self, splats: Splats, count: int) -> None:
-        if count > PREVIEW_COUNT:
-            self._handle = splats.add_to(self._client.scene, count)
+    def _draw(self, splats: SplatLevels, limit: int) -> None:
+        if limit > PREVIEW_COUNT:
+            self._handle = splats.add_to(self._client.scene, limit)
         elif self._handle is not None:
             self._handle.remove()
             self._handle = None
-        self._drawn, self._count = splats, count
+        self._drawn, self._limit = splats, limit
 
     def _response_s(self) -> float:
         """Return the median time of an answer: a browser answers a read of its storage between two frames.
@@ -191,29 +180,29 @@ class BrowserDetail:
 
 def _note_html(count: int) -> str:
     return (
-        f'<div style="padding:0 0.75em;font-size:0.85em">This browser draws {count:,} of them: more would be slow. '
-        f"To draw all, clear the box above.</div>"
+        f'<div style="padding:0 0.75em;font-size:0.85em">This browser draws them merged to {count:,}: more would be '
+        f"slow. To draw all, clear the box above.</div>"
     )
 
 
 class SplatLayer:
     """Owns the scene's splats and one BrowserDetail for each browser. Thread-safe.
 
-    The scene that all browsers share has the small set, which a new browser gets with the page's first messages.
-    A larger set belongs to one browser's own scene and hides the shared one there.
+    The scene that all browsers share has the coarsest level, which a new browser gets with the page's first messages.
+    A finer level belongs to one browser's own scene and hides the shared one there.
     """
 
     def __init__(self, server: LocalServer, folder: Any) -> None:
         """folder: the page's folder in which a slow browser's number of splats is shown."""
         self._server, self._folder = server, folder
         self._lock = threading.Lock()
-        self._splats: Splats | None = None
+        self._splats: SplatLevels | None = None
         self._is_adaptive = True
         self._browsers: dict[int, BrowserDetail] = {}
         server.on_client_connect(self._connect)
         server.on_client_disconnect(self._disconnect)
 
-    def show(self, splats: Splats) -> None:
+    def show(self, splats: SplatLevels) -> None:
         """Replace the splats in every browser."""
         with self._lock:
             self._splats = splats

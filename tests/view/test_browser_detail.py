@@ -1,18 +1,17 @@
-"""A browser first gets a small set of splats, then as many as it draws fast enough."""
+"""A browser first gets merged splats, then as many as it draws fast enough."""
 
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from browser import open_browser
-from sample_gaussians import plain_gaussians, random_gaussians
+from sample_gaussians import plain_gaussians
 
 from gausslite_view import splats as browser_detail
-from gausslite_view.contents import ViewContents, spread_order
-from gausslite_view.splats import PREVIEW_COUNT, RESPONSE_LIMIT_S, BrowserDetail, next_count
+from gausslite_view.contents import ViewContents
+from gausslite_view.splats import PREVIEW_COUNT, RESPONSE_LIMIT_S, BrowserDetail, next_limit
 
 pytest.importorskip("viser")
 from gausslite_view.pages import open_page
@@ -36,31 +35,34 @@ def points(count):
     return plain_gaussians(means_m, opacities=0.9, scales_m=0.01)
 
 
-def test_a_fast_browser_takes_the_next_step_and_ends_with_all():
-    assert next_count(PREVIEW_COUNT, 150_000, 0.02) > PREVIEW_COUNT
-    assert next_count(100_000, 150_000, 0.02) == 150_000
-    assert next_count(150_000, 150_000, 0.02) == 150_000
+def test_a_browser_that_answers_in_time_takes_the_next_step():
+    assert PREVIEW_COUNT < next_limit(PREVIEW_COUNT, 150_000, 0.02) < 150_000
+    assert next_limit(100_000, 150_000, 0.02) >= 150_000
 
 
 def test_a_slow_browser_keeps_what_it_has():
-    assert next_count(PREVIEW_COUNT, 150_000, RESPONSE_LIMIT_S) == PREVIEW_COUNT
+    assert next_limit(PREVIEW_COUNT, 150_000, RESPONSE_LIMIT_S) == PREVIEW_COUNT
 
 
-def test_each_prefix_of_the_order_covers_the_map_and_half_of_it_the_region():
-    gaussians = random_gaussians(4000)
-    active = np.arange(4000) < 400
-    gaussians = replace(gaussians, active=active, opacities=np.full(4000, 0.5, np.float32))
-    order = spread_order(gaussians)
-    assert sorted(order.tolist()) == list(range(4000))
-    first = order[:400]
-    assert np.count_nonzero(active[first]) == 200
-    background = np.sort(first[first >= 400])
-    assert np.diff(background).max() < 5 * 3600 / 200
+def drawn_counts(browser, page, until):
+    """Return the numbers of splats that a new tab has drawn until this JavaScript condition holds."""
+    browser.add_init_script(COUNT_DRAWN)
+    tab = browser.new_page()
+    tab.goto(page.url)
+    tab.wait_for_function(until)
+    return set(tab.evaluate("window.drawn"))
 
 
-def test_opaque_gaussians_come_first():
-    gaussians = plain_gaussians(np.zeros((100, 3)), opacities=np.where(np.arange(100) < 50, 0.01, 0.9))
-    assert spread_order(gaussians)[:40].min() >= 50
+def test_a_browser_that_answers_like_a_gpu_goes_from_the_first_level_to_all_splats(monkeypatch):
+    monkeypatch.setattr(browser_detail, "HARDWARE_RESPONSE_S", 1000.0)
+    monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
+    page, count = open_page(0, "test"), 5 * PREVIEW_COUNT
+    try:
+        page.show(ViewContents.of_one_agent(points(count)))
+        with open_browser() as browser:
+            assert drawn_counts(browser, page, f"window.drawn.at(-1) == {count}") <= {PREVIEW_COUNT, count}
+    finally:
+        page.close()
 
 
 def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_more_when_it_is_fast(monkeypatch):
@@ -73,7 +75,7 @@ def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_mor
             browser.add_init_script(COUNT_DRAWN)
             tab = browser.new_page()
             tab.goto(page.url)
-            tab.get_by_text(f"This browser draws {PREVIEW_COUNT:,} of them").wait_for()
+            tab.get_by_text(f"This browser draws them merged to {PREVIEW_COUNT:,}").wait_for()
             tab.wait_for_function("window.drawn.length > 0")
             assert set(tab.evaluate("window.drawn")) == {PREVIEW_COUNT}
             page._adapts.value = False
