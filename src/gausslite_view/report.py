@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+
 from gausslite.codec.state_file import read_png, write_atomic
 from gausslite.domain.errors import StorageError
+from gausslite.domain.objects import found_text
+from gausslite.evaluation.compare import MAP_PURPOSES, team_sentence
 from gausslite_view.report_elements import as_html, element, picture, styled
 from gausslite_view.report_parts import (
     MAP_SIZE,
     SCORES,
     TIMES,
+    Figure,
     ReportContents,
     RunResults,
     as_count,
+    as_decibels,
     as_percent,
     as_seconds,
     figures_table,
     nouns_table,
+    number,
     objects_table,
     read_results,
     settings_table,
+    short_text,
     task_column,
 )
 from gausslite_view.report_pictures import (
@@ -44,7 +54,8 @@ _GENERATOR = "gausslite report"
 # the browser itself refuses every request and every script
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _HEAD_BYTES = 512
-_OPEN_VIEWS = 2
+_OPEN_SHEETS = 2
+_SHEET_WIDTH_PX = 800
 _BARS = (("region PSNR", SCORES[0]), ("image PSNR", SCORES[2]), ("Gaussians", MAP_SIZE[0]), ("frame rate", TIMES[4]))
 _LINES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("time of each frame", "seconds", as_seconds),
@@ -93,30 +104,113 @@ def _document(contents: ReportContents) -> Element:
 
 
 def _sections(contents: ReportContents) -> Iterator[Element]:
+    """Yield one sentence for each run, the pictures, the figures, and then how the maps were made."""
     runs = contents.runs
     colours = {run.name: run_colour(i) for i, run in enumerate(runs)}
-    yield _section("Task", styled("div", "cards", *(task_column(run) for run in runs if run.report)))
+    yield styled("div", "lead", *(element("p", sentence) for sentence in _lead_sentences(runs)))
+    for group in _by_world_frame(runs):
+        if views := shared_views(group):
+            sections = view_sections(group, views)
+            folded = _folded(sections[1:], "views")
+            yield _section("Views", *sections[:1], _view_note(group), *folded, *_kappa_legends(group))
     yield from _score_section(runs)
+    yield _section("Task", styled("div", "cards", *(task_column(run) for run in runs if run.report)))
+    if tables := _present(objects_table(runs), nouns_table(runs)):
+        yield _section("Objects", *tables)
+    if contents.sheets:
+        sheets = [picture(_as_thumbnail(read_png(path)), caption) for path, caption in contents.sheets.items()]
+        shown = [styled("div", "sheets", *part) for part in (sheets[:_OPEN_SHEETS], sheets[_OPEN_SHEETS:]) if part]
+        yield _section("Pictures", *shown[:1], *_folded(shown[1:], "pictures", len(sheets) - _OPEN_SHEETS))
+    if plans := [_plans(group) for group in _by_world_frame(runs)]:
+        yield _section("From above", *_plan_notes(), *plans)
     tables = _present(figures_table(runs, MAP_SIZE), figures_table(runs, TIMES))
     yield _section("Map and time", styled("div", "tables", *tables))
     if charts := [*_bars(runs, colours), *_lines(runs, colours)]:
         yield _section("Plots", run_legend(colours), styled("div", "charts", *charts))
-    for group in _by_world_frame(runs):
-        if views := shared_views(group):
-            sections = view_sections(group, views)
-            yield _section("Views", *_view_notes(group), *sections[:_OPEN_VIEWS], *_folded(sections[_OPEN_VIEWS:]))
-    if contents.sheets:
-        sheets = [picture(read_png(path), caption) for path, caption in contents.sheets.items()]
-        yield _section("Pictures", styled("div", "sheets", *sheets))
-    if plans := [_plans(group) for group in _by_world_frame(runs)]:
-        yield _section("From above", *_plan_notes(), *plans)
-    if tables := _present(objects_table(runs), nouns_table(runs)):
-        yield _section("Objects", *tables)
     yield _section("Settings", *_present(settings_table(runs)))
 
 
+def _lead_sentences(runs: Sequence[RunResults]) -> Iterator[str]:
+    """Yield a sentence for each run, and one on what a team gains by fusing, or on the best of several runs."""
+    for run in runs:
+        if run.report:
+            yield f"{run.name}: {_found(run)} {_quality(run)}"
+    psnr = {f"the region of {task}": _values(runs, _of_task(task, "roi_psnr")) for task in _tasks(runs)}
+    if gain := team_sentence({**psnr, "whole images": _values(runs, lambda run: number(run.scores.get("full_psnr")))}):
+        yield gain
+    elif best := _best_region(runs):
+        yield best
+
+
+def _task_figures(runs: Sequence[RunResults]) -> list[Figure]:
+    """Return the figures of each task's region alone, for the maps of a team that were scored so."""
+    figures = []
+    for task in _tasks(runs):
+        figures.append(Figure(f"region of {task}, PSNR", _of_task(task, "roi_psnr"), as_decibels))
+        figures.append(Figure(f"region of {task}, covered", _of_task(task, "roi_covered"), as_percent))
+    return figures
+
+
+def _found(run: RunResults) -> str:
+    """Return what the run was for and what it found."""
+    gaussians = run.contents.gaussians
+    size = f"{as_count(len(gaussians))} Gaussians"
+    task = run.report.get("task")
+    text = short_text(task.get("text") if isinstance(task, Mapping) else task)
+    in_region = f"{size}, {as_count(int(gaussians.active.sum()))} of them in its region."
+    if text:
+        found = found_text(run.contents.objects, run.contents.targets, gaussians.means_m[gaussians.active])
+        return f"for \u201c{text}\u201d it found {found}; {in_region}"
+    if gaussians.active.any():
+        return f"the map of a known region has {in_region}"
+    return f"the map without a task has {size}."
+
+
+def _quality(run: RunResults) -> str:
+    own_region = _of_task(run.name, "roi_psnr")(run)
+    region = own_region if _of_tasks(run) else number(run.scores.get("roi_psnr"))
+    image = number(run.scores.get("full_psnr"))
+    views = number(run.scores.get("n_views"))
+    if image is None or views is None:
+        return "It was not scored on views that it has not seen."
+    in_region = "" if region is None else f"its region has {as_decibels(region)} PSNR and "
+    return f"On {as_count(views)} scored views {in_region}the whole images have {as_decibels(image)}."
+
+
+def _best_region(runs: Sequence[RunResults]) -> str:
+    """Return which of several runs shows the region best, if they were scored on equally many views."""
+    known = {run.name: value for run in runs if (value := number(run.scores.get("roi_psnr"))) is not None}
+    if len(known) < 2 or len({run.scores.get("n_views") for run in runs if run.name in known}) > 1:
+        return ""
+    first, second = sorted(known, key=known.__getitem__, reverse=True)[:2]
+    gain_db = known[first] - known[second]
+    return f"The region is best in {first}: {as_decibels(gain_db)} more than in {second}."
+
+
+def _of_tasks(run: RunResults) -> Mapping[str, object]:
+    tasks = run.scores.get("tasks")
+    return tasks if isinstance(tasks, Mapping) else {}
+
+
+def _of_task(task: str, key: str) -> Callable[[RunResults], float | None]:
+    def value(run: RunResults) -> float | None:
+        scores = _of_tasks(run).get(task)
+        return number(scores.get(key)) if isinstance(scores, Mapping) else None
+
+    return value
+
+
+def _tasks(runs: Sequence[RunResults]) -> list[str]:
+    """Return the tasks in whose regions the maps were scored, by the name of the agent."""
+    return list(dict.fromkeys(task for run in runs for task in _of_tasks(run)))
+
+
+def _values(runs: Sequence[RunResults], value: Callable[[RunResults], float | None]) -> dict[str, float | None]:
+    return {run.name: value(run) for run in runs}
+
+
 def _score_section(runs: Sequence[RunResults]) -> Iterator[Element]:
-    table = figures_table(runs, SCORES)
+    table = figures_table(runs, (*_task_figures(runs), *SCORES))
     if table is None:
         hint = "The maps were not scored on held-out views: see gausslite eval --save-scores."
         yield _section("Quality", styled("p", "muted", hint))
@@ -130,7 +224,9 @@ def _score_section(runs: Sequence[RunResults]) -> Iterator[Element]:
         notes.append("They were held out: no map was trained on them.")
     if len({run.scores.get("n_views") for run in scored}) > 1:
         notes.append("The runs were scored on different numbers of views: their figures are not comparable.")
-    yield _section("Quality", styled("p", "muted", " ".join(notes)), table)
+    purposes = [element("li", f"{run.name}: {MAP_PURPOSES[run.name]}") for run in runs if run.name in MAP_PURPOSES]
+    lists = [styled("ul", "muted", *purposes)] if purposes else []
+    yield _section("Quality", styled("p", "muted", " ".join(notes)), table, *lists)
 
 
 def _is_held_out(run: RunResults) -> bool:
@@ -158,15 +254,18 @@ def _lines(runs: Sequence[RunResults], colours: dict[str, str]) -> Iterator[Elem
             yield line_chart(title, lines, text)
 
 
-def _view_notes(runs: Sequence[RunResults]) -> list[Element]:
+def _view_note(runs: Sequence[RunResults]) -> Element:
     notes = [
         "Keyframes that trained a map: these figures do not show its quality from other viewpoints. All runs are "
         "rendered at the same views."
     ]
     if any(run.report.get("camera_correction") for run in runs):
         notes.append("The camera's motion during a frame is not rendered, so moving views have lower figures here.")
-    legends = [styled("div", "legend", f"kappa of {run.name}: ", kappa_legend(run.contents)) for run in runs]
-    return [styled("p", "muted", " ".join(notes)), *legends]
+    return styled("p", "muted", " ".join(notes))
+
+
+def _kappa_legends(runs: Sequence[RunResults]) -> list[Element]:
+    return [styled("div", "legend", f"kappa of {run.name}: ", kappa_legend(run.contents)) for run in runs]
 
 
 def _plan_notes() -> list[Element]:
@@ -194,10 +293,21 @@ def _by_world_frame(runs: Sequence[RunResults]) -> list[list[RunResults]]:
     return list(groups.values())
 
 
-def _folded(sections: Sequence[Element]) -> list[Element]:
+def _folded(sections: Sequence[Element], name: str, count: int | None = None) -> list[Element]:
+    """Return sections that a click opens. count: of what they hold, if that is not one each."""
     if not sections:
         return []
-    return [element("details", element("summary", f"{len(sections)} more views"), *sections)]
+    return [element("details", element("summary", f"{count or len(sections)} more {name}"), *sections)]
+
+
+def _as_thumbnail(sheet: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "_ _ 3"]:
+    """Return a comparison sheet at no more than the width at which the page shows it."""
+    import cv2
+
+    height, width = sheet.shape[:2]
+    scale = min(1.0, _SHEET_WIDTH_PX / width)
+    size = (round(scale * width), max(1, round(scale * height)))
+    return np.asarray(cv2.resize(sheet, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _section(title: str, *children: Element) -> Element:

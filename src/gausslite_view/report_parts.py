@@ -169,7 +169,7 @@ def short_text(value: object) -> str:
 
 def as_count(value: float) -> str:
     """Return a whole number with separated thousands."""
-    return f"{value:,.0f}".replace(",", " ")
+    return f"{value:,.0f}"
 
 
 def as_bytes(value: float) -> str:
@@ -318,7 +318,12 @@ def comparison_table(runs: Sequence[RunResults], rows: Sequence[tuple[str, Seque
 def list_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Element:
     """Return a table with one row for each entry."""
     head = element("tr", *(element("th", text) for text in header))
-    body = [element("tr", *(element("td", text) for text in row)) for row in rows]
+    body = [
+        element(
+            "tr", *(element("td", text, attributes={"title": name}) for name, text in zip(header, row, strict=True))
+        )
+        for row in rows
+    ]
     return styled("div", "scroll", styled("table", "list", element("thead", head), element("tbody", *body)))
 
 

@@ -78,6 +78,10 @@ def test_the_demo_maps_fuses_scores_and_ends_its_processes_on_a_recording_with_a
     for scores in report["maps"].values():
         assert scores["roi_psnr"] > 5
         assert scores["full_psnr"] > 5
+        assert {task: of_task["roi_psnr"] for task, of_task in scores["tasks"].items()} == dict.fromkeys(
+            ("agent-a", "agent-b"), scores["roi_psnr"]
+        )
+    assert "One map for all tasks: the voted map has" in done.stdout
     sizes = {name: len(read_ply(out / f"{name}.ply")) for name in ("concatenation", "vote")}
     both = sum(len(read_ply(out / agent / "map.ply")) for agent in report["agents"])
     assert sizes["vote"] < sizes["concatenation"] == both

@@ -87,6 +87,8 @@ def test_runs_are_side_by_side_at_the_same_views(tmp_path):
     assert rows["region PSNR"] == ["25.50 dB"]
     assert "<tr><th></th><th>second</th></tr>" in (tmp_path / "both.html").read_text(encoding="utf-8")
     assert rows["Gaussians"] == ["357", "357"]
+    headings = re.findall("<h2>([^<]*)</h2>", (tmp_path / "both.html").read_text(encoding="utf-8"))
+    assert headings.index("Views") < headings.index("Quality") < headings.index("Map and time")
     captions = [text for text in page.texts if text.endswith(": kappa")]
     assert captions.count("first: kappa") == captions.count("second: kappa") == 2  # at the view and from above
     assert "Frame 3" in page.texts
@@ -192,16 +194,26 @@ def test_the_maps_of_a_team_are_columns(tmp_path):
             task="Find the mug",
             task_graph=TASK,
         )
+    maps = {
+        name: {"full_psnr": full, "tasks": {"agent-a": {"roi_psnr": region}}}
+        for name, full, region in (("agent-a", 16.0, 24.0), ("agent-b", 20.0, 15.0), ("vote", 22.0, 23.5))
+    }
+    maps["vote"]["roi_psnr"] = 23.0
     (team / "vote.ply").write_bytes((team / "agent-a" / "map.ply").read_bytes())
     (team / "report.json").write_text(
-        json.dumps({"agents": {"agent-a": {}, "agent-b": {}, "../agent-a": {}}, "maps": {"vote": {"roi_psnr": 23.0}}})
+        json.dumps({"agents": {"agent-a": {}, "agent-b": {}, "../agent-a": {}}, "maps": maps})
     )
     (team / "pictures").mkdir()
     sheet = (team / "agent-a" / "views" / "000003.png").read_bytes()
     (team / "pictures" / "000-frame.png").write_bytes(sheet)
     page = report(team, out=tmp_path / "page.html")
     rows = table_rows(tmp_path / "page.html")
-    assert rows["region PSNR"] == ["23.00 dB"]
+    assert rows["region PSNR"] == ["–", "–", "23.00 dB"]
+    assert rows["region of agent-a, PSNR"] == ["24.00 dB", "15.00 dB", "23.50 dB"]
+    assert (
+        "One map for all tasks: the voted map has 23.5 dB PSNR in the region of agent-a, 22.0 dB PSNR in whole images; "
+        "agent-a alone has 6.0 dB less in whole images, agent-b alone has 8.5 dB less in the region of agent-a."
+    ) in page.texts
     assert rows["sent to the fusion server"] == ["2.5 MB", "2.5 MB", "–"]
     assert rows["share of the map sent"] == ["2 %", "2 %", "–"]
     assert rows["frame rate"] == ["2.50 Hz", "2.50 Hz"]
@@ -273,3 +285,25 @@ def test_the_views_of_several_agents_take_turns(tmp_path):
                 )
     views = shared_views(read_results(agents).runs)
     assert sorted((view.image.index, view.recorder) for view in views) == [(10, "a"), (10, "b"), (11, "a"), (11, "b")]
+
+
+def test_a_narrow_window_cuts_no_column(tmp_path):
+    runs = [write_run(tmp_path / f"a-rather-long-name-{number}", task=TASK, objects=[MUG]) for number in range(4)]
+    report(*runs, out=tmp_path / "page.html")
+    with open_browser((390, 800)) as context:
+        page = context.new_page()
+        page.goto((tmp_path / "page.html").as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        wide = (
+            "[...document.querySelectorAll('.scroll, .grid')].filter(box => box.scrollWidth > box.clientWidth).length"
+        )
+        assert page.evaluate(wide) == 0
+
+
+def test_the_page_begins_with_what_a_run_found_and_how_good_it_is(tmp_path):
+    run = write_run(tmp_path / "run", task=TASK, objects=[{**MUG, "min_m": [0.1, 0.4, 0.9]}])
+    (run / "evaluation.json").write_text(json.dumps({"roi_psnr": 25.5, "full_psnr": 21.25, "n_views": 7}))
+    page = report(run, out=tmp_path / "page.html")
+    first = next(text for text in page.texts if text.startswith("run: "))
+    assert "for \u201cPick up the mug on the table\u201d it found mug at (0.25, 0.50, 1.00) m" in first
+    assert "On 7 scored views its region has 25.50 dB PSNR and the whole images have 21.25 dB." in first

@@ -36,7 +36,12 @@ from gausslite.config.values import VOXEL_SIZE, read_text
 from gausslite.datasets.open import default_world_frame
 from gausslite.domain.checks import require_name
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.evaluation.compare import MapScores, TeamScores, score_team
+from gausslite.evaluation.compare import (
+    MAP_PURPOSES,
+    TeamScores,
+    score_team,
+    team_sentence,
+)
 from gausslite.evaluation.views import HeldOutView, view_maps
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_models
@@ -53,7 +58,7 @@ def demo_report(
     options: argparse.Namespace,
     scenario: Scenario,
     agents: Mapping[str, object],
-    scores: Mapping[str, MapScores],
+    result: TeamScores,
     frames_corrupt: int,
 ) -> dict[str, object]:
     """Return report.json of the demo. frames_corrupt: number of held-out frames that cannot be read."""
@@ -66,10 +71,13 @@ def demo_report(
         "size": list(scenario.size),
         "seed": options.seed,
         "agents": dict(agents),
-        "maps": {name: asdict(score) for name, score in scores.items()},
+        "maps": {
+            name: {**asdict(score), "tasks": {task: asdict(maps[name]) for task, maps in result.by_task.items()}}
+            for name, score in result.scores.items()
+        },
         "scored": {
             "objects": sorted(scenario.regions),
-            "views": next(iter(scores.values())).n_views,
+            "views": next(iter(result.scores.values())).n_views,
             "frames_corrupt": frames_corrupt,
             "fitted": scenario.fit_views,
         },
@@ -85,24 +93,34 @@ def agent_reports(agents: tuple[AgentPlan, ...], out: Path) -> dict[str, dict[st
     return reports
 
 
-def report_tables(
-    agents: Mapping[str, Mapping[str, object]], scores: Mapping[str, MapScores], fitted_views: bool
-) -> str:
-    """Return a table of the agents and a table of the maps' scores, as text."""
-    lines = ["", f"{'agent':<10}{'frames':>8}{'Hz':>8}{'Gaussians':>11}{'ROI':>8}{'sent':>11}{'shared':>9}"]
+def report_tables(agents: Mapping[str, Mapping[str, object]], result: TeamScores, fitted_views: bool) -> str:
+    """Return a table of the agents, a table of the maps' scores, and what each map is for, as text."""
+    lines = ["", f"{'agent':<10}{'frames':>8}{'Hz':>8}{'Gaussians':>11}{'ROI':>8}{'sent':>11}{'shared':>9}  task"]
     for name, row in agents.items():
+        sent = f"{_number(row['bytes_sent']) / 1e6:.2f} MB"
         lines.append(
             f"{name:<10}{row['frames']:>8}{row['hz']:>8.1f}{row['gaussians']:>11}{row['roi_share']:>8.1%}"
-            f"{_number(row['bytes_sent']) / 1e6:>8.2f} MB{_number(row['map_shared_percent']):>8.1f}%"
+            f"{sent:>11}{_number(row['map_shared_percent']):>8.1f}%  {row['task']}"
         )
-    lines += ["", f"{'map':<15}{'ROI PSNR':>10}{'ROI SSIM':>10}{'full PSNR':>11}"]
-    for name, score in scores.items():
-        roi_psnr = "-" if score.roi_psnr is None else f"{score.roi_psnr:.2f} dB"
-        roi_ssim = "-" if score.roi_ssim is None else f"{score.roi_ssim:.3f}"
-        lines.append(f"{name:<15}{roi_psnr:>10}{roi_ssim:>10}{score.full_psnr:>8.2f} dB")
+    tasks = list(result.by_task)
+    heads = "".join(f"{name + ' task':>15}" for name in tasks)
+    lines += ["", f"{'PSNR (dB) in':<15}{heads}{'all regions':>13}{'whole image':>13}"]
+    for name, score in result.scores.items():
+        of_tasks = "".join(f"{_decibels(result.by_task[task][name].roi_psnr):>15}" for task in tasks)
+        lines.append(f"{name:<15}{of_tasks}{_decibels(score.roi_psnr):>13}{_decibels(score.full_psnr):>13}")
     if fitted_views:
         lines.append("pose and exposure of each held-out view were fitted, because keyframes were refined")
+    psnr = {
+        f"the region of {task}": {name: maps[name].roi_psnr for name in maps} for task, maps in result.by_task.items()
+    }
+    psnr["whole images"] = {name: score.full_psnr for name, score in result.scores.items()}
+    lines += ["", *(f"{name}: {purpose}" for name, purpose in MAP_PURPOSES.items() if name in result.scores)]
+    lines += [sentence] if (sentence := team_sentence(psnr)) else []
     return "\n".join(lines) + "\n"
+
+
+def _decibels(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _number(value: object) -> float:
@@ -180,10 +198,10 @@ def run(options: argparse.Namespace) -> int:
         agents = agent_reports(scenario.agents, options.out)
     corrupt = CorruptFrames(print_message)
     result = _score(options, scenario, maps, corrupt)
-    report = demo_report(options, scenario, agents, result.scores, corrupt.count)
+    report = demo_report(options, scenario, agents, result, corrupt.count)
     write_json(options.out / "report.json", report)
     _write_pictures(options.out / "pictures", result)
-    print(report_tables(agents, result.scores, scenario.fit_views))
+    print(report_tables(agents, result, scenario.fit_views))
     sibling(Sibling.REPORT).write_report(options.out / REPORT_PAGE, [options.out])
     print(f"maps and pictures are in {options.out}; {options.out / REPORT_PAGE} shows them")
     return 0
@@ -242,7 +260,7 @@ def _score(
     if not views and corrupt.first_error is not None:
         raise corrupt.first_error
     viewers = view_maps({name: read_ply(path, print_message) for name, path in maps.items()}, options.threads)
-    return score_team(viewers, views, scenario.fit_views)
+    return score_team(viewers, views, scenario.task_regions, scenario.fit_views)
 
 
 def _write_pictures(folder: Path, scores: TeamScores) -> None:

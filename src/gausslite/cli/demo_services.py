@@ -84,6 +84,7 @@ class AgentPlan:
 class Scenario:
     """Sequences and tasks of the agents, and the views and regions on which their maps are scored.
 
+    task_regions: those of each agent's task alone.
     test_every: agents keep every n-th frame from mapping; None if the held-out views are of another sequence.
     """
 
@@ -92,6 +93,7 @@ class Scenario:
     test_every: int | None
     held_out: tuple[FrameStream, ...]
     regions: Mapping[str, Region]
+    task_regions: Mapping[str, Sequence[Region]]
     depth_registration: DepthRegistration | None = None
     camera_correction: CameraCorrection = field(default_factory=CameraCorrection)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
@@ -120,12 +122,14 @@ def simulated_scenario(options: argparse.Namespace) -> Scenario:
     held_out = open_source(specs[2])
     size = frame_size(options.size or HOME_SIZE, held_out)
     found = calibrate_with_messages(specs[2], held_out, stated_values(None, None, options.pose_prior))
+    regions = _scored_regions(options, held_out.regions())
     return Scenario(
         agents,
         size,
         None,
         (FrameStream(held_out, range(len(held_out)), size),),
-        _scored_regions(options, held_out.regions()),
+        regions,
+        _task_regions(agents, regions),
         pose_prior=found.pose_prior,
     )
 
@@ -154,6 +158,7 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
         test_every=_TEST_EVERY,
         held_out=views,
         regions=regions,
+        task_regions=_task_regions(agents, regions),
         depth_registration=found.registration,
         camera_correction=found.correction,
         pose_prior=found.pose_prior,
@@ -174,6 +179,15 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
             f"got {', '.join(regions) or 'none'}"
         )
     return chosen
+
+
+def _task_regions(agents: Sequence[AgentPlan], regions: Mapping[str, Region]) -> dict[str, Sequence[Region]]:
+    """Return the scored regions of each agent's task; none of them if one has none, as figures would be missing."""
+    from gausslite.task.rules import RuleParser
+
+    scene = SceneInfo(regions=regions)
+    found = {agent.agent_id: scene.regions_of(set(RuleParser().parse(agent.task).targets)) for agent in agents}
+    return {name: list(own.values()) for name, own in found.items()} if all(found.values()) else {}
 
 
 _TERMINATION_TIMEOUT_S = 10.0

@@ -30,9 +30,11 @@ from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, PoseError, StorageError
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.objects import found_text
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text
 from gausslite.domain.task import TaskGraph
+from gausslite.evaluation.compare import MapScores, score_training_views
 from gausslite.evaluation.metrics import trajectory_error
 from gausslite.evaluation.pictures import render_preview
 from gausslite.evaluation.views import view_map
@@ -236,6 +238,7 @@ class _Run:
         self._gaussians = Gaussians.empty()
         self._report: dict[str, object] = {}
         self._notes: tuple[str, ...] = ()
+        self._training_scores: MapScores | None = None
         self._save_error: StorageError | None = None
 
     def map_frames(self, estimators: EstimatorFactory, resumed_after: int) -> MissionResult:
@@ -285,14 +288,17 @@ class _Run:
             "notes": list(self._notes),
         }
         prepare_folder(options.out)
+        keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
+        viewer = view_map(self._gaussians, mission.backend, mission.threads) if keyframes else None
+        if viewer is not None:
+            self._training_scores = score_training_views(viewer, keyframes)
+            self._report["training_views"] = asdict(self._training_scores)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
         write_poses(options.out, self._mapper.poses)
         self._timeline.write(options.out)
         self._recorder.write(options.out)
         write_keyframes(options.out, self._mapper.keyframes())
-        keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
-        if keyframes:
-            viewer = view_map(self._gaussians, mission.backend, mission.threads)
+        if viewer is not None:
             write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
 
     def raise_if_stopped(self, result: MissionResult) -> None:
@@ -317,7 +323,7 @@ class _Run:
         skipped = ", ".join(f"{count} {reason}" for count, reason in counts if count)
         print(
             f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
-            f"{len(self._gaussians)} Gaussians ({report['active_gaussians']} in the task's region) → "
+            f"{len(self._gaussians):,} Gaussians ({report['active_gaussians']:,} in the task's region) → "
             f"{self._options.out / 'map.ply'}; {PREVIEW} in the same folder shows it"
         )
         if totals.late:
@@ -329,6 +335,18 @@ class _Run:
         # the notes repeat what is missing among the nouns
         for line in dict.fromkeys((*(noun.describe() for noun in self._mapper.nouns), *self._notes)):
             print(f"  {line}")
+        print(self._outcome(result.last_index))
+
+    def _outcome(self, last_index: int) -> str:
+        """Return what was found, where, and how good the map is on views that it was trained on."""
+        graph, gaussians = self._inputs.schedule.at(last_index), self._gaussians
+        region_m = gaussians.means_m[gaussians.active]
+        parts = [] if graph is None else [f"found: {found_text(self._mapper.objects, graph.targets, region_m)}"]
+        if self._training_scores is not None:
+            scores = self._training_scores
+            in_region = "" if scores.roi_psnr is None else f"{scores.roi_psnr:.1f} dB PSNR in the region, "
+            parts.append(f"{scores.n_views} training views: {in_region}{scores.full_psnr:.1f} dB in whole images")
+        return "; ".join(parts)
 
     def _save(self, last_index: int) -> None:
         prepare_folder(self._options.save_state.parent)

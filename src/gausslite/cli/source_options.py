@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from dataclasses import dataclass
 
 from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
@@ -27,6 +28,8 @@ from gausslite.domain.relevance import Region
 from gausslite.mission.runner import region_file_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
 from gausslite.process import Sibling, print_message, sibling
+
+_MESSAGE_WIDTH = 150
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +100,18 @@ def stated_values(
 
 
 def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> Calibration:
-    """Calibrate an opened sequence as `calibrate` does; each estimate and its reason go to stderr."""
+    """Calibrate an opened sequence as `calibrate` does; the start and each estimate's reason go to stderr."""
     if not source.depth_registered and stated.registration is None and not stated.depth_as_recorded:
         print_message(
             f"{spec}: this layout does not state whether depth is registered to colour; the registration is estimated "
             f"now, --set register-depth={NONE} uses depth as recorded"
+        )
+    estimates = ["lens", "shutter"] if stated.correction is None and not source.camera_ideal else []
+    estimates += ["errors of the poses"] if stated.pose_prior is None and not source.poses_exact else []
+    if estimates:
+        print_message(
+            f"{spec}: {len(source)} frames; up to half a minute for estimates of {', '.join(estimates)} "
+            f"(`gausslite calibrate` prints all values)"
         )
     found = calibrate(source, stated, _report_estimate)
     for note in found.notes:
@@ -111,7 +121,8 @@ def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> 
 
 def _report_estimate(evidence: Evidence) -> None:
     if not evidence.guaranteed:
-        print_message(str(evidence))
+        reasons = "; ".join(evidence.reasons)
+        print_message(textwrap.shorten(f"{evidence.option}: {reasons}", _MESSAGE_WIDTH, placeholder=" …"))
 
 
 def selected_regions(options: argparse.Namespace, source: Source) -> list[Region]:

@@ -11,6 +11,10 @@ from enum import StrEnum
 from importlib import resources
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.task import TaskGraph, noun_of
@@ -282,3 +286,24 @@ def object_of_gaussian(
     seen_as = (agent_id, target)
     matching = [found for found in objects if seen_as in ((seen.agent_id, seen.target) for seen in found.observers)]
     return min(matching, key=lambda found: found.landmark.distance_m(point), default=None)
+
+
+def found_text(
+    objects: Sequence[ObjectLandmark], targets: Sequence[str], region_means_m: Float32[ndarray, "n 3"]
+) -> str:
+    """Return where the targets of a task are: "mug at (2.10, 1.95, 0.78) m, no book".
+
+    region_means_m: the region's Gaussians; an object without any was seen, but is not what the task means.
+    """
+    meant = [found for found in objects if found.role is ObjectRole.TARGET and _holds_any(found, region_means_m)]
+    parts = []
+    for noun in targets:
+        centres_m = [found.centroid_m for found in meant if found.noun in (noun, noun_of(noun))]
+        places = " and ".join("({:.2f}, {:.2f}, {:.2f}) m".format(*centre_m) for centre_m in centres_m)
+        parts.append(f"{noun} at {places}" if places else f"no {noun}")
+    return ", ".join(parts)
+
+
+def _holds_any(landmark: ObjectLandmark, points_m: Float32[ndarray, "n 3"]) -> bool:
+    box = landmark.extent_m
+    return bool(np.any(np.all((points_m >= box.min_m) & (points_m <= box.max_m), axis=1)))

@@ -17,15 +17,17 @@ from statistics import fmean
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Shaped, UInt8
+from jaxtyping import Bool, Float32, Shaped, UInt8
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import CorrectionTrack
+from gausslite.domain.relevance import Region
 from gausslite.evaluation.metrics import covered_share, depth_l1_m, gradient_deviation, laplacian_ratio, psnr, ssim_map
 from gausslite.evaluation.pictures import comparison_sheet
-from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_views, render_fitted
+from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_per_segment, largest_roi_views, render_fitted
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 MAX_PSNR_DB = 100.0
@@ -105,6 +107,18 @@ def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Ras
     """Return the mean scores of the map over the held-out views. Raises InvalidInputError without views."""
     viewer = MapViewer(gaussians, rasterizer)
     return average([score_view(viewer.render_frame(view.frame), view) for view in views])
+
+
+def score_training_views(
+    viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]], count: int = 5
+) -> MapScores:
+    """Return the mean scores over the keyframes with the largest region in each part of a run, at most `count`.
+
+    The map was trained on them, so they only show whether it fits what the camera saw.
+    """
+    pixels = [int(np.count_nonzero(roi)) for _, roi in keyframes]
+    chosen = [HeldOutView(*keyframes[i]) for i in sorted(largest_roi_per_segment(pixels, count))]
+    return average([score_view(viewer.render_frame(view.frame), view) for view in chosen])
 
 
 def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDistance | None = None) -> ViewScore:
@@ -202,33 +216,79 @@ class CorrectedScores:
         }
 
 
+MAP_PURPOSES = {
+    "concatenation": "all Gaussians of all robots: nothing is left out, and common places are there several times",
+    "vote": "each voxel from the robot that trained it most: the team's map, for all tasks at the size of one",
+    "refine": "the voted map, trained further on all robots' keyframes after the mission: for views of the whole place",
+}
+TEAM_MAP = "vote"
+"""What each fused map is for; a robot's own map is for its own task."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TeamScores:
-    """Scores by map name, and a few comparison sheets by frame number."""
+    """Scores by map name, also inside each task's region alone (by task, then map), and a few comparison sheets."""
 
     scores: dict[str, MapScores]
+    by_task: dict[str, dict[str, MapScores]]
     sheets: dict[str, UInt8[ndarray, "_ _ 3"]]
 
 
 def score_team(
-    viewers: Mapping[str, MapViewer], views: Sequence[HeldOutView], fit_views: bool = False, sheets: int = 4
+    viewers: Mapping[str, MapViewer],
+    views: Sequence[HeldOutView],
+    task_regions: Mapping[str, Sequence[Region]],
+    fit_views: bool = False,
+    sheets: int = 4,
 ) -> TeamScores:
     """Return the scores of every map over all held-out views, with comparison sheets of `sheets` views.
 
-    The sheets show the views with the largest region, spread over the sequence. With fit_views, each rendering uses
-    the fitted pose and exposure (`render_fitted`). Raises InvalidInputError if there are no views.
+    views: with the regions of all tasks. The sheets show the views with the largest region, spread over the sequence.
+    With fit_views, each rendering uses the fitted pose and exposure (`render_fitted`). Raises InvalidInputError if
+    there are no views.
     """
     if not views:
         raise InvalidInputError("held-out views: expected at least one frame with depth, got none")
     scores: dict[str, list[ViewScore]] = {name: [] for name in viewers}
+    by_task: dict[str, dict[str, list[ViewScore]]] = {task: {name: [] for name in viewers} for task in task_regions}
     shown = largest_roi_views(views, sheets)
     pictures = {}
     for i, view in enumerate(views):
         renderings: dict[str, Float32[ndarray, "h w 3"]] = {}
+        of_tasks = {task: HeldOutView.of(view.frame, regions) for task, regions in task_regions.items()}
         for name, viewer in viewers.items():
             rendering = render_fitted(viewer, view.frame) if fit_views else viewer.render_frame(view.frame)
             scores[name].append(score_view(rendering, view))
+            for task, task_view in of_tasks.items():
+                by_task[task][name].append(score_view(rendering, task_view))
             renderings[name] = rendering.rgb
         if i in shown:
             pictures[f"{i:03d}-frame-{view.frame.index:06d}"] = comparison_sheet(view, renderings)
-    return TeamScores({name: average(view_scores) for name, view_scores in scores.items()}, pictures)
+    means = {task: {name: average(of_map) for name, of_map in maps.items()} for task, maps in by_task.items()}
+    return TeamScores({name: average(of_map) for name, of_map in scores.items()}, means, pictures)
+
+
+def team_sentence(psnr: Mapping[str, Mapping[str, float | None]]) -> str:
+    """Return how good the voted map is everywhere, and what each robot's own map lacks most in comparison.
+
+    psnr: of each map by name, in each task's region and in whole images. Empty without a voted map or without figures.
+    """
+    voted = {place: maps.get(TEAM_MAP) for place, maps in psnr.items()}
+    shown = [f"{value:.1f} dB PSNR in {place}" for place, value in voted.items() if value is not None]
+    lacks = []
+    for name in {name: None for maps in psnr.values() for name in maps if name not in MAP_PURPOSES}:
+        gaps_db = {
+            place: value - own
+            for place, value in voted.items()
+            if value is not None and (own := psnr[place].get(name)) is not None
+        }
+        if gaps_db:
+            place = max(gaps_db, key=gaps_db.__getitem__)
+            lacks.append(
+                f"{name} alone has {gaps_db[place]:.1f} dB less in {place}"
+                if gaps_db[place] > 0
+                else f"{name} alone has no less"
+            )
+    if not shown or not lacks:
+        return ""
+    return f"One map for all tasks: the voted map has {', '.join(shown)}; {', '.join(lacks)}."

@@ -101,7 +101,7 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
     )
     return TeamResult(
         trial=trial,
-        scores=score_team(viewers, scene.views, trial.fit_views, sheets=0).scores,
+        scores=score_team(viewers, scene.views, {}, trial.fit_views, sheets=0).scores,
         share_percent=100.0 * float(active) / max(total, 1),
         bytes_sent=sum(agent_map.bytes_sent for agent_map in maps),
         gaussians_sent=sum(agent_map.gaussians_sent for agent_map in maps),
