@@ -24,7 +24,7 @@ import gausslite
 from gausslite.config.values import read_path
 from gausslite.domain.errors import KernelError, ModelFileError
 from gausslite.perception.model_file import require_listed_checksum
-from gausslite.perception.models import CATALOGUE, ModelEntry, inspect
+from gausslite.perception.models import CATALOGUE, ModelEntry, detector_advice, inspect
 from gausslite.process import printable
 from gausslite.render.choose import DRIVER_DEVICES, choose_with_reason
 from gausslite.render.cpu import SIMD_VARIABLE, choose_simd, choose_threads, cores_allowed, usable_simd
@@ -48,7 +48,7 @@ class Check:
 
 
 _PROJECT = "gausslite"
-_REINSTALL = "Install it with: pip install gausslite"
+_REINSTALL = "Install it with `pip install .` in that tree"
 
 
 def extra_checks() -> Iterator[Check]:
@@ -59,29 +59,36 @@ def extra_checks() -> Iterator[Check]:
         yield Check("package", "error", "gausslite runs from a source tree that is not installed", _REINSTALL)
         return
     yield _required(installed)
-    for extra in sorted(installed.metadata.get_all("Provides-Extra") or ()):
-        yield _extra(installed, extra)
+    names = sorted(installed.metadata.get_all("Provides-Extra") or ())
+    extras = {name: _requirements(installed, name) for name in names}
+    absent = [name for name in names if not all(map(_installed_version, extras[name]))]
+    for name in names:
+        if name not in absent:
+            yield _extra(name, extras[name])
+    if absent:
+        finding = f"not installed: {', '.join(absent)}"
+        yield Check("extras", "ok", finding, f"Each adds a function: pip install '{_PROJECT}[NAME]' adds its packages")
 
 
 def _required(installed: Distribution) -> Check:
-    faults = [fault for requirement in _requirements(installed, "") if (fault := _fault(requirement))]
-    if faults:
-        return Check("package", "error", "; ".join(faults), "Repair it with: pip install --upgrade gausslite")
+    faulty = [requirement for requirement in _requirements(installed, "") if _fault(requirement)]
+    if faulty:
+        return Check("package", "error", "; ".join(map(_fault, faulty)), _repair(faulty))
     return Check("package", "ok", f"gausslite {installed.version} with all required packages")
 
 
-def _extra(installed: Distribution, extra: str) -> Check:
-    requirements = _requirements(installed, extra)
-    absent = [requirement.name for requirement in requirements if _installed_version(requirement) is None]
-    command = f"pip install '{_PROJECT}[{extra}]'"
-    name = f"extra {extra}"
-    if absent:
-        return Check(name, "ok", f"not installed; {', '.join(absent)} missing", f"To use it: {command}")
-    faults = [fault for requirement in requirements if (fault := _fault(requirement))]
-    if faults:
-        return Check(name, "warning", "; ".join(faults), f"Repair it with: {command}")
+def _extra(extra: str, requirements: list[Requirement]) -> Check:
+    name, faulty = f"extra {extra}", [requirement for requirement in requirements if _fault(requirement)]
+    if faulty:
+        return Check(name, "warning", "; ".join(map(_fault, faulty)), _repair(faulty))
     packages = sorted({f"{requirement.name} {_installed_version(requirement)}" for requirement in requirements})
     return Check(name, "ok", ", ".join(packages))
+
+
+def _repair(faulty: list[Requirement]) -> str:
+    """Return the command that installs what is required; the packages are those of an index, GaussLite is not."""
+    wanted = " ".join(f"'{requirement.name}{requirement.specifier}'" for requirement in faulty)
+    return f"Repair it with: pip install {wanted}"
 
 
 def _requirements(installed: Distribution, extra: str) -> list[Requirement]:
@@ -107,14 +114,14 @@ def _installed_version(requirement: Requirement) -> str | None:
         return None
 
 
-def _fault(requirement: Requirement) -> str | None:
-    """Return why the installed package does not meet the requirement; None if it does."""
+def _fault(requirement: Requirement) -> str:
+    """Return why the installed package does not meet the requirement; empty if it does."""
     found = _installed_version(requirement)
     if found is None:
         return f"{requirement.name} is missing"
     if not requirement.specifier.contains(found, prereleases=True):
         return f"{requirement.name}: expected {requirement.specifier}, got {found}"
-    return None
+    return ""
 
 
 _GIB = 1 << 30
@@ -231,7 +238,7 @@ def model_checks(folder: Path) -> Iterator[Check]:
     for entry in present:
         yield _model(entry, folder / entry.file_name)
     if not present:
-        advice = "--detector needs one; `gausslite models source NAME` prints the commands that make it"
+        advice = f"For --detector, {detector_advice()}; `gausslite models list` lists others"
         yield Check("models", "ok", f"no model files in {folder}", advice)
 
 
@@ -247,9 +254,7 @@ def _model(entry: ModelEntry, path: Path) -> Check:
 
 
 _DRIVER_FOLDER = Path("/proc/driver/nvidia")
-_RASTERIZER_CHECKS_REINSTALL = (
-    "Install GaussLite again with this Python: pip install --force-reinstall --no-deps gausslite"
-)
+_RASTERIZER_CHECKS_REINSTALL = "Install GaussLite again with this Python, from its wheel or its folder"
 
 
 def rasterizer_checks() -> Iterator[Check]:

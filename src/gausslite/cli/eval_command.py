@@ -61,9 +61,10 @@ class EvalOptions:
     strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
     test_every: int | None = option(
         None,
-        "score only every N-th selected frame: those that `map --test-every N` holds out",
+        "score only every N-th selected frame: those that `map --test-every N` holds out; 1: all (default: as the "
+        "report next to MAP states for this source, else all)",
         metavar="N",
-        low=2,
+        low=1,
     )
     fit_views: bool | None = option(
         None, "fit pose and exposure of each view before scoring, for real cameras (default: as poses)"
@@ -102,7 +103,8 @@ def run(options: argparse.Namespace) -> int:
     conditions = _Conditions.of(options)
     recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)
     source = calibrate_with_messages(options.source, recorded, conditions.stated).source
-    positions = _selected_positions(options, source)
+    test_every = _test_every(options)
+    positions = _selected_positions(options.frames, test_every, source)
     regions = selected_regions(options, source)
     if options.pictures is not None:
         prepare_folder(options.pictures)
@@ -117,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
     extra = {} if corrected is None else corrected.summary()
     figures = {**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count, **extra}
     if options.save_scores:
-        views = {"source": str(options.source), "frames": options.frames, "test_every": options.test_every}
+        views = {"source": str(options.source), "frames": options.frames, "test_every": test_every}
         write_evaluation(options.map.absolute().parent, {**figures, **views})
     if options.json:
         print(as_text(figures))
@@ -199,13 +201,30 @@ class _SelectedFrames:
                 yield position, frame
 
 
-def _selected_positions(options: argparse.Namespace, source: Source) -> Sequence[int]:
-    positions = select_frames(source, options.frames)
-    if options.test_every is None:
+def _test_every(options: argparse.Namespace) -> int | None:
+    """Return which views are scored; print a message if it comes from the report, or if the map was trained on them."""
+    report = read_report(options.map.parent)
+    if options.test_every is not None or report.get("source") != options.source:
+        return None if options.test_every == 1 else options.test_every
+    held_out, mapped = report.get("hold_out"), report.get("selected_frames", options.frames)
+    if not isinstance(held_out, int):
+        print_message(
+            f"{options.map.name} was trained on these views; to score views that it has not seen, map and score with "
+            "--test-every 8"
+        )
+        return None
+    other = "" if mapped == options.frames else f"; the map is of --frames {mapped}"
+    print_message(f"from the report next to {options.map.name}: --test-every {held_out}{other}")
+    return held_out
+
+
+def _selected_positions(frames: str, test_every: int | None, source: Source) -> Sequence[int]:
+    positions = select_frames(source, frames)
+    if test_every is None:
         return positions
-    held_out = HeldOutSplit(options.test_every).split(positions)[1]
+    held_out = HeldOutSplit(test_every).split(positions)[1]
     if not held_out:
-        raise DatasetError(f"--test-every {options.test_every}: expected at least that many frames, got fewer")
+        raise DatasetError(f"--test-every {test_every}: expected at least that many frames, got fewer")
     return held_out
 
 

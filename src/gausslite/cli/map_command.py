@@ -345,7 +345,8 @@ class _Run:
         if self._training_scores is not None:
             scores = self._training_scores
             in_region = "" if scores.roi_psnr is None else f"{scores.roi_psnr:.1f} dB PSNR in the region, "
-            parts.append(f"{scores.n_views} training views: {in_region}{scores.full_psnr:.1f} dB in whole images")
+            views = f"{scores.n_views} training view{'s' if scores.n_views > 1 else ''}"
+            parts.append(f"{views}: {in_region}{scores.full_psnr:.1f} dB in whole images")
         return "; ".join(parts)
 
     def _save(self, last_index: int) -> None:

@@ -12,9 +12,9 @@ from gausslite.cli.source_options import calibrate_with_messages, open_recorded,
 from gausslite.codec.json import graph_as_json
 from gausslite.config.option import build, option
 from gausslite.config.values import AUTO, NONE
-from gausslite.datasets.open import default_world_frame
+from gausslite.datasets.open import default_world_frame, open_source
 from gausslite.datasets.source import Source, frame_step
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import get_text
@@ -64,7 +64,7 @@ class MapInputs:
         mission = mission_settings(options)
         schedule = _schedule(parse_task(options), [TaskSwitch.parse(text) for text in options.task_at])
         require_poses = mission.poses is not PoseMode.TRACK
-        recorded = open_recorded(options.source, options.up, require_poses)
+        recorded = _open_recorded(options, require_poses)
         source = build(
             SourceSettings, options, depth_registration=None, camera_correction=None, require_poses=require_poses
         )
@@ -150,6 +150,7 @@ class MapInputs:
             "seed": self.mission.seed,
             "max_gaussians": self.mission.max_gaussians,
             "hold_out": self.source.test_every,
+            "selected_frames": self.source.frames,
         }
 
 
@@ -179,6 +180,28 @@ def parse_task(options: argparse.Namespace) -> TaskGraph | None:
     from gausslite.task.rules import RuleParser
 
     return RuleParser().parse(options.task)
+
+
+def _open_recorded(options: argparse.Namespace, require_poses: bool) -> Source:
+    """Open the sequence; an error of the first frame's pose says that frames without poses can be tracked."""
+    try:
+        source = open_recorded(options.source, options.up, require_poses)
+        if require_poses and len(source):
+            source.frame(0)
+    except (DatasetError, PoseError) as error:
+        if require_poses and _opens_without_poses(options):
+            advice = f"--poses {PoseMode.TRACK} maps the frames without given poses"
+            raise type(error)(f"{error}; {advice}") from error
+        raise
+    return source
+
+
+def _opens_without_poses(options: argparse.Namespace) -> bool:
+    try:
+        open_source(options.source, options.up, require_poses=False).frame(0)
+    except (DatasetError, PoseError):
+        return False
+    return True
 
 
 def has_regions(options: argparse.Namespace) -> bool:

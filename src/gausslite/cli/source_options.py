@@ -29,7 +29,8 @@ from gausslite.mission.runner import region_file_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
 from gausslite.process import Sibling, print_message, sibling
 
-_MESSAGE_WIDTH = 150
+_MESSAGE_WIDTH, _VALUE_WIDTH = 150, 30
+"""Characters of a message on an estimate, and of the value in it; `gausslite calibrate` prints longer ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +122,9 @@ def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> 
 
 def _report_estimate(evidence: Evidence) -> None:
     if not evidence.guaranteed:
-        reasons = "; ".join(evidence.reasons)
-        print_message(textwrap.shorten(f"{evidence.option}: {reasons}", _MESSAGE_WIDTH, placeholder=" …"))
+        value = f" {evidence.value}" if len(evidence.value) <= _VALUE_WIDTH else ""
+        line = f"{evidence.option}{value}: {'; '.join(evidence.reasons)}"
+        print_message(textwrap.shorten(line, _MESSAGE_WIDTH, placeholder=" …"))
 
 
 def selected_regions(options: argparse.Namespace, source: Source) -> list[Region]:

@@ -94,8 +94,10 @@ class EstimatorFactory:
     def require_detector(self) -> None:
         """Raise InvalidInputError if there is neither a model file nor ground truth."""
         if self._models is None and not self._scene().regions:
+            from gausslite.perception.models import detector_advice
+
             raise InvalidInputError(
-                "detector: the sequence has no ground-truth regions; name an ONNX file with --detector"
+                f"detector: expected --detector FILE.onnx, which finds the task's objects; {detector_advice()}"
             )
 
     def noun_matches(self, graph: TaskGraph) -> tuple[NounMatch, ...]:

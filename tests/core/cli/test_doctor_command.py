@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from importlib.metadata import metadata, version
+from importlib.metadata import PathDistribution, metadata, version
 from pathlib import Path
 
 import pytest
@@ -47,9 +47,10 @@ def test_a_working_machine_has_no_error_and_the_findings_are_true(tmp_path: Path
     assert checks["rasterizer"]["finding"].startswith(f"backend {choose_rasterizer('auto').name}, because ")
     assert version("gausslite") in checks["package"]["finding"]
     assert [name for name in checks if name.startswith("model")] == ["models"]
-    assert "gausslite models source NAME" in checks["models"]["advice"]
+    assert "pip install ultralytics && yolo export model=yolo11n-seg.pt" in checks["models"]["advice"]
     extras = {name.removeprefix("extra ") for name in checks if name.startswith("extra ")}
-    assert extras == set(metadata("gausslite").get_all("Provides-Extra"))
+    absent = checks["extras"]["finding"].removeprefix("not installed: ").split(", ") if "extras" in checks else []
+    assert extras.union(absent) == set(metadata("gausslite").get_all("Provides-Extra") or ())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -141,3 +142,20 @@ def test_no_connection_is_opened(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
+
+
+def test_absent_extras_are_one_line_and_repairs_name_packages_of_an_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: gausslite\nVersion: 1.0\n"
+        "Requires-Dist: numpy\nRequires-Dist: pytest>=10000 ; extra == 'test'\n"
+        "Requires-Dist: no-such-package ; extra == 'view'\nRequires-Dist: none-such>=2 ; extra == 'ros'\n"
+        "Provides-Extra: view\nProvides-Extra: ros\nProvides-Extra: test\n"
+    )
+    monkeypatch.setattr(doctor_command, "distribution", lambda _: PathDistribution(tmp_path))
+    checks = {check.name: check for check in doctor_command.extra_checks()}
+    assert checks.keys() == {"package", "extra test", "extras"}
+    assert (checks["package"].status, checks["extra test"].status, checks["extras"].status) == ("ok", "warning", "ok")
+    assert checks["extra test"].advice == "Repair it with: pip install 'pytest>=10000'"
+    assert checks["extras"].finding == "not installed: ros, view"

@@ -56,4 +56,6 @@ def test_the_summary_reports_objects_not_found(tmp_path: Path, capsys: pytest.Ca
     assert main(["map", "sim:home?frames=1", "--task", "Find the unicorn", *small, "--out", str(tmp_path)]) == 0
     output = capsys.readouterr().out
     assert "\n  no region matches 'unicorn'; the regions are " in output
-    assert output.endswith("\n  none of these frames shows an object of the task\n")
+    *_, note, outcome = output.splitlines()
+    assert note == "  none of these frames shows an object of the task"
+    assert outcome.startswith("found: no unicorn; 1 training view: ")

@@ -10,6 +10,7 @@ import pytest
 from tiny_sequences import write_seven_scenes, write_tum
 
 from gausslite.calibration.calibrate import Calibration
+from gausslite.cli.main import main
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import open_source
@@ -53,7 +54,9 @@ def test_an_estimated_pose_prior_is_reported(tmp_path: Path, capsys: pytest.Capt
     assert calibrate(tum, None, given).pose_prior == given
     assert capsys.readouterr().err == ""
     assert calibrate(tum, None, AUTO).pose_prior.is_exact
-    [line] = capsys.readouterr().err.splitlines()
+    notice, line = capsys.readouterr().err.splitlines()
+    assert notice.startswith(f"{tum}: ")
+    assert "up to half a minute for estimates of errors of the poses" in notice
     assert line == "pose-prior none: only 0 pairs of frames overlap, too few for an estimate"
 
 
@@ -73,3 +76,20 @@ def test_regions_of_the_folder_are_used_with_a_message(tmp_path: Path, capsys: p
     assert len(selected_regions(options, open_source(str(folder)))) == 1
     [line] = capsys.readouterr().err.splitlines()
     assert line == f"{folder}: the ground-truth regions of roi_voxels.npz in the sequence's folder are used"
+
+
+def test_a_folder_without_poses_is_refused_with_the_option_that_tracks_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tum, seven = write_tum(tmp_path / "fr1"), write_seven_scenes(tmp_path / "seq")
+    for missing in (tum / "groundtruth.txt", *seven.glob("*.pose.txt")):
+        missing.unlink()
+    for folder in (tum, seven):
+        assert main(["map", str(folder), "--out", str(tmp_path / "out")]) == 2
+        *_, line = capsys.readouterr().err.splitlines()
+        assert line.endswith("; --poses track maps the frames without given poses")
+    # without colour images tracking cannot help
+    (tum / "rgb.txt").unlink()
+    (tum / "groundtruth.txt").write_text("")
+    assert main(["map", str(tum), "--out", str(tmp_path / "out")]) == 2
+    assert "--poses track" not in capsys.readouterr().err

@@ -13,6 +13,7 @@ from gausslite.cli.main import main
 from gausslite.mission.results import read_report
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+TRAINED = "map.ply was trained on these views; to score views that it has not seen, map and score with --test-every 8"
 CAMERA, POSE_PRIOR = "20,20,7.5,5.5,-0.01,0,0,0,0,0", "0.01,0.5,0.1,0.03"
 
 
@@ -41,10 +42,10 @@ def test_the_report_next_to_a_map_sets_the_registration_and_fitting(
         return json.loads(captured.out), captured.err
 
     scores, message = score()
-    assert message == f"from the report next to map.ply: register-depth {CAMERA} --poses refine\n"
+    assert message == f"from the report next to map.ply: register-depth {CAMERA} --poses refine\n{TRAINED}\n"
     assert scores == score("--set", f"register-depth={CAMERA}", "--set", "fit-views=true")[0]
     raw, message = score("--set", f"register-depth={CAMERA}", "--set", "fit-views=false")
-    assert (scores["fitted"], raw["fitted"], message) == (True, False, "")
+    assert (scores["fitted"], raw["fitted"], message) == (True, False, f"{TRAINED}\n")
     (map_path.parent / "report.json").write_text("[]")
     assert read_report(map_path.parent) == {}
     assert "the registration is estimated now" in score()[1]
@@ -60,6 +61,13 @@ def test_eval_scores_the_frames_that_were_held_out(
     capsys.readouterr()
     assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json", "--test-every", "5"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 2
+    # without the option the report next to the map decides; 1 asks for all
+    assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["n_views"] == 2
+    assert "from the report next to map.ply: --test-every 5\n" in captured.err
+    assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json", "--test-every", "1"]) == 0
+    assert json.loads(capsys.readouterr().out)["n_views"] == 10
 
 
 def test_a_map_has_a_preview_next_to_recorded_images(kitchen: Path, tmp_path: Path) -> None:
