@@ -17,15 +17,22 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gausslite.api import (
         AgentClient,
+        AgentLink,
         BallRegion,
         CalibratedSequence,
         Camera,
+        CameraMotion,
         DepthRegistration,
+        Export,
         Frame,
+        FrameOutcome,
         FusionClient,
         Gaussians,
+        Lens,
+        LensModel,
         MapResult,
         MissionSettings,
+        ParserClient,
         PerceptionSettings,
         PoseExposurePrior,
         PoseMode,
@@ -33,6 +40,7 @@ if TYPE_CHECKING:
         SceneInfo,
         Source,
         Tls,
+        Twist,
         create_mapper,
         empty_batch,
         load_ply,
@@ -42,20 +50,28 @@ if TYPE_CHECKING:
         render_view,
         save_ply,
     )
+    from gausslite.domain import errors
     from gausslite.domain.errors import GaussLiteError
 
 __all__ = [
     "AgentClient",
+    "AgentLink",
     "BallRegion",
     "CalibratedSequence",
     "Camera",
+    "CameraMotion",
     "DepthRegistration",
+    "Export",
     "Frame",
+    "FrameOutcome",
     "FusionClient",
     "GaussLiteError",
     "Gaussians",
+    "Lens",
+    "LensModel",
     "MapResult",
     "MissionSettings",
+    "ParserClient",
     "PerceptionSettings",
     "PoseExposurePrior",
     "PoseMode",
@@ -63,8 +79,10 @@ __all__ = [
     "SceneInfo",
     "Source",
     "Tls",
+    "Twist",
     "create_mapper",
     "empty_batch",
+    "errors",
     "load_ply",
     "map_sequence",
     "open_calibrated",
@@ -73,14 +91,18 @@ __all__ = [
     "save_ply",
 ]
 
+_ERRORS = "gausslite.domain.errors"
+
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use. Raises AttributeError for other names."""
     if name not in __all__:
         raise AttributeError(f"module 'gausslite' has no attribute {name!r}")
     # a program that only catches errors does not load the library
-    module = "gausslite.domain.errors" if name == "GaussLiteError" else "gausslite.api"
-    value = getattr(import_module(module), name)
+    if name == "errors":
+        value: Any = import_module(_ERRORS)
+    else:
+        value = getattr(import_module(_ERRORS if name == "GaussLiteError" else "gausslite.api"), name)
     globals()[name] = value
     return value
 

@@ -18,7 +18,7 @@ from gausslite.calibration.calibrate import StatedValues, calibrate
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import Camera
+from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel, Twist
 from gausslite.domain.checks import describe, require_instance, require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
@@ -40,20 +40,29 @@ from gausslite.mission.settings import (
 )
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.task.rules import RuleParser
-from gausslite.wire.clients import AgentClient, FusionClient
+from gausslite.v1.agent_service_pb2 import FrameOutcome
+from gausslite.wire.clients import AgentClient, Export, FusionClient, ParserClient
+from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
 
 __all__ = [
     "AgentClient",
+    "AgentLink",
     "BallRegion",
     "CalibratedSequence",
     "Camera",
+    "CameraMotion",
     "DepthRegistration",
+    "Export",
     "Frame",
+    "FrameOutcome",
     "FusionClient",
     "Gaussians",
+    "Lens",
+    "LensModel",
     "MapResult",
     "MissionSettings",
+    "ParserClient",
     "PerceptionSettings",
     "PoseExposurePrior",
     "PoseMode",
@@ -61,6 +70,7 @@ __all__ = [
     "SceneInfo",
     "Source",
     "Tls",
+    "Twist",
     "create_mapper",
     "empty_batch",
     "load_ply",

@@ -14,7 +14,7 @@ from gausslite.config.option import build, option
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import default_world_frame, open_source
 from gausslite.datasets.source import Source, frame_step
-from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
+from gausslite.domain.errors import DatasetError, GaussLiteError, InvalidInputError, PoseError
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import get_text
@@ -183,25 +183,36 @@ def parse_task(options: argparse.Namespace) -> TaskGraph | None:
 
 
 def _open_recorded(options: argparse.Namespace, require_poses: bool) -> Source:
-    """Open the sequence; an error of the first frame's pose says that frames without poses can be tracked."""
+    """Open the sequence; where its poses cannot be read, the error says that frames without poses can be tracked."""
     try:
         source = open_recorded(options.source, options.up, require_poses)
-        if require_poses and len(source):
-            source.frame(0)
     except (DatasetError, PoseError) as error:
-        if require_poses and _opens_without_poses(options):
-            advice = f"--poses {PoseMode.TRACK} maps the frames without given poses"
-            raise type(error)(f"{error}; {advice}") from error
-        raise
+        raise _with_advice(error, options, require_poses) from None
+    errors = [_error_of(source, i) for i in {0, len(source) // 2, len(source) - 1}] if require_poses else []
+    if errors and None not in errors:
+        advised = _with_advice(errors[0], options, require_poses)
+        if advised is not errors[0]:
+            raise advised
     return source
 
 
-def _opens_without_poses(options: argparse.Namespace) -> bool:
+def _error_of(source: Source, position: int) -> GaussLiteError | None:
+    try:
+        source.frame(position)
+    except (DatasetError, PoseError) as error:
+        return error
+    return None
+
+
+def _with_advice(error: GaussLiteError, options: argparse.Namespace, require_poses: bool) -> GaussLiteError:
+    """Return the error with the option that maps frames without poses, if it would; the error itself if not."""
+    if not require_poses:
+        return error
     try:
         open_source(options.source, options.up, require_poses=False).frame(0)
     except (DatasetError, PoseError):
-        return False
-    return True
+        return error
+    return type(error)(f"{error}; --poses {PoseMode.TRACK} maps the frames without given poses")
 
 
 def has_regions(options: argparse.Namespace) -> bool:

@@ -122,7 +122,10 @@ class Source(Protocol):
 def require_position(source_name: str, i: int, count: int) -> None:
     """Raise DatasetError unless i is one of the positions 0 .. count - 1."""
     if not 0 <= i < count:
-        raise DatasetError(f"{source_name}: expected a position from 0 to {count - 1}, got {i}")
+        raise DatasetError(
+            f"{source_name}: expected a position from 0 to {count - 1}, got {i}; indices().index({i}) is the position "
+            "of the frame with this number"
+        )
 
 
 def excluded_frames_note(count: int, recorded: int, reason: str) -> str:
