@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gausslite.api import (
         AgentClient,
         AgentLink,
+        Answer,
         BallRegion,
         CalibratedSequence,
         Camera,
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
         Source,
         Tls,
         Twist,
+        ask,
         create_mapper,
         empty_batch,
         load_ply,
@@ -56,6 +58,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AgentClient",
     "AgentLink",
+    "Answer",
     "BallRegion",
     "CalibratedSequence",
     "Camera",
@@ -80,6 +83,7 @@ __all__ = [
     "Source",
     "Tls",
     "Twist",
+    "ask",
     "create_mapper",
     "empty_batch",
     "errors",

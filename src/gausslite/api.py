@@ -23,6 +23,7 @@ from gausslite.domain.checks import describe, require_instance, require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import UpAxis, require_rigid
 from gausslite.domain.recording import DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import BallRegion, Region
@@ -39,15 +40,16 @@ from gausslite.mission.settings import (
     default_policy,
 )
 from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.questions import Z_UP, Answer, answer
 from gausslite.task.rules import RuleParser
-from gausslite.v1.agent_service_pb2 import FrameOutcome
-from gausslite.wire.clients import AgentClient, Export, FusionClient, ParserClient
+from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
 from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
 
 __all__ = [
     "AgentClient",
     "AgentLink",
+    "Answer",
     "BallRegion",
     "CalibratedSequence",
     "Camera",
@@ -71,6 +73,7 @@ __all__ = [
     "Source",
     "Tls",
     "Twist",
+    "ask",
     "create_mapper",
     "empty_batch",
     "load_ply",
@@ -261,3 +264,11 @@ def render_view(
     require_rigid("T_world_camera", pose)
     image = view_map(gaussians, backend, threads).render(camera, pose)
     return RenderedImage(image.rgb, image.expected_depth_m(), image.alpha)
+
+
+def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = Z_UP) -> Answer:
+    """Return the objects that a question means, such as "what is on the table" or "largest chair"; count them with len.
+
+    objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError.
+    """
+    return answer(RuleParser().parse(question), list(objects), up_axis)

@@ -32,13 +32,13 @@ SUMMARIES = {
     "fetch": "download the fused map of a running team",
     "evict": "delete the data of an agent from a fusion server, and keep it out on request",
     "unban": "let a banned agent join a fusion server again",
-    "objects": "print where the objects of a task are, from a fusion server or from the report of a run",
+    "objects": "print where objects are, or which ones a question means, from a fusion server or the results of a run",
     "models": "list, download, verify and inspect model files for detection and segmentation",
     "completion": "print the completion of commands and options for a shell",
     "doctor": "check the machine and the installation: CPU, GPU, memory, disk, clock, ports, models, extras",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }
-_TEAM = ("status", "end", "refine", "fetch", "evict", "unban", "objects")
+_TEAM = ("status", "end", "refine", "fetch", "evict", "unban")
 _SIBLINGS = {"report": Sibling.REPORT_COMMAND, "view": Sibling.VIEW_COMMAND, "bench": Sibling.BENCH_COMMAND}
 
 

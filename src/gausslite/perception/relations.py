@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -17,7 +17,36 @@ from gausslite.perception.colours import ColourFilter
 from gausslite.perception.evidence import Evidence
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
 from gausslite.perception.settings import RelationSettings
-from gausslite.perception.supporting_surface import SupportingSurfaces
+
+
+@runtime_checkable
+class TaskObjects(Protocol):
+    """The landmarks that the names of a task mean."""
+
+    def seen(self, name: str) -> list[Landmark]:
+        """Return all landmarks of a name."""
+        ...
+
+    def confirmed(self, name: str) -> list[Landmark]:
+        """Return the confirmed landmarks of a name; if there are none, all of them."""
+        ...
+
+    def candidates(self, name: str) -> list[Landmark]:
+        """Return those of which one can be the closest or the farthest."""
+        ...
+
+
+@runtime_checkable
+class Surfaces(Protocol):
+    """Decides by heights whether an object stands on an anchor."""
+
+    def is_by_height(self, relation: Relation) -> bool:
+        """Return True if heights decide the relation."""
+        ...
+
+    def stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
+        """Return whether an object stands on the relation's anchor by its height; None if heights do not decide."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,13 +69,17 @@ class NamedObjects:
         """Return the confirmed landmarks of a name; if there are none, all of them."""
         return self.evidence.confirmed(self.seen(name)) or self.seen(name)
 
+    def candidates(self, name: str) -> list[Landmark]:
+        """Return the confirmed landmarks without those of far lower scores: one false candidate decides."""
+        return self.evidence.without_low_scores(self.confirmed(name))
+
 
 class RelationFilter:
     """Decides whether an observed object satisfies the relations of a target, to objects in view or not."""
 
     def __init__(
-        self, graph: TaskGraph, up: Float64[ndarray, "3"], settings: RelationSettings, objects: NamedObjects,
-        surfaces: SupportingSurfaces,
+        self, graph: TaskGraph, up: Float64[ndarray, "3"], settings: RelationSettings, objects: TaskObjects,
+        surfaces: Surfaces,
     ) -> None:  # fmt: skip
         """Objects and surfaces are shared with their owner, which observes frames."""
         self._relations = {
@@ -123,15 +156,11 @@ class RelationFilter:
         return any(geometry.holds(relation.predicate, observation, anchor) for anchor in anchors)
 
     def _is_extreme(self, relation: Relation, observation: Observation) -> bool:
-        """Return True for the candidate with the least (or largest) distance to its nearest anchor.
-
-        Those with far lower scores than another are no candidates: one false candidate decides.
-        """
+        """Return True for the candidate with the least (or largest) distance to its nearest anchor."""
         sign = 1.0 if relation.predicate is Predicate.CLOSEST_TO else -1.0
         anchors = self._objects.confirmed(relation.anchor)
-        candidates = self._objects.evidence.without_low_scores(self._objects.confirmed(relation.target))
         best, best_signed_m = None, np.inf
-        for candidate in candidates:
+        for candidate in self._objects.candidates(relation.target):
             distances_m = [
                 surface_distance_m(candidate, anchor, self._settings.max_sampled_cells)
                 for anchor in anchors

@@ -47,6 +47,9 @@ MAX_END_S = 90_000.0
 # larger than the default, because a server may send larger blocks
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
 
+FrameOutcome = agent_service_pb2.FrameOutcome
+"""Names the outcomes of `AgentClient.ingest`: `FrameOutcome.Name(result.outcome)`."""
+
 
 @dataclass(frozen=True, slots=True)
 class Session:

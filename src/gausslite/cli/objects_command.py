@@ -1,0 +1,215 @@
+"""`gausslite objects`: where the objects of a map are, or which of them a question means."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.codec.json import object_as_json, object_from_json
+from gausslite.codec.ply import read_ply
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build
+from gausslite.config.program import add_flags
+from gausslite.datasets.folder import read_pose_rows
+from gausslite.domain.checks import quote_name
+from gausslite.domain.errors import InvalidInputError, TaskError
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
+from gausslite.domain.task import TaskGraph
+from gausslite.fusion.objects import find_objects
+from gausslite.mission.results import TRAJECTORY, as_text, read_report
+from gausslite.wire.security import TlsFiles
+
+_NS_PER_S = 1e9
+_EPOCH_TIMES_S = 1e8
+"""Larger times are counted from 1970."""
+_MIN_GAUSSIANS = 20
+
+
+def configure(parser: CommandParser) -> None:
+    """Add the options of `gausslite objects`."""
+    add = parser.add_argument
+    add("place", metavar="HOST:PORT|FOLDER", help="a fusion server, or the output folder of `map` or an agent")
+    add(
+        "question",
+        metavar="QUESTION",
+        nargs="?",
+        default="",
+        help='a noun such as "mug", or a question such as "what is on the table" or "how many chairs are near the '
+        'door" (default: all objects)',
+    )
+    add("--json", action="store_true", help="print JSON for scripts")
+    add_flags(parser, TlsFiles)
+    parser.set_defaults(run=run)
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """The objects of a map; of a folder also its Gaussians and its last camera pose, None if it has none."""
+
+    objects: Sequence[TeamObject]
+    up_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    gaussians: Gaussians | None = None
+    T_world_camera: Float64[ndarray, "4 4"] | None = None
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the objects, the most confident first. Returns 0, or 1 if there is none."""
+    folder = Path(options.place)
+    place = _read_folder(folder) if folder.is_dir() else _Place(_query(options))
+    objects, notes = _select(place, options.question)
+    boxes = [oriented_box(team_object.landmark, place.gaussians, place.up_axis) for team_object in objects]
+    if options.json:
+        values = [_as_json(*pair) for pair in zip(objects, boxes, strict=True)]
+        print(as_text({"count": len(objects), "objects": values, "notes": list(notes)}))
+    else:
+        for pair in zip(objects, boxes, strict=True):
+            print(_describe(*pair))
+        for note in notes:
+            print(f"note: {note}")
+        if options.question or not objects:
+            print(_count(len(objects), options.question))
+    return 0 if objects else 1
+
+
+def _select(place: _Place, question: str) -> tuple[Sequence[TeamObject], Sequence[str]]:
+    """Return the objects that a noun or a question means, with notes. Raises InvalidInputError, TaskError."""
+    if not question:
+        return place.objects, ()
+    from gausslite.perception.questions import answer
+    from gausslite.task.rules import RuleParser
+
+    try:
+        graph = RuleParser().parse(question)
+    except TaskError as error:
+        raise InvalidInputError(f"QUESTION: {error}") from error
+    by_id = {team_object.landmark.object_id: team_object for team_object in place.objects}
+    found = answer(graph, [team_object.landmark for team_object in place.objects], place.up_axis, place.T_world_camera)
+    return [by_id[landmark.object_id] for landmark in found.objects], found.notes
+
+
+def _count(count: int, question: str) -> str:
+    if not count:
+        return f"no object{f' for {quote_name(question)}' if question else ''}"
+    return f"{count} object{'s' if count > 1 else ''}"
+
+
+def _query(options: argparse.Namespace) -> Sequence[TeamObject]:
+    # imported late, because the objects of a folder need no gRPC
+    from gausslite.wire.channel import require_callable
+    from gausslite.wire.clients import FusionClient
+
+    require_callable("a fusion server or the output folder of a run", options.place)
+    with FusionClient(options.place, tls=build(TlsFiles, options).read()) as client:
+        return client.query_objects()
+
+
+def _read_folder(folder: Path) -> _Place:
+    """Return the objects in report.json, with what the folder has of the map. Raises InvalidInputError, CodecError."""
+    report = read_report(folder)
+    values = report.get("objects")
+    if not isinstance(values, list):
+        raise InvalidInputError(f"{folder}: expected a report.json with objects, got none")
+    agent_id = str(report.get("agent_id") or folder.resolve().name)
+    targets = report.get("targets")
+    nouns = tuple(str(target) for target in targets) if isinstance(targets, list) else ()
+    graph = TaskGraph("", str(report.get("task") or ""), nouns, (), ())
+    objects = find_objects({agent_id: ObjectReport(graph, tuple(object_from_json(value) for value in values))}, {})
+    map_file, trajectory = folder / "map.ply", folder / TRAJECTORY
+    poses = read_pose_rows(trajectory)[1] if trajectory.is_file() else np.zeros((0, 4, 4))
+    return _Place(
+        objects,
+        _up_axis(poses),
+        read_ply(map_file) if map_file.is_file() else None,
+        poses[-1] if len(poses) else None,
+    )
+
+
+def _up_axis(T_world_camera: Float64[ndarray, "t 4 4"]) -> tuple[float, float, float]:
+    """Return the axis of the world that is closest to up in the cameras' images; z without cameras."""
+    mean_up = -T_world_camera[:, :3, 1].mean(axis=0) if len(T_world_camera) else np.array((0.0, 0.0, 1.0))
+    axis = int(np.argmax(np.abs(mean_up)))
+    x, y, z = (math.copysign(1.0, mean_up[axis]) if i == axis else 0.0 for i in range(3))
+    return x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class OrientedBox:
+    """The smallest upright box of an object. yaw_rad: of its longer horizontal side, from the first horizontal axis.
+
+    size_m: along that side, across it, and upwards.
+    """
+
+    yaw_rad: float
+    size_m: tuple[float, float, float]
+
+
+def oriented_box(
+    landmark: ObjectLandmark, gaussians: Gaussians | None, up_axis: tuple[float, float, float]
+) -> OrientedBox | None:
+    """Return the smallest upright box of the map's Gaussians within the object's box; None with fewer than 20."""
+    if gaussians is None:
+        return None
+    import cv2
+
+    means_m, box = gaussians.means_m.astype(np.float64), landmark.extent_m
+    inside = np.all((means_m >= box.min_m) & (means_m <= box.max_m), axis=1)
+    points_m = (
+        means_m[inside & gaussians.active] if (inside & gaussians.active).sum() >= _MIN_GAUSSIANS else means_m[inside]
+    )
+    if len(points_m) < _MIN_GAUSSIANS:
+        return None
+    vertical = int(np.argmax(np.abs(up_axis)))
+    first, second = (axis for axis in range(3) if axis != vertical)
+    _, (width_m, depth_m), angle_deg = cv2.minAreaRect(points_m[:, [first, second]].astype(np.float32))
+    if width_m < depth_m:
+        width_m, depth_m, angle_deg = depth_m, width_m, angle_deg + 90.0
+    yaw_rad = math.radians((angle_deg + 90.0) % 180.0 - 90.0)
+    return OrientedBox(yaw_rad, (float(width_m), float(depth_m), float(np.ptp(points_m[:, vertical]))))
+
+
+def _as_json(team_object: TeamObject, box: OrientedBox | None) -> dict[str, object]:
+    observers = [
+        {
+            "agent_id": observer.agent_id,
+            "id": observer.object_id,
+            "target": observer.target,
+            "confidence": observer.confidence,
+            "first_seen_ns": observer.first_seen_ns,
+            "last_seen_ns": observer.last_seen_ns,
+        }
+        for observer in team_object.observers
+    ]
+    oriented = {} if box is None else {"yaw_rad": box.yaw_rad, "oriented_size_m": list(box.size_m)}
+    return {**object_as_json(team_object.landmark), **oriented, "observers": observers}
+
+
+def _describe(team_object: TeamObject, box: OrientedBox | None) -> str:
+    landmark = team_object.landmark
+    place = ", ".join(f"{value:.2f}" for value in landmark.centroid_m)
+    size = " x ".join(f"{value:.2f}" for value in (landmark.size_m if box is None else box.size_m))
+    turned = "" if box is None else f" turned by {round(math.degrees(box.yaw_rad))} deg"
+    seen = "; ".join(
+        f"{observer.agent_id} from {_time(observer.first_seen_ns)} to {_time(observer.last_seen_ns)}"
+        for observer in team_object.observers
+    )
+    return (
+        f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({place}) m, size {size} m{turned}, "
+        f"confidence {landmark.confidence:.2f}, seen by {seen}"
+    )
+
+
+def _time(time_ns: int) -> str:
+    """Return a capture time: as a date if the clock counts from 1970, else in seconds."""
+    seconds = time_ns / _NS_PER_S
+    if seconds < _EPOCH_TIMES_S:
+        return f"{seconds:.1f} s"
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

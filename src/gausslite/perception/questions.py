@@ -1,0 +1,118 @@
+"""Answer a question about a finished map's objects, with the graph and the relations of a task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.objects import ObjectLandmark, meant_by
+from gausslite.domain.pose import UpAxis, unit_up_axis
+from gausslite.domain.task import Relation, Superlative, TaskGraph, noun_of
+from gausslite.perception.object_map import Landmark, Observation
+from gausslite.perception.relations import RelationFilter, select_extreme
+from gausslite.perception.settings import RelationSettings
+
+_BOX_STEP_M = 0.05
+_MAX_STEPS = 16
+_OF_A_VIEWPOINT = (Superlative.NEAREST, Superlative.FARTHEST, Superlative.LEFTMOST, Superlative.RIGHTMOST)
+Z_UP: UpAxis = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The objects that a question means, and why there may be others. A count is their number."""
+
+    objects: tuple[ObjectLandmark, ...]
+    notes: tuple[str, ...] = ()
+
+
+def answer(
+    graph: TaskGraph,
+    objects: Sequence[ObjectLandmark],
+    up_axis: UpAxis = Z_UP,
+    T_world_camera: Float64[ndarray, "4 4"] | None = None,
+) -> Answer:
+    """Return the objects that are targets of the graph, as a robot with this task would choose them from their boxes.
+
+    Unlike a task, a relation to an anchor that the map does not have selects nothing. T_world_camera: the viewpoint of
+    left_of, nearest and the like; without it, sides are evaluated as near.
+    """
+    mapped, up = _MappedObjects(objects), np.array(unit_up_axis(up_axis))
+    relations = RelationFilter(graph, up, RelationSettings(), mapped, _NoSurfaces())
+    notes = [f"the map has no {noun_of(name)!r}" for name in relations.unseen_anchors]
+    if notes:
+        return Answer((), tuple(notes))
+    excluded = {id(landmark) for name in graph.excluded for landmark in mapped.seen(name)}
+    superlatives = {attribute.name: attribute.superlative for attribute in graph.attributes if attribute.superlative}
+    notes += [
+        f"the map does not store colours: {attribute.colour!r} is not evaluated"
+        for attribute in graph.attributes
+        if attribute.colour is not None
+    ]
+    chosen: list[Landmark] = []
+    for target in graph.targets:
+        seen = [landmark for landmark in mapped.seen(target) if id(landmark) not in excluded]
+        camera_m = None if T_world_camera is None else T_world_camera[:3, 3]
+        fitting = [landmark for landmark in seen if relations.satisfies(target, _observed(landmark, camera_m))]
+        superlative = superlatives.get(target)
+        if fitting and superlative is not None:
+            if superlative in _OF_A_VIEWPOINT and T_world_camera is None:
+                notes.append(f"{superlative}: needs a viewpoint, which this map does not have")
+                continue
+            pose = np.eye(4) if T_world_camera is None else T_world_camera
+            fitting = [select_extreme(fitting, superlative, up, pose)]
+        chosen += fitting
+    numbers = sorted({landmark.number for landmark in chosen})
+    return Answer(tuple(objects[number] for number in numbers), tuple(notes))
+
+
+class _MappedObjects:
+    """The objects of a finished map as landmarks, all of them confirmed; a landmark's number is its position."""
+
+    def __init__(self, objects: Sequence[ObjectLandmark]) -> None:
+        self._landmarks = [_landmark(number, found) for number, found in enumerate(objects)]
+
+    def seen(self, name: str) -> list[Landmark]:
+        """Return the objects that a name of the graph means, by noun and synonym."""
+        nouns = set(meant_by(noun_of(name), dict.fromkeys(landmark.phrase for landmark in self._landmarks)))
+        return [landmark for landmark in self._landmarks if landmark.phrase in nouns]
+
+    def confirmed(self, name: str) -> list[Landmark]:
+        """Return the same: a map lists confirmed objects only."""
+        return self.seen(name)
+
+    def candidates(self, name: str) -> list[Landmark]:
+        """Return the same."""
+        return self.seen(name)
+
+
+class _NoSurfaces:
+    """No height is known of what an object stands on: boxes decide."""
+
+    def is_by_height(self, relation: Relation) -> bool:
+        """Return False."""
+        del relation
+        return False
+
+    def stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
+        """Return None."""
+        del relation, seen
+
+
+def _landmark(number: int, found: ObjectLandmark) -> Landmark:
+    """Return a landmark whose cells fill the object's box."""
+    low_m, high_m = np.array(found.extent_m.min_m), np.array(found.extent_m.max_m)
+    steps = np.clip(np.ceil((high_m - low_m) / _BOX_STEP_M).astype(int) + 1, 2, _MAX_STEPS)
+    axes = [np.linspace(low_m[axis], high_m[axis], steps[axis]) for axis in range(3)]
+    points_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    landmark = Landmark.from_observation(Observation.from_points(found.noun, points_m, score=found.confidence))
+    landmark.number, landmark.centroid_m = number, np.array(found.centroid_m)
+    return landmark
+
+
+def _observed(landmark: Landmark, camera_m: Float64[ndarray, "3"] | None) -> Observation:
+    return replace(landmark.seen_from(np.zeros(3)), camera_m=camera_m)

@@ -1,0 +1,76 @@
+"""Questions about a finished map: nouns, relations, superlatives and counts, with the graph of a task."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import gausslite as gl
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.perception.questions import answer
+from gausslite.task.rules import RuleParser
+
+
+def thing(name: str, centre_m: tuple[float, float, float], size_m: tuple[float, float, float]) -> ObjectLandmark:
+    low, high = (tuple(c + side * s / 2 for c, s in zip(centre_m, size_m, strict=True)) for side in (-1, 1))
+    role = ObjectRole.ANCHOR
+    return ObjectLandmark(name, name.partition("-")[0], role, centre_m, AxisAlignedBox(low, high), 0.9, 0, 1)
+
+
+ROOM = (
+    thing("table-1", (0.0, 0.0, 0.4), (1.6, 0.8, 0.8)),
+    thing("mug-1", (0.3, 0.1, 0.85), (0.1, 0.1, 0.1)),
+    thing("mug-2", (3.0, 0.0, 1.0), (0.1, 0.1, 0.1)),
+    thing("book-1", (-0.4, 0.0, 0.82), (0.2, 0.15, 0.04)),
+    thing("chair-1", (1.2, 0.0, 0.45), (0.5, 0.5, 0.9)),
+    thing("chair-2", (4.0, 2.0, 0.5), (0.7, 0.7, 1.0)),
+    thing("box-1", (3.0, -2.0, 0.25), (0.6, 0.6, 0.5)),
+    thing("ball-1", (3.0, -2.0, 0.2), (0.1, 0.1, 0.1)),
+)
+QUESTIONS = {
+    "what is on the table": {"mug-1", "book-1"},
+    "how many mugs are on the table": {"mug-1"},
+    "where is the mug": {"mug-1", "mug-2"},
+    "what is inside the box": {"ball-1"},
+    "chair nearest to the table": {"chair-1"},
+    "the chair farthest from the table": {"chair-2"},
+    "largest chair": {"chair-2"},
+    "smallest chair": {"chair-1"},
+    "how many chairs": {"chair-1", "chair-2"},
+    "how many sofas": set(),
+    "mug that is not on the table": {"mug-2"},
+    "cup": {"mug-1", "mug-2"},
+}
+
+
+@pytest.mark.parametrize(("question", "expected"), QUESTIONS.items())
+def test_a_question_selects_the_objects_that_its_graph_means(question: str, expected: set[str]) -> None:
+    found = gl.ask(ROOM, question)
+    assert {landmark.object_id for landmark in found.objects} == expected
+
+
+def test_an_anchor_that_the_map_does_not_have_selects_nothing_and_is_named() -> None:
+    found = gl.ask(ROOM, "what is on the shelf")
+    assert (found.objects, found.notes) == ((), ("the map has no 'shelf'",))
+
+
+def test_colours_are_named_as_not_evaluated() -> None:
+    found = gl.ask(ROOM, "red mug")
+    assert len(found.objects) == 2
+    assert found.notes == ("the map does not store colours: 'red' is not evaluated",)
+
+
+def test_nearest_needs_a_viewpoint() -> None:
+    graph = RuleParser().parse("nearest mug")
+    assert answer(graph, ROOM).notes == ("nearest: needs a viewpoint, which this map does not have",)
+    viewpoint = np.eye(4)
+    viewpoint[:3, 3] = (4.0, 0.0, 1.0)
+    [mug] = answer(graph, ROOM, T_world_camera=viewpoint).objects
+    assert mug.object_id == "mug-2"
+
+
+def test_the_up_axis_decides_what_is_on_the_table() -> None:
+    sideways = [thing("table-1", (0.4, 0.0, 0.0), (0.8, 1.6, 0.8)), thing("mug-1", (0.85, 0.1, 0.0), (0.1, 0.1, 0.1))]
+    assert not gl.ask(sideways, "what is on the table").objects
+    assert gl.ask(sideways, "what is on the table", up_axis=(1.0, 0.0, 0.0)).objects == (sideways[1],)
