@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 from gausslite.task import lexicon
@@ -180,7 +181,9 @@ _QUESTION_WORDS: Final = word_set("is are was were does did has have can could w
 def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
     """Handle the negation at the current word."""
     before, after = buffer.tag(-1), buffer.tag(1)
-    if before is Tag.PRONOUN and buffer.word(-1) != "you" and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
+    if word == "no":
+        _deny(buffer)
+    elif before is Tag.PRONOUN and buffer.word(-1) != "you" and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
         buffer.close()  # "I can't find my phone"
     elif word in INABILITIES and before in (Tag.NOUN, Tag.INDEFINITE) and after is Tag.VERB:
         buffer.close()  # "my son can't find his bear"
@@ -205,6 +208,22 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
         buffer.emit(ChunkKind.NEGATION, word)
 
 
+def _deny(buffer: ChunkBuffer) -> None:
+    """Handle "no": "with no lid", "has no lid" and "with a lamp but no shade" negate a relation, "no forks" excludes."""
+    buffer.close()
+    kinds = [chunk.kind for chunk in buffer.chunks[-3:]]
+    listed = kinds == [ChunkKind.PREPOSITION, ChunkKind.NOUN, ChunkKind.CONJUNCTION]
+    if kinds[-1:] == [ChunkKind.PREPOSITION]:
+        buffer.chunks[-1] = replace(buffer.chunks[-1], negated=True)
+    elif (buffer.word(-1) in _VERB_CHUNKS_HAVE_FORMS and kinds[-1:] == [ChunkKind.NOUN]) or (
+        listed and buffer.chunks[-3].word in ("with", "near")
+    ):
+        buffer.negates_next = True
+        buffer.emit_preposition("near", "without")
+    elif buffer.tag(-1) is not Tag.AUXILIARY:
+        buffer.emit(ChunkKind.NEGATION, "no")
+
+
 def _follows_noun_of_state(buffer: ChunkBuffer) -> bool:
     """Return True for the "not" of "the mug that is not red" and "anything not red"."""
     is_relative = buffer.tag(-1) is Tag.AUXILIARY and buffer.tag(-2) is Tag.RELATIVE
@@ -220,7 +239,7 @@ def _is_state(buffer: ChunkBuffer) -> bool:
 
 def _opens_question(buffer: ChunkBuffer) -> bool:
     is_question = buffer.word(-1) in _QUESTION_WORDS and buffer.tag(-2) in _CLAUSE_START_TAGS
-    return is_question and buffer.tag(1) in OBJECT_START_TAGS | {Tag.PREPOSITION, Tag.ANAPHOR}
+    return is_question and buffer.tag(1) in OBJECT_START_TAGS | {Tag.ANAPHOR}
 
 
 def _negates_place(buffer: ChunkBuffer) -> bool:

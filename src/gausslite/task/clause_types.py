@@ -42,7 +42,7 @@ class ClauseType(Enum):
 def clause_types(tagged: TaggedWords) -> dict[int, ClauseType]:
     """Return the index of each clause's first word, with the clause's type."""
     types: dict[int, ClauseType] = {}
-    before = ClauseType.STATEMENT
+    before = ClauseType.REQUEST
     starts = [0, *(index for index in range(1, len(tagged)) if _begins_clause(tagged, index))]
     for start, end in zip(starts, [*starts[1:], len(tagged)], strict=True):
         before = types[start] = _clause_type(tagged, start, end, before)

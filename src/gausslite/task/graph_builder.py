@@ -130,10 +130,12 @@ class GraphBuilder:
             return
         if chunk.gerund and before is not None and before.kind is ChunkKind.VERB and before.word == "avoid":
             self._negation("avoid " + chunk.word)
+        joined = before is not None and before.kind is ChunkKind.CONJUNCTION
         same_negation = self._negated and (
-            self._clause.nouns_since_negation == 0
+            # "don't turn left, go to the table"
+            (self._clause.nouns_since_negation == 0 and not (joined and self._clause.verb_since_negation))
             or chunk.gerund
-            or (before is not None and before.kind is ChunkKind.CONJUNCTION and before.word == "or")
+            or (joined and before is not None and before.word == "or")
         )
         if not same_negation:
             self._negated = False
@@ -160,6 +162,10 @@ class GraphBuilder:
             self._handle_demonstrative(word, before, None)
             return
         pending, self._pending = self._pending, None
+        if pending is not None and clause.terms.negated and clause.places:
+            words = f"not {clause.preposition} {word}"  # "beside the sink, not in it"
+            self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
+            return
         if self._negated:
             named = (clause.objects or clause.referents)[-1:]
             if pending is not None and named:

@@ -291,8 +291,9 @@ def _abbreviate(phrase: str) -> str:
 def _sentence_words(text: str) -> frozenset[str]:
     """Return every word of a sentence, also in the singular, and the parts of hyphenated words."""
     tokens = tokenize(normalise_text(text).replace("-", " ")) + normalise_text(text).split()
-    bare = [token.strip(".,;:!?()\"'").removesuffix("'s") for token in tokens]
-    return frozenset(bare) | frozenset(singular(token) for token in bare) | frozenset(tokens)
+    bare = {token.strip(".,;:!?()\"'").removesuffix("'s") for token in tokens} - {""}
+    glasses = {"glass"} if "glasses" in bare else set()  # of water, unlike spectacles
+    return frozenset((*bare, *map(singular, bare), *tokens, *glasses))
 
 
 def _is_mentioned(phrase: str, mentioned: frozenset[str]) -> bool:

@@ -115,7 +115,8 @@ Options = dict[Tag, int]
 
 # one line for words with the same possible tags; the digits after a tag are its cost
 _CLOSED_LINES: Final = (
-    ("d0", "a an the my your his our their its every whose no"),
+    ("d0", "a an the my your his our their its every whose"),
+    ("q0", "no"),
     ("d0 o3", "her"),
     ("d0 k2", "this these those"),
     ("d0 k4 w0 s13", "that"),
