@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gausslite.codec.json import graph_from_json
 from gausslite.domain.errors import InvalidInputError, TaskError
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TargetRole, TaskGraph
 from gausslite.task.grounding import TaskParser
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")
@@ -22,8 +22,9 @@ class ParserScore:
     """Shares of correct sentences, milliseconds per sentence, and the texts whose graph is not exact.
 
     A share per part of the graph: the set of its targets, their roles, the anchors, the relations with negation and
-    distances, the attributes, and the excluded objects. exact: all of them. reversed_relations: sentences with a
-    relation whose negation is wrong, and no warning.
+    distances, the attributes, and the excluded objects. exact: all of them. opposites: the sentences without a warning
+    whose graph states the opposite: a relation with the wrong negation, an object to leave alone that is handled or
+    locates something, or an object to handle that is left alone.
     """
 
     backend: str
@@ -35,7 +36,7 @@ class ParserScore:
     relation_set: float
     attribute_set: float
     excluded_set: float
-    reversed_relations: int
+    opposites: tuple[str, ...]
     median_ms: float
     slowest_ms: float
     by_fallback: int
@@ -64,7 +65,8 @@ def score_parser(
     """Return the scores of parsing every sentence once; a sentence that raises TaskError counts as wrong."""
     matches: list[tuple[bool, ...]] = []
     times_ms: list[float] = []
-    fallbacks = reversed_relations = 0
+    fallbacks = 0
+    opposites: list[str] = []
     for graph in expected:
         started_s = clock_s()
         parsed = _graph_or_none(parser, graph.text)
@@ -72,7 +74,8 @@ def score_parser(
         matches.append(matching_parts(graph, parsed))
         if parsed is not None:
             fallbacks += any(warning.startswith("backend ") for warning in parsed.warnings)
-            reversed_relations += _is_reversed(graph, parsed)
+            if not parsed.warnings and _is_opposite(graph, parsed):
+                opposites.append(graph.text)
     targets, roles, anchors, relations, attributes, excluded = map(statistics.fmean, zip(*matches, strict=True))
     exact = [all(parts) for parts in matches]
     return ParserScore(
@@ -85,7 +88,7 @@ def score_parser(
         relation_set=relations,
         attribute_set=attributes,
         excluded_set=excluded,
-        reversed_relations=reversed_relations,
+        opposites=tuple(opposites),
         median_ms=statistics.median(times_ms),
         slowest_ms=max(times_ms),
         by_fallback=fallbacks,
@@ -106,15 +109,34 @@ def _parts(graph: TaskGraph) -> tuple[frozenset[object], ...]:
     return tuple(frozenset(part) for part in parts)
 
 
-def _is_reversed(expected: TaskGraph, parsed: TaskGraph) -> bool:
-    """Return True if a relation stands with the wrong negation and nothing warns of it."""
+def _is_opposite(expected: TaskGraph, parsed: TaskGraph) -> bool:
+    """Return True if the parsed graph states the opposite of a part of the expected one."""
     wanted = {
         (relation.predicate, relation.target, relation.anchor): relation.negated for relation in expected.relations
     }
-    return not parsed.warnings and any(
+    if any(
         wanted.get((relation.predicate, relation.target, relation.anchor), relation.negated) != relation.negated
         for relation in parsed.relations
+    ):
+        return True
+    denied = _anchors(expected, negated=True) - _anchors(expected, negated=False) - _handled(expected)
+    return bool(
+        _handled(expected) & _left_alone(parsed)
+        or _left_alone(expected) & _handled(parsed)
+        or denied & (_handled(parsed) | _anchors(parsed, negated=False))
     )
+
+
+def _handled(graph: TaskGraph) -> set[str]:
+    return {target for target, role in zip(graph.targets, graph.roles, strict=True) if role is not TargetRole.OBSTACLE}
+
+
+def _left_alone(graph: TaskGraph) -> set[str]:
+    return {*graph.targets, *graph.excluded} - _handled(graph)
+
+
+def _anchors(graph: TaskGraph, negated: bool) -> set[str]:
+    return {relation.anchor for relation in graph.relations if relation.negated is negated}
 
 
 def _graph_or_none(parser: TaskParser, text: str) -> TaskGraph | None:

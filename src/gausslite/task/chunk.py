@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from gausslite.domain.nouns import is_thing
 from gausslite.task import lexicon
 from gausslite.task.lexicon import DISTANCE_SUPERLATIVES, SUPERLATIVES, is_attribute, singular, word_set
 from gausslite.task.tags import Tag
@@ -42,7 +43,7 @@ class NounPhrase:
     @property
     def is_known(self) -> bool:
         """True when the head is a noun of the lexicon."""
-        return self.head in lexicon.NOUNS or self.head in lexicon.GENERIC
+        return self.head in lexicon.NOUNS or self.head in lexicon.GENERIC or is_thing(self.head) or is_thing(self.text)
 
 
 def noun_phrase(words: Sequence[str], has_determiner: bool) -> NounPhrase:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Final
 
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind, adjectives_only
 from gausslite.task.clause_types import (
-    INABILITIES,
     SUBJECT_PRONOUNS,
     SUBJECT_TAGS,
     WISHES,
@@ -18,7 +16,8 @@ from gausslite.task.clause_types import (
     is_command,
     is_modal,
 )
-from gausslite.task.lexicon import ORDINALS, is_attribute, singular, word_set
+from gausslite.task.lexicon import ORDINALS, is_attribute, word_set
+from gausslite.task.negation import HAVE_FORMS, NOUN_PHRASE_TAGS, OBJECT_START_TAGS, chunk_negation
 from gausslite.task.tags import Tag, tag_words
 from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
 from gausslite.task.verbs import (
@@ -26,18 +25,13 @@ from gausslite.task.verbs import (
     BELONGING_VERBS,
     GO_VERBS,
     HOLDING_VERBS,
-    POSTURE_VERBS,
-    TOOL_VERBS,
     is_particle,
     verb_base,
 )
 
 _RELATIVES: Final = word_set("that which who whom")
-_VERB_CHUNKS_HAVE_FORMS: Final = word_set("has have had")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
 _MODIFIED_TAGS: Final = frozenset({Tag.NOUN, Tag.PARTICIPLE})
-NOUN_PHRASE_TAGS: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE})
-OBJECT_START_TAGS: Final = frozenset({Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE, Tag.INDEFINITE})
 
 
 class VerbChunker:
@@ -58,11 +52,7 @@ class VerbChunker:
         """Handle "is", "has" and the like; "has" with an object means near."""
         buffer = self._buffer
         self._end_relative_subject(finite=True)
-        if (
-            word in _VERB_CHUNKS_HAVE_FORMS
-            and buffer.last_kind() is ChunkKind.NOUN
-            and buffer.tag(1) in OBJECT_START_TAGS
-        ):
+        if word in HAVE_FORMS and buffer.last_kind() is ChunkKind.NOUN and buffer.tag(1) in OBJECT_START_TAGS:
             buffer.emit_preposition("near")
         self._after_modal = is_modal(buffer.tagged, buffer.index) and buffer.last_kind() is ChunkKind.NOUN
 
@@ -167,113 +157,6 @@ class VerbChunker:
             self._buffer.close()
 
 
-_NEGATED_VERBS: Final = WISHES | word_set("care touch mean")
-# "that is not a duck" excludes something, "that is not open" does not
-_EXCLUDING_TAGS: Final = frozenset({Tag.VERB, Tag.DETERMINER, Tag.NOUN})
-_VERB_FORMS: Final = frozenset({Tag.VERB, Tag.GERUND, Tag.PARTICIPLE})
-_NOUN_BEFORE: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.RELATIVE, Tag.AUXILIARY, Tag.ANAPHOR, Tag.CONJUNCTION})
-_NOTS: Final = word_set("not never") | {"but not", "do not", "doesn't", "don't", "dont"}
-_CLAUSE_START_TAGS: Final = frozenset({None, Tag.CLAUSE_BREAK, Tag.CONJUNCTION})
-_HAVE_FORMS: Final = word_set("have has had")
-_QUESTION_WORDS: Final = word_set("is are was were does did has have can could would will")
-
-
-def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
-    """Handle the negation at the current word."""
-    before, after = buffer.tag(-1), buffer.tag(1)
-    if word == "no":
-        _deny(buffer)
-    elif before is Tag.PRONOUN and buffer.word(-1) != "you" and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
-        buffer.close()  # "I can't find my phone"
-    elif word in INABILITIES and before in (Tag.NOUN, Tag.INDEFINITE) and after is Tag.VERB:
-        buffer.close()  # "my son can't find his bear"
-        if buffer.last_kind() is ChunkKind.NOUN:
-            buffer.chunks.pop()
-    elif _opens_question(buffer):
-        buffer.close()  # "isn't there a mug on the table?"
-    elif (word in _NOTS and _negates_place(buffer)) or (
-        word in _NOTS and is_attribute(buffer.word(1)) and _follows_noun_of_state(buffer)
-    ):
-        buffer.close()
-        buffer.negates_next = True
-    elif word == "without" and _modifies_noun(buffer):
-        buffer.close()
-        buffer.negates_next = True
-        buffer.emit_preposition("near", word)
-    elif after is Tag.AUXILIARY and buffer.tag(2) in (Tag.PARTICIPLE, Tag.VERB):
-        _exclude_subject(buffer, word)
-    elif before is Tag.AUXILIARY and buffer.word(-1) != "do" and (after not in _EXCLUDING_TAGS or _is_state(buffer)):
-        buffer.emit(ChunkKind.NOT_UNDERSTOOD, f"{word} {buffer.word(1)}".strip())
-    else:
-        buffer.emit(ChunkKind.NEGATION, word)
-
-
-def _deny(buffer: ChunkBuffer) -> None:
-    """Handle "no": "with no lid", "has no lid" and "with a lamp but no shade" negate a relation, "no forks" excludes."""
-    buffer.close()
-    kinds = [chunk.kind for chunk in buffer.chunks[-3:]]
-    listed = kinds == [ChunkKind.PREPOSITION, ChunkKind.NOUN, ChunkKind.CONJUNCTION]
-    if kinds[-1:] == [ChunkKind.PREPOSITION]:
-        buffer.chunks[-1] = replace(buffer.chunks[-1], negated=True)
-    elif (buffer.word(-1) in _VERB_CHUNKS_HAVE_FORMS and kinds[-1:] == [ChunkKind.NOUN]) or (
-        listed and buffer.chunks[-3].word in ("with", "near")
-    ):
-        buffer.negates_next = True
-        buffer.emit_preposition("near", "without")
-    elif buffer.tag(-1) is not Tag.AUXILIARY:
-        buffer.emit(ChunkKind.NEGATION, "no")
-
-
-def _follows_noun_of_state(buffer: ChunkBuffer) -> bool:
-    """Return True for the "not" of "the mug that is not red" and "anything not red"."""
-    is_relative = buffer.tag(-1) is Tag.AUXILIARY and buffer.tag(-2) is Tag.RELATIVE
-    is_bare = buffer.tag(-1) is Tag.INDEFINITE and buffer.tag(2) not in NOUN_PHRASE_TAGS
-    return is_relative or is_bare
-
-
-def _is_state(buffer: ChunkBuffer) -> bool:
-    """Return True for an unknown word in "that is not rotten", unlike "that are not chairs"."""
-    word = buffer.word(1)
-    return buffer.tag(1) is Tag.NOUN and word not in lexicon.NOUNS and singular(word) == word
-
-
-def _opens_question(buffer: ChunkBuffer) -> bool:
-    is_question = buffer.word(-1) in _QUESTION_WORDS and buffer.tag(-2) in _CLAUSE_START_TAGS
-    return is_question and buffer.tag(1) in OBJECT_START_TAGS | {Tag.ANAPHOR}
-
-
-def _negates_place(buffer: ChunkBuffer) -> bool:
-    """Return True for "(that is) not on", "(that do) not hang on", "(who is) not wearing"."""
-    if buffer.tag(-1) not in _NOUN_BEFORE or not (buffer.words or buffer.chunks):
-        return False
-    if buffer.tag(1) is Tag.PREPOSITION:
-        return True
-    base, after = verb_base(buffer.word(1)), buffer.tag(2)
-    if buffer.tag(-1) is Tag.AUXILIARY and buffer.word(1) in _HAVE_FORMS and after in OBJECT_START_TAGS:
-        return True
-    in_clause = buffer.tag(-1) in (Tag.AUXILIARY, Tag.RELATIVE) and buffer.tag(1) in _VERB_FORMS
-    is_place = base in POSTURE_VERBS and after is Tag.PREPOSITION
-    return in_clause and (is_place or (base in HOLDING_VERBS and after in OBJECT_START_TAGS))
-
-
-def _modifies_noun(buffer: ChunkBuffer) -> bool:
-    """Return True for "the worker without a helmet", not for "wipe the table without the sponge"."""
-    is_noun = buffer.tag(-1) in (Tag.NOUN, Tag.INDEFINITE) and buffer.tag(1) in OBJECT_START_TAGS
-    has_action = buffer.last_verb() in TOOL_VERBS
-    part = buffer.word(1) if buffer.tag(1) is not Tag.DETERMINER else buffer.word(2)
-    return is_noun and (not has_action or part in lexicon.PARTS)
-
-
-def _exclude_subject(buffer: ChunkBuffer, word: str) -> None:
-    """Negate the chunks before the verb: "the lamp and the vase must not be touched"."""
-    buffer.close()
-    first = len(buffer.chunks)
-    while first and buffer.chunks[first - 1].kind in (ChunkKind.NOUN, ChunkKind.CONJUNCTION):
-        first -= 1
-    base = verb_base(buffer.word(2)) or buffer.word(2)
-    buffer.chunks[first:first] = [Chunk(ChunkKind.NEGATION, word), Chunk(ChunkKind.VERB, base, gerund=True)]
-
-
 _DEMONSTRATIVES: Final = word_set("this that these those")
 # "go around the table to the sofa": the table is a waypoint, the sofa the goal
 _ROUTE_RELATIONS: Final = word_set("near past above")
@@ -298,6 +181,7 @@ class _Chunker:
         self._buffer = ChunkBuffer(tagged)
         self._verbs = VerbChunker(self._buffer)
         self._clause_types = clause_types(tagged)
+        self._is_statement = False
         self._handlers: dict[Tag, Callable[[str], None]] = {
             Tag.NOUN: self._noun,
             Tag.ADJECTIVE: self._adjective,
@@ -323,6 +207,7 @@ class _Chunker:
         for index, (word, tag) in enumerate(buffer.tagged):
             buffer.index = index
             previous, clause = clause, self._clause_types.get(index, clause)
+            self._is_statement = clause is ClauseType.STATEMENT
             starts_request = previous is ClauseType.STATEMENT or self._starts_question(index)
             if tag is Tag.CONJUNCTION and clause is ClauseType.REQUEST and starts_request:
                 tag = Tag.CLAUSE_BREAK
@@ -373,7 +258,11 @@ class _Chunker:
         buffer = self._buffer
         before = (buffer.tag(-1), buffer.tag(-2))
         follows_noun = Tag.INDEFINITE in before or Tag.RELATIVE in (buffer.tag(-2), buffer.tag(-3))
-        if follows_noun and buffer.last_kind() is ChunkKind.NOUN and is_attribute(word):
+        is_it = self._is_statement and before == (Tag.AUXILIARY, Tag.ANAPHOR)  # "it is black"
+        follows_noun = follows_noun or (self._is_statement and before == (Tag.AUXILIARY, Tag.NOUN))
+        if is_attribute(word) and (
+            is_it or (follows_noun and buffer.last_kind() in (ChunkKind.NOUN, ChunkKind.CONJUNCTION))
+        ):
             buffer.chunks.append(Chunk(ChunkKind.ATTRIBUTE, word, negated=buffer.negates_next))
         buffer.negates_next = False
 

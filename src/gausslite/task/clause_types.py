@@ -42,7 +42,7 @@ class ClauseType(Enum):
 def clause_types(tagged: TaggedWords) -> dict[int, ClauseType]:
     """Return the index of each clause's first word, with the clause's type."""
     types: dict[int, ClauseType] = {}
-    before = ClauseType.REQUEST
+    before = ClauseType.STATEMENT
     starts = [0, *(index for index in range(1, len(tagged)) if _begins_clause(tagged, index))]
     for start, end in zip(starts, [*starts[1:], len(tagged)], strict=True):
         before = types[start] = _clause_type(tagged, start, end, before)
@@ -85,8 +85,8 @@ def _begins_clause(tagged: TaggedWords, index: int) -> bool:
 def _opens_clause(tagged: TaggedWords, conjunction_at: int) -> bool:
     """Return True if a verb, or a subject with its verb, follows the conjunction."""
     tags = [tag for _, tag in tagged[conjunction_at + 1 : conjunction_at + 3]] + [None, None]
-    if tags[0] is Tag.NEGATION and tags[1] is Tag.PREPOSITION:
-        return False  # "on the table, not on the shelf"
+    if tags[0] is Tag.NEGATION and (tags[1] is Tag.PREPOSITION or tagged[conjunction_at + 1][0] == "no"):
+        return False  # "on the table, not on the shelf", "with a lamp but no shade"
     if tags[0] in (Tag.VERB, Tag.NEGATION, Tag.AUXILIARY):
         return True
     if tags[0] in (Tag.PRONOUN, Tag.ANAPHOR):

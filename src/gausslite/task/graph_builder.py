@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
-from gausslite.task.graph_draft import GraphDraft, RelationTerms
+from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
-from gausslite.task.roles import Clause, RoleAssigner
+from gausslite.task.roles import RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
 from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS
 
@@ -17,6 +17,10 @@ from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDL
 # with these, a room or place states where something is
 _SPACE_PREPOSITIONS = frozenset(
     {"at", "around", "throughout", "across", "on", "near the middle of", "along", "through"}
+)
+# they make a picture: "take a picture of the mug"
+_PICTURING_VERBS = frozenset(
+    {"take", "make", "get", "capture", "shoot", "draw", "snap", "record", "want", "need", "see"}
 )
 _ADDRESSED_ROBOTS = (("drone",), ("rover",))
 
@@ -75,6 +79,8 @@ class GraphBuilder:
         elif chunk.kind is ChunkKind.NOT_UNDERSTOOD:
             self._draft.warnings.append(f"{chunk.word!r} is not understood: it is dropped")
         elif chunk.kind is ChunkKind.ATTRIBUTE:
+            if before is not None and before.kind is ChunkKind.CONJUNCTION:  # "near the door and is not blue"
+                self._described = next(reversed(self._clause.objects), self._described)
             self._describe(chunk.word, chunk.negated)
 
     def finish(self) -> GraphDraft:
@@ -212,6 +218,9 @@ class GraphBuilder:
                 return
             noun = self._resolve_one(noun)
         pending, self._pending = self._pending, None
+        if pending == "of" and self._described and self._described.split()[-1] in lexicon.PICTURES:
+            self._draft.warnings.append(f"what {self._described!r} shows is not understood: {noun.text!r} is dropped")
+            return
         if self._partitive is not None and pending in (None, "of"):
             (superlative, pending), self._partitive = self._partitive, None
             noun = NounPhrase((*superlative.words, *noun.words), True)
@@ -219,7 +228,7 @@ class GraphBuilder:
         if adjectives_only(noun.words) and not (of_follows and noun.head in lexicon.PLACES):
             self._lone_adjectives(noun, pending, after)
             return
-        if not _names_object(noun, pending, after, self._clause.verb):
+        if not _names_object(noun, pending, self._following, self._clause.verb):
             self._skip_noun(noun, pending, conjoined, after)
             return
         if pending is not None and lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS:
@@ -241,7 +250,7 @@ class GraphBuilder:
     def _lone_adjectives(self, noun: NounPhrase, pending: str | None, after: Chunk | None) -> None:
         """Handle adjectives without a noun: "the red" and blue mugs, "the largest" of the boxes."""
         before_noun = after is not None and (after.kind is ChunkKind.NOUN or after.word == "of")
-        if after is not None and after.kind is ChunkKind.CONJUNCTION:
+        if [chunk.kind for chunk in self._following[:2]] == [ChunkKind.CONJUNCTION, ChunkKind.NOUN]:
             self._adjectives.append(noun)
         elif any(word in SUPERLATIVES for word in noun.words) and self._described is not None:
             self._describe(" ".join(word for word in noun.words if is_attribute(word)), negated=False)
@@ -310,13 +319,18 @@ class GraphBuilder:
             self._draft.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")
 
 
-def _names_object(noun: NounPhrase, pending: str | None, after: Chunk | None, verb: str | None) -> bool:
-    """Return False for names of the robot, and for places, routes and measures that stand for another noun."""
+def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chunk], verb: str | None) -> bool:
+    """Return False for names of the robot, and for places, routes and amounts that stand for another noun."""
     if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES:
         return False
     if noun.head in lexicon.TASK_NOUNS and pending is None:
         return False
-    of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
+    of_follows = bool(following) and following[0].kind is ChunkKind.PREPOSITION and following[0].word == "of"
+    content = following[1].noun if of_follows and len(following) > 1 else None
+    if content is not None and not content.has_determiner and noun.head not in lexicon.CONTAINERS:
+        return False  # "a bar of soap"
+    if of_follows and noun.head in lexicon.PICTURES and verb not in _PICTURING_VERBS:
+        return True
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
     if compound and noun.head in lexicon.PLACES and not of_follows:
         return True
@@ -333,7 +347,10 @@ def _names_object(noun: NounPhrase, pending: str | None, after: Chunk | None, ve
         return pending not in (None, "of", "for", "to")
     if noun.head in lexicon.MEASURES and pending not in (None, "of"):
         return not of_follows
-    return noun.head not in lexicon.MEASURES or ((noun.is_known or compound) and not of_follows)
+    # "the smallest piece"
+    described = len(noun.words) > 1 and verb not in _PICTURING_VERBS
+    known = noun.head in lexicon.NOUNS or (noun.is_known and pending != "of")
+    return noun.head not in lexicon.MEASURES or ((known or compound or described) and not of_follows)
 
 
 def _with_shared_head(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from gausslite.domain.task import Predicate, Relation, TargetRole
+from gausslite.domain.task import Predicate, Relation, Superlative, TargetRole
 from gausslite.task import lexicon
+from gausslite.task.chunk import NounPhrase
+from gausslite.task.lexicon import SUPERLATIVES
 from gausslite.task.tokens import UNBOUNDED, Bounds
 
 _PREDICATES: Final = frozenset(predicate.value for predicate in Predicate)
@@ -102,6 +104,7 @@ class GraphDraft:
 
     def add_relation(self, terms: RelationTerms, targets: Sequence[str], anchor: str) -> None:
         """Relate every target to the anchor; a relation without a predicate becomes near, with a warning."""
+        targets = [target for target in targets if target != anchor]  # "the box next to the other box"
         self.mentions.append(anchor)
         known = self._as_predicate(terms, anchor)
         if known is None:
@@ -151,3 +154,98 @@ class GraphDraft:
         """Remove nouns of statements: the baby in "the baby sleeps, close the curtains"."""
         if not self._statement_nouns.issuperset(self.targets):
             self.targets = [target for target in self.targets if target not in self._statement_nouns]
+
+
+class Clause:
+    """The objects a verb acts on, the candidates for "it" (referents), and places still without an object.
+
+    places: the destinations or tools named last, which further places describe. terms: of the latest preposition.
+    superlative: "nearest" or "farthest" before the latest object. conjoined: the latest object followed
+    a conjunction. by_pronoun: the objects come from "it" or "them". adds_place: the preposition follows a conjunction.
+    route: the clause mentions a path. skip_of_phrase: the next "of" continues a noun that names no object.
+    """
+
+    def __init__(self, verb: str | None = None, referents: list[str] | None = None) -> None:
+        self.verb = verb
+        self.referents = referents or []
+        self.objects: list[str] = []
+        self.pending_places: list[tuple[RelationTerms, NounPhrase]] = []
+        self.last_relation: str | None = None
+        self.terms = RelationTerms("near")
+        self.places: list[str] = []
+        self.superlative: str | None = None
+        self.statement = False
+        self.conjoined = False
+        self.is_part = False
+        self.between = False
+        self.in_space = False
+        self.preposition = ""
+        self.adds_place = False
+        self.current_place = False
+        self.by_pronoun = False
+        self.follows_statement = False
+        self.route = False
+        self.skip_of_phrase = False
+        self.inherited_conjoined = False
+        self.inherited_preposition: str | None = None
+        self.nouns_since_negation = 0
+        self.verb_since_negation = False
+
+
+class RelationAssigner:
+    """Add the relations of the current clause to a draft."""
+
+    def __init__(self, draft: GraphDraft) -> None:
+        self._draft = draft
+        self.clause = Clause()
+
+    def relate(self, relation: str, noun: NounPhrase) -> None:
+        """Relate the clause's objects to the noun; a place named before any object is kept for the next object."""
+        self.relate_by(RelationTerms(relation, self.clause.terms.negated, self.clause.terms.bounds), noun)
+
+    def relate_by(self, terms: RelationTerms, noun: NounPhrase) -> None:
+        """Relate the clause's objects by complete terms, as `relate` does."""
+        clause = self.clause
+        clause.last_relation = terms.relation
+        clause.in_space = self._is_context(terms, noun)
+        if not clause.objects:
+            clause.pending_places.append((terms, noun))
+        elif clause.in_space:
+            self._draft.add_context(noun.text)
+        else:
+            self._draft.add_relation(terms, clause.objects, noun.text)
+
+    def relate_places(self, terms: RelationTerms, noun: NounPhrase) -> None:
+        """Relate the destinations or tools named last: "put it on the table by the window"."""
+        if self._is_context(terms, noun):
+            self._draft.add_context(noun.text)
+        else:
+            self._draft.add_relation(terms, self.clause.places, noun.text)
+
+    def _is_context(self, terms: RelationTerms, noun: NounPhrase) -> bool:
+        is_context = terms.relation == "inside" and lexicon.is_space(noun.words)
+        if is_context and terms.negated:
+            self._draft.warnings.append(f"not in {noun.text!r}: a place is not evaluated, the exception is dropped")
+        return is_context
+
+    def is_extreme(self, pending: str) -> bool:
+        """Return True for "the nearest chair to", "the farthest cone from"."""
+        superlative = SUPERLATIVES.get(self.clause.superlative or "")
+        is_farthest = superlative is Superlative.FARTHEST and pending == "from"
+        return bool(self.clause.objects) and (is_farthest or (superlative is not None and pending == "to"))
+
+    def relate_extreme(self, noun: NounPhrase) -> None:
+        """Relate the clause's objects as the nearest or farthest to the noun."""
+        clause = self.clause
+        word = clause.superlative or ""
+        for phrase in list(clause.objects):
+            self.rename(phrase, " ".join(part for part in phrase.split() if part != word))
+        farthest = SUPERLATIVES[word] is Superlative.FARTHEST
+        clause.superlative = None
+        self.relate(Predicate.FARTHEST_FROM if farthest else Predicate.CLOSEST_TO, noun)
+
+    def rename(self, phrase: str, new: str) -> None:
+        """Change the description of an object that the sentence has named."""
+        self._draft.rename(phrase, new)
+        for phrases in (self.clause.objects, self.clause.referents, self.clause.places):
+            phrases[:] = [new if known == phrase else known for known in phrases]

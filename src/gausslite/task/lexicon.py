@@ -21,42 +21,13 @@ _SHADES: Final = word_set("light dark bright pale deep")
 # a colour and a noun that together name another thing
 _COLOUR_COMPOUNDS: Final = frozenset(
     tuple(pair.split("_"))
-    for pair in [
-        "orange_juice",
-        "orange_tree",
-        "orange_peel",
-        "red_wine",
-        "white_wine",
-        "green_tea",
-        "black_tea",
-        "black_coffee",
-        "black_pepper",
-        "white_bread",
-        "brown_bread",
-        "brown_rice",
-        "brown_sugar",
-        "white_sugar",
-        "red_cross",
-        "blue_cheese",
-        "cream_cheese",
-        "green_bean",
-        "red_onion",
-        "green_onion",
-        "red_cabbage",
-        "black_box",
-        "white_board",
-        "black_board",
-        "ice_cream",
-        "yellow_page",
-        "gold_fish",
-        "silver_foil",
-        "black_hole",
-        "green_house",
-        "red_light_district",
-        "orange_slice",
-        "red_meat",
-        "white_chocolate",
-    ]
+    for pair in word_set(
+        "orange_juice orange_tree orange_peel red_wine white_wine green_tea black_tea black_coffee "
+        "black_pepper white_bread brown_bread brown_rice brown_sugar white_sugar red_cross blue_cheese "
+        "cream_cheese green_bean red_onion green_onion red_cabbage black_box white_board black_board "
+        "ice_cream yellow_page gold_fish silver_foil black_hole green_house orange_slice red_meat "
+        "white_chocolate"
+    )
 )
 _WORDS_OF_SUPERLATIVE: Final = {
     Superlative.LARGEST: "largest biggest hugest greatest larger bigger",
@@ -161,42 +132,17 @@ CONTAINERS: Final = word_set(
     "folder binder hopper silo casket coffin wallet quiver holster sheath sleeve wrapper packet sachet pack bundle "
     "bathroom bedroom office garage room car truck lorry bus ambulance helicopter boat plane taxi train"
 )
+# nouns that are also verbs or adjectives, or that the vocabulary lacks
 _OBJECTS: Final = word_set(
-    "mug cup glass bottle plate bowl fork knife spoon pan pot kettle teapot jug pitcher can jar lid tray napkin towel "
-    "sponge cloth soap dish toaster blender grill apple banana orange lemon tomato potato carrot bread food fruit "
-    "vegetable sandwich pizza cake cookie egg milk coffee tea juice water snack cereal book notebook magazine "
-    "newspaper paper pen pencil marker stapler folder binder envelope letter document laptop computer monitor "
-    "keyboard mouse phone cellphone telephone tablet charger cable cord remote printer camera speaker headphones "
-    "headset microphone router lamp light bulb clock watch calculator eraser ruler scissors tape pillow cushion "
-    "blanket sheet rug carpet mat curtain blind mirror picture painting poster frame vase candle plant flower "
-    "flowerpot planter tree bush grass leaf branch rock stone dirt mud puddle sand gravel trash garbage rubbish "
-    "litter waste debris dust crumb stain spill recycling cart trolley wheelchair walker stroller bicycle bike "
-    "scooter motorcycle car truck van bus vehicle forklift pallet cone barrier bollard sign hydrant extinguisher pole "
-    "post pipe valve gauge meter switch socket outlet plug button lever handle knob panel fuse thermostat sensor "
-    "detector alarm vent fan heater radiator conditioner boiler tank pump motor engine machine conveyor robot hammer "
-    "screwdriver wrench drill saw pliers nail screw bolt nut toolbox tool glove helmet vest goggles rope chain hose "
-    "ladder broom mop bucket dustpan vacuum brush shovel rake wheelbarrow mower ball toy doll puzzle block brick dice "
-    "card game controller guitar piano drum violin bat racket frisbee kite shoe boot sandal slipper sock shirt "
-    "t-shirt tshirt jacket coat hat cap scarf pants jeans dress skirt clothes clothing laundry hanger bag backpack "
-    "purse wallet suitcase luggage umbrella key keys keychain glasses sunglasses belt ring necklace tie person people "
-    "man woman child baby kid human pedestrian worker patient visitor guest user operator nurse doctor dog cat bird "
-    "pet animal horse cow sheep medicine pill medication syringe bandage thermometer mask kit toothbrush toothpaste "
-    "comb razor shampoo tissue package parcel box crate carton basket bin barrel container shelf rack locker drawer "
-    "hook stand tripod chair table stool bench sofa couch bed crib mattress desk cabinet furniture appliance utensil "
-    "cutlery silverware tableware electronics equipment supply device gadget instrument article belonging valuables "
-    "stairs step ramp railing rail curb hole crack leak window door wall floor ceiling roof beam column pillar "
-    "entrance exit doorway gate fence bridge elevator dock station landmark tag whiteboard coaster saucer straw ladle "
-    "spatula whisk corkscrew opener grater strainer colander mitt apron thermos flask canteen dumbbell treadmill yoga "
-    "barbell skateboard surfboard snowboard ski tent sleeping cooler lantern flashlight torch battery adapter usb "
-    "drive disk disc cd dvd television tv screen projector console antenna modem server mailbox streetlight lamppost "
-    "statue fountain swing slide sandbox manhole crosswalk tire wheel weed hedge log stump root seed fertilizer "
-    "sprinkler nozzle faucet tap drain gutter chimney tile plank board lumber wood scrap metal wire spring gear "
-    "bearing shaft coil circuit breaker transformer inverter seat armrest leg arm edge pad notepad sticker label "
-    "stamp coin money bill cash ticket passport badge shed sled doorstep doormat pool bathrobe awning wiring plumbing "
-    "piping lighting bedding carving flooring siding scaffolding wrap weld cover lift jack clip clamp peg grip splash "
-    "seal strap latch hatch winch hoist crane drop iron polish spray paint oil grease wax trap track guard guide "
-    "print sketch note stock pack file pass switchgear stick mail patch emergency building house apartment head cream "
-    "weight suit eye ear nose mouth hand foot finger knee neck eyewash age"
+    "glass spoon sponge dish grill orange milk water book document monitor headphones light watch tape painting plant "
+    "rock puddle sand litter dust stain spill recycling cart truck sign post switch plug handle vent pump hammer "
+    "drill saw nail screw bolt hose mop vacuum brush shovel rake block dice frisbee t-shirt tshirt cap jeans dress "
+    "keychain ring tie pedestrian pet animal comb package hook stand electronics supply article belonging valuables "
+    "step crack leak exit dock tag whiteboard ladle whisk yoga sleeping usb drive cd dvd swing slide wheel weed log "
+    "seed tap drain metal spring coil seat pad notepad label stamp coin money cash ticket passport badge lighting "
+    "wrap weld cover lift clip clamp peg grip splash seal strap latch hatch winch hoist drop iron polish spray paint "
+    "oil grease wax trap track guard guide print sketch note pack file pass switchgear stick mail patch building "
+    "house head cream eye hand age"
 )
 NOUNS: Final = (
     _OBJECTS
@@ -228,7 +174,7 @@ ADVERBS: Final = word_set(
     "soon later today tonight tomorrow yesterday sometime sometimes whenever maybe perhaps probably certainly exactly "
     "directly straight precisely about approximately roughly nearly nearby anywhere somewhere together alone "
     "afterwards finally firstly even ever quite rather pretty otherwise therefore however anyway indeed twice "
-    "possible necessary ago overhead only able"
+    "possible necessary ago overhead only able um uh er erm hmm oh"
 )
 # gerunds that begin a compound noun: the charging station, a washing machine
 COMPOUND_GERUNDS: Final = word_set(
@@ -272,12 +218,13 @@ MEASURES: Final = word_set(
     "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lots "
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
     "section suit bit heap batch handful slice lump chunk strip loaf record inventory close-up closeup overview "
-    "weight"
+    "weight content"
 )
 # measures and places that a robot can also be asked to handle: "bring me the list"
 PHYSICAL_MEASURES: Final = word_set("picture photo photograph map list model record sample copy")
 # places that are also physical objects, unless "in" or "to" precedes them
 PHYSICAL_PLACES: Final = word_set("home corner site front back")
+PICTURES: Final = word_set("picture photo photograph image painting drawing poster portrait sketch")
 BUILDINGS: Final = word_set("building house apartment")
 # spaces around the robot, which state a context and no anchor; other rooms of the lexicon are objects
 _SPACES: Final = (ROOMS - word_set("closet elevator staircase street sidewalk lawn driveway laundry")) | word_set(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from gausslite.domain.task import Predicate, Superlative, TargetRole
+from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, phrase_from_text
-from gausslite.task.graph_draft import GraphDraft, RelationTerms
-from gausslite.task.lexicon import SUPERLATIVES, word_set
+from gausslite.task.graph_draft import Clause, GraphDraft, RelationAssigner, RelationTerms
+from gausslite.task.lexicon import word_set
 from gausslite.task.verbs import (
     ATTACHING_VERBS,
     AVOIDING_VERBS,
@@ -20,6 +20,7 @@ from gausslite.task.verbs import (
     GIVING_VERBS,
     GO_VERBS,
     INSPECTION_VERBS,
+    LEAVING_VERBS,
     LOOKING_VERBS,
     MOVING_VERBS,
     PLACE_VERBS,
@@ -30,109 +31,17 @@ from gausslite.task.verbs import (
     TOOL_VERBS,
 )
 
-
-class Clause:
-    """The objects a verb acts on, the candidates for "it" (referents), and places still without an object.
-
-    places: the destinations or tools named last, which further places describe. terms: of the latest preposition.
-    superlative: "nearest" or "farthest" before the latest object. conjoined: the latest object followed
-    a conjunction. by_pronoun: the objects come from "it" or "them". adds_place: the preposition follows a conjunction.
-    route: the clause mentions a path. skip_of_phrase: the next "of" continues a noun that names no object.
-    """
-
-    def __init__(self, verb: str | None = None, referents: list[str] | None = None) -> None:
-        self.verb = verb
-        self.referents = referents or []
-        self.objects: list[str] = []
-        self.pending_places: list[tuple[RelationTerms, NounPhrase]] = []
-        self.last_relation: str | None = None
-        self.terms = RelationTerms("near")
-        self.places: list[str] = []
-        self.superlative: str | None = None
-        self.statement = False
-        self.conjoined = False
-        self.is_part = False
-        self.between = False
-        self.in_space = False
-        self.preposition = ""
-        self.adds_place = False
-        self.current_place = False
-        self.by_pronoun = False
-        self.follows_statement = False
-        self.route = False
-        self.skip_of_phrase = False
-        self.inherited_conjoined = False
-        self.inherited_preposition: str | None = None
-        self.nouns_since_negation = 0
-        self.verb_since_negation = False
-
-
-class RelationAssigner:
-    """Add the relations of the current clause to a draft."""
-
-    def __init__(self, draft: GraphDraft) -> None:
-        self._draft = draft
-        self.clause = Clause()
-
-    def relate(self, relation: str, noun: NounPhrase) -> None:
-        """Relate the clause's objects to the noun; a place named before any object is kept for the next object."""
-        self.relate_by(RelationTerms(relation, self.clause.terms.negated, self.clause.terms.bounds), noun)
-
-    def relate_by(self, terms: RelationTerms, noun: NounPhrase) -> None:
-        """Relate the clause's objects by complete terms, as `relate` does."""
-        clause = self.clause
-        clause.last_relation = terms.relation
-        clause.in_space = self._is_context(terms, noun)
-        if not clause.objects:
-            clause.pending_places.append((terms, noun))
-        elif clause.in_space:
-            self._draft.add_context(noun.text)
-        else:
-            self._draft.add_relation(terms, clause.objects, noun.text)
-
-    def relate_places(self, terms: RelationTerms, noun: NounPhrase) -> None:
-        """Relate the destinations or tools named last: "put it on the table by the window"."""
-        if self._is_context(terms, noun):
-            self._draft.add_context(noun.text)
-        else:
-            self._draft.add_relation(terms, self.clause.places, noun.text)
-
-    def _is_context(self, terms: RelationTerms, noun: NounPhrase) -> bool:
-        is_context = terms.relation == "inside" and lexicon.is_space(noun.words)
-        if is_context and terms.negated:
-            self._draft.warnings.append(f"not in {noun.text!r}: a place is not evaluated, the exception is dropped")
-        return is_context
-
-    def is_extreme(self, pending: str) -> bool:
-        """Return True for "the nearest chair to", "the farthest cone from"."""
-        superlative = SUPERLATIVES.get(self.clause.superlative or "")
-        is_farthest = superlative is Superlative.FARTHEST and pending == "from"
-        return bool(self.clause.objects) and (is_farthest or (superlative is not None and pending == "to"))
-
-    def relate_extreme(self, noun: NounPhrase) -> None:
-        """Relate the clause's objects as the nearest or farthest to the noun."""
-        clause = self.clause
-        word = clause.superlative or ""
-        for phrase in list(clause.objects):
-            self.rename(phrase, " ".join(part for part in phrase.split() if part != word))
-        farthest = SUPERLATIVES[word] is Superlative.FARTHEST
-        clause.superlative = None
-        self.relate(Predicate.FARTHEST_FROM if farthest else Predicate.CLOSEST_TO, noun)
-
-    def rename(self, phrase: str, new: str) -> None:
-        """Change the description of an object that the sentence has named."""
-        self._draft.rename(phrase, new)
-        for phrases in (self.clause.objects, self.clause.referents, self.clause.places):
-            phrases[:] = [new if known == phrase else known for known in phrases]
-
-
 _ORIGIN_RELATIONS: Final = {f"from_{place}": place for place in ("on", "under", "inside", "behind", "near")}
 # after "on the table" these state the destination; other prepositions locate the table
 _FINAL_DESTINATIONS: Final = word_set("on inside")
-_DESTINATION_RELATIONS: Final = word_set("to on inside near under behind in_front_of above between left_of right_of")
+_DESTINATION_RELATIONS: Final = word_set(
+    "to on inside near under behind in_front_of above between left_of right_of past"
+)
 # both objects of these verbs are targets
 _PAIRING_VERBS: Final = word_set("compare swap exchange")
 _ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
+# with a room: where the robot goes through
+_CROSSING_VERBS: Final = LEAVING_VERBS | (GO_VERBS - REACHING_VERBS - COVERING_VERBS)
 _PASSING_RELATIONS: Final = word_set("past beyond")
 
 
@@ -191,7 +100,9 @@ class RoleAssigner:
             pending, conjoined = clause.inherited_preposition, clause.inherited_conjoined
             clause.skip_of_phrase, clause.inherited_preposition = False, None
         if pending is None:
-            if conjoined and clause.last_relation is not None and self._is_second_anchor(noun, after):
+            if lexicon.is_space(noun.words) and clause.verb in _CROSSING_VERBS:
+                self._draft.add_context(noun.text)
+            elif conjoined and clause.last_relation is not None and self._is_second_anchor(noun, after):
                 self._add_anchor(clause.last_relation, noun)
             elif self._is_recipient(following):
                 self._add_destination(noun)
@@ -223,12 +134,12 @@ class RoleAssigner:
             self._assign_path_end(noun)
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
             self._relations.relate("near", noun)
-        elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS:
+        elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS - PLACE_VERBS:
             self._draft.add_target(noun.text)
         elif clause.preposition in _ROUTE_PREPOSITIONS and clause.verb in DELIVERY_VERBS and not clause.objects:
             self.target(noun, TargetRole.OBJECT)  # "lead me around the puddle"
         elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
-            self.target(noun, TargetRole.OBJECT, conjoined=True)
+            self._assign_waypoint(noun, conjoined=True)
         elif pending == "with" and clause.terms.negated and clause.places:
             self._draft.exclude(noun.text)  # "with the sponge, not with the towel"
         elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
@@ -258,8 +169,11 @@ class RoleAssigner:
                 self._make_places_targets()  # "stop behind the car near the tree"
             self._relations.relate(pending, noun)
 
-    def _assign_waypoint(self, noun: NounPhrase) -> None:
-        self.target(noun, TargetRole.OBJECT)
+    def _assign_waypoint(self, noun: NounPhrase, conjoined: bool = False) -> None:
+        if lexicon.is_space(noun.words):
+            self._draft.add_context(noun.text)
+        else:
+            self.target(noun, TargetRole.OBJECT, conjoined)
         self.clause.route = True
 
     def _assign_path_end(self, noun: NounPhrase) -> None:
@@ -284,7 +198,7 @@ class RoleAssigner:
         return clause.verb in PLACE_VERBS and not clause.current_place and self._is_final_place(pending, following)
 
     def _is_route_point(self, pending: str) -> bool:
-        return pending == "past" and self.clause.verb in GO_VERBS and bool(self.clause.objects)
+        return pending == "past" and self.clause.verb in GO_VERBS | STOPPING_VERBS
 
     def _add_anchor(self, relation: str, noun: NounPhrase) -> None:
         if relation == "to":
@@ -321,14 +235,19 @@ class RoleAssigner:
         if clause.last_relation == "to" and clause.places and (is_part or not self._may_be_tool(noun)):
             self._relations.relate_places(RelationTerms("near"), noun)
         elif (
-            clause.verb in LOOKING_VERBS
-            or is_part
+            is_part
             or self._are_people(clause.objects)
-            or (clause.verb in FETCHING_VERBS and noun.head not in lexicon.HELD_TOOLS)
+            or (clause.preposition == "with" and not clause.by_pronoun and self._describes_with(noun))
         ):
             self._relations.relate("near", noun)
         else:
             self._add_tool(noun)
+
+    def _describes_with(self, noun: NounPhrase) -> bool:
+        verb = self.clause.verb
+        if verb is None or verb in LOOKING_VERBS:
+            return True
+        return verb in FETCHING_VERBS | GIVING_VERBS | DELIVERY_VERBS and noun.head not in lexicon.HELD_TOOLS
 
     def _may_be_tool(self, noun: NounPhrase) -> bool:
         return self.clause.verb in TOOL_VERBS or noun.head in lexicon.HELD_TOOLS
@@ -398,6 +317,8 @@ class RoleAssigner:
         if clause.route or not clause.objects or clause.verb in GO_VERBS - MOVING_VERBS:
             going = clause.route or clause.verb is None or clause.verb in GO_VERBS | STOPPING_VERBS | DELIVERY_VERBS
             role = TargetRole.DESTINATION if going else TargetRole.OBJECT
+            if clause.verb in REACHING_VERBS:  # "climb the ladder to the attic"
+                self._draft.roles.update(dict.fromkeys(clause.objects, TargetRole.OBJECT))
             self.target(noun, role, conjoined=bool(clause.objects))
             clause.route = False
         else:
@@ -422,17 +343,17 @@ class RoleAssigner:
 
     def _assign_after_of(self, noun: NounPhrase) -> None:
         clause = self.clause
-        if clause.pending_places:
-            return
-        if not clause.objects:
+        if not clause.objects and not clause.pending_places:
             self.target(noun, self._role_of_object())
         elif lexicon.is_space(noun.words):
             self._draft.add_context(noun.text)
-        elif (clause.is_part or noun.has_determiner) and clause.last_relation is None:
+        elif clause.last_relation in ("to", "with") and clause.places:
+            self._relations.relate_places(RelationTerms("near"), noun)
+        elif clause.is_part or noun.has_determiner:
             self._relations.relate("near", noun)
 
     def _assign_origin(self, pending: str, noun: NounPhrase) -> None:
-        going = self.clause.verb in GO_VERBS - MOVING_VERBS and self.clause.objects
+        going = self.clause.verb in GO_VERBS - MOVING_VERBS - SEARCH_VERBS
         if going or self.clause.last_relation == "with":
             return
         if pending in _ORIGIN_RELATIONS:

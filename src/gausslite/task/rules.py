@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -9,14 +10,17 @@ from typing import Final
 
 from gausslite.config.option import check_options, option
 from gausslite.domain.errors import InvalidInputError, TaskError
-from gausslite.domain.task import EXAMPLE, TaskGraph, require_task_text
+from gausslite.domain.task import EXAMPLE, TargetRole, TaskGraph, require_task_text
 from gausslite.task.chunk import Chunk, ChunkKind
 from gausslite.task.chunker import chunk_sentence
 from gausslite.task.graph_builder import build_draft
+from gausslite.task.graph_draft import GraphDraft
 from gausslite.task.grounding import ParsedPhrases, TaskParser, grounded_graph, normalise_text
 from gausslite.task.language.parsers import LanguageModel
-from gausslite.task.tokens import comparisons
+from gausslite.task.tags import is_english
+from gausslite.task.tokens import comparisons, tokenize
 
+_CODE: Final = re.compile(r"[{}\[\]<=|\\$*]|(?<![-=])>|\w\(|&&|^import ")
 RESPONSE_FORMATS: Final = ("json_schema", "json_object", "none")
 
 
@@ -125,6 +129,8 @@ class RuleParser:
         draft.warnings += [
             f"{comparison!r} is not understood: it is dropped" for comparison in comparisons(normalise_text(text))
         ]
+        if _loses_negation(chunks, draft):
+            draft.warnings.append("a negation is not understood: it is dropped")
         parsed = ParsedPhrases(
             targets={target: draft.roles[target] for target in draft.targets},
             anchors=draft.anchors,
@@ -137,9 +143,20 @@ class RuleParser:
         return grounded_graph(text, parsed, draft)
 
 
+def _loses_negation(chunks: list[Chunk], draft: GraphDraft) -> bool:
+    """Return True if the sentence negates something and neither the graph nor a warning says so."""
+    negates = any(chunk.kind is ChunkKind.NEGATION or chunk.negated for chunk in chunks)
+    is_stated = draft.warnings or draft.excluded or TargetRole.OBSTACLE in draft.roles.values()
+    return negates and not is_stated and not any(relation.negated for relation in draft.relations)
+
+
 def _require_structure(text: str, chunks: list[Chunk]) -> None:
-    """Raise TaskError for unknown words alone; with a verb, an article or a preposition they may be rare objects."""
+    """Raise TaskError for code, for mostly unknown words, as in another language, and for unknown words alone."""
     nouns = [chunk.noun for chunk in chunks if chunk.noun is not None]
+    words = [word for word in tokenize(normalise_text(text)) if word[0].isalpha()]
+    unknown = [word for word in words if not is_english(word)]
+    if _CODE.search(text) or (len(words) > 2 and 2 * len(unknown) > len(words)):
+        raise TaskError(_no_object_message(text, ()))
     has_structure = any(chunk.kind in (ChunkKind.VERB, ChunkKind.PREPOSITION) for chunk in chunks)
     if not has_structure and not any(noun.is_known or noun.has_determiner for noun in nouns):
         raise TaskError(_no_object_message(text, ()))

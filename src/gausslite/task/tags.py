@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Final
 
+from gausslite.domain.nouns import is_thing
 from gausslite.task import lexicon
 from gausslite.task.lexicon import UNCHANGED, is_attribute, singular, word_set
 from gausslite.task.tokens import PREPOSITIONS, split_bounds
 from gausslite.task.verbs import (
     GO_VERBS,
     SEARCH_VERBS,
+    STOPPING_VERBS,
     TOOL_VERBS,
     VERBS,
     base_of_ed,
@@ -55,7 +57,7 @@ _COSTS: Final = """
    n  a  d  v  g  e  x  p  t  u  c  s  w  o  i  k  q  .
 ^ 10 10  0  0 10 30  0 10 20 10 20 10 10  0  0 10  0  5
 n  8 20 30 20 10 10  5  0  5  5  0  0  0 20 30 30  0  0
-a  0  3 40 40  8 10 20  7 15 10  5  7 20 30 40 40 20  7
+a  0  3 40 40  8 10 20  7 15 10  5  7 20 30 40 40  5  7
 d  0  0  5 90  7  7 60 20 60 30 30 30 40 50 40 60 40 20
 v  5  5  0 30  8 30 40  0  0  5  5  5 20  0  0  0 10  5
 g  7  7  0 50 30 30 30  0  0 10 10 10 20  5  3  0 20  5
@@ -166,6 +168,11 @@ _NEVER_NOUNS: Final = GO_VERBS | word_set(
     "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
     "know think eat sit seem contain include become lose forget boil"
 )
+# at the start of a clause no things: "stand in front of", "swing left", "stock the shelf"
+_MOTIONS: Final = GO_VERBS | STOPPING_VERBS | word_set("turn pass")
+_ARTICLES: Final = frozenset({"a", "an", "the", "my", "your", "every"})
+_OPENERS: Final = frozenset({"", ",", ".", ";", "and", "then"})
+_TURNS: Final = word_set("left right around back up down forward backward straight here there")
 _POSSESSIVES: Final = ("'s", "s'")
 _NOUNS: Final = (
     lexicon.NOUNS
@@ -216,6 +223,11 @@ def _tag_options(before: str, word: str, after: str) -> Options:
         return {Tag.ADJECTIVE: 0}
     if before == "without" and base_of_ing(word) is not None:
         return {Tag.GERUND: 0}
+    if before in _OPENERS and (
+        (word in _MOTIONS and (after in PREPOSITIONS or after in _TURNS))
+        or (word in VERBS and after in lexicon.DETERMINERS and word not in _CLOSED)
+    ):
+        return {Tag.VERB: 0}
     if word == "one" and after in _MODALS_AFTER_ONE:
         return {Tag.PRONOUN: 0}
     if after == "of" and word in ("one", "half"):
@@ -223,13 +235,17 @@ def _tag_options(before: str, word: str, after: str) -> Options:
     closed = _CLOSED.get(split_bounds(word)[0])
     if closed is not None:
         return closed
+    if after in lexicon.DETERMINERS and base_of_ing(word) is not None:
+        return {Tag.GERUND: 0}  # "cleaning the floors"
     if word[0].isdigit():
         return {Tag.DETERMINER: 0, Tag.NOUN: 5}
     if word.endswith(_POSSESSIVES) and len(word) > 3:
         return {Tag.ADJECTIVE: 0, Tag.DETERMINER: 0}
-    is_noun = singular(word) in _NOUNS or word in _NOUNS or word in UNCHANGED
+    if before in _ARTICLES and (not after or after in PREPOSITIONS) and not _describes(word):
+        return {Tag.NOUN: 0}  # "the led"
+    is_noun = _is_noun(word)
     options = _verb_options(before, word, is_noun)
-    if word in lexicon.ADJECTIVES or is_attribute(word):
+    if _describes(word):
         options[Tag.ADJECTIVE] = 0
     if is_noun:
         options[Tag.NOUN] = 5 if before == "to" and word in _USUALLY_VERBS else 0
@@ -242,6 +258,23 @@ def _tag_options(before: str, word: str, after: str) -> Options:
             Tag.VERB: 40,
         }
     return options
+
+
+def _describes(word: str) -> bool:
+    return word in lexicon.ADJECTIVES or is_attribute(word)
+
+
+def _is_noun(word: str) -> bool:
+    """Return True for a noun of the word lists, and of the vocabulary if it is no form of a known verb."""
+    if singular(word) in _NOUNS or word in _NOUNS or word in UNCHANGED:
+        return True
+    return is_thing(singular(word)) and verb_base(word) is None and not _describes(word)
+
+
+def is_english(word: str) -> bool:
+    """Return True for a word of the closed classes, the word lists or the vocabulary of nouns."""
+    known = word in _CLOSED or is_adverb(word) or _describes(word) or verb_base(word) is not None
+    return known or singular(word) in _NOUNS or is_thing(singular(word)) or word.endswith(_POSSESSIVES)
 
 
 def _noun_cost_of_verb(before: str, word: str) -> int:
@@ -257,7 +290,7 @@ def _verb_options(before: str, word: str, is_noun: bool) -> Options:
     if word in VERBS:
         usual = not is_noun or (word in _USUALLY_VERBS and (before == "to" or (before == "and" and word in GO_VERBS)))
         options[Tag.VERB] = 0 if usual else 5 if word in _USUALLY_VERBS else 12
-        if before in _NOUNS:  # "the cup bring": a singular noun is not the verb's subject
+        if _is_noun(before):  # "the cup bring": a singular noun is not the verb's subject
             options[Tag.VERB] += 8
     elif base_of_s(word) is not None:
         options[Tag.VERB] = 2 if not is_noun else 8 if base_of_s(word) in _USUALLY_VERBS else 18

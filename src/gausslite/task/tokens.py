@@ -109,6 +109,9 @@ def _number(text: str) -> float:
     return value + 0.5 * bool(and_a_half)
 
 
+_PLACED: Final = (
+    r"(?:(?:to|on) the (?:left|right)|in front|on top) of|next to|(?:above|below|under|behind|beside|near|in|on)"
+)
 _NUMBER: Final = r"(?:a few|a couple of|several|some|at least|about|one|two|three|four|five|half an?|a|\d+)"
 _LENGTH: Final = r"(?:met(?:er|re)s?|feet|foot|steps?|cm|m|inch(?:es)?|paces?|yards?|centimet(?:er|re)s?)"
 _IDIOMS_DISTANCE: Final = rf"{_NUMBER}(?: (?:one|two|three|a|\d+))? {_LENGTH}"
@@ -120,6 +123,17 @@ _PLAIN: Final = {
     rf"at (?:least|most)(?= (?:one|two|three|four|five|six|seven|eight|nine|ten|\d+) (?!{_LENGTH}\b))": "",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
+    # "a cabinet, above it is a lamp"
+    rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
+    r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
+    rf"(?:which|what) ([\w ]{{2,40}}?) (?:is|are) ([\w ]{{2,40}}?) ({_PLACED})$": r"find the \1 and \2 \3 the \1",
+    r"(?:facing|looking at) ([\w ]{2,40}),": r"there is \1;",
+    r"(?:and|but) (is|are|has)(?= (?:not|no|on|in)\b)": r"and which \1",
+    r"but (the [\w ]+?) (?:should|must|can|has to) (?:stay|remain)(?: \w+)*": r"but do not touch \1",
+    r"nothing (?:but|except|other than)": "",
+    r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)": "",
+    r"until you (?:are|stand)(?= (?:between|next|in|beside|near|at|by|under|behind)\b)": "and stop",
+    r"(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
     # a double negation is a request
     r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
@@ -129,7 +143,6 @@ _PLAIN: Final = {
     r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor (on|in|inside|under|near|behind|at|above)": (
         r"not \1 \2 and not \3"
     ),
-    r"face[ -](?:down|up)": "",
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)": "i see",
     r"back(?= where\b)": "",
     r"(?:so|as|very|quite|too) well": "",
@@ -139,22 +152,16 @@ _PLAIN: Final = {
     r"(where|how|what|who)'d": r"\1 did",
     r"u": "you",
     r"take (?:a|two|three|\d+) (?:\w+ )?steps?": "go",
-    r"sth|smth": "something",
-    r"(?:step|task|item|phase) \d+ ?[:.)]": ";",
     r"(?:there is )?no need to": "do not",
     r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
-    r"gimme": "give me",
-    r"lemme": "let me",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
     # light verbs, whose noun carries the meaning
     r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
-    r"(?:take|make) (?:a )?note of|take stock of": "look at",
     r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
-    r"(?:take|get) (?:good )?(?:care|hold) of": "handle",
     r"(?:make|find) (?:your|its) way(?= (?:to|towards?|into|through|past|out|back)\b)": "go",
     r"be careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|take care not to": "do not",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
@@ -164,14 +171,13 @@ _PLAIN: Final = {
     r"not (?:\w+ )?far (?:away )?from": "near",
     r"(?:farthest|furthest|most distant) away(?! from)|most distant(?! from)": "farthest",
     r"with no(?= \w)": "without",
+    r"(?:\w+ (?:floor|level|story)) (?=(?:\w+room|kitchen|office|hallway)\b)": "",
     r"(?:ground|first|second|third|fourth|top|upper|lower|next|\d+(?:st|nd|rd|th)) floor\b"
     r"(?! (?:tile|lamp|mat|plan|board))": "storey",
     r"(\w+)-colou?red": r"\1",
     r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
     r"right(?= (?:next|beside|behind|under|above|in front|by|inside|at|below|between|on top)\b)": "",
-    r"in (?:a|one) (?:\w+ )?(?:row|line|pile|stack|heap|circle)": "",
     r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
-    r"give (?:\w+ )?priority to|prioriti[sz]e|spend (?:\w+ )*?(?:time|effort|budget) on": "look at",
     r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
     r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
@@ -200,6 +206,15 @@ _LEAVE_ALONE: Final = re.compile(
 )
 
 
+# "the cup (the red one)"
+_BRACKETS: Final = re.compile(r"(\w+),? \((?:the |an? )?((?:\w+ )??\w+?)(?: ones?)?\)")
+
+
+def _described_before(match: re.Match[str]) -> str:
+    described = all(word in lexicon.ADJECTIVES or lexicon.is_attribute(word) for word in match[2].split())
+    return f"{match[2]} {match[1]}" if described else match[0]
+
+
 def comparisons(text: str) -> list[str]:
     """Return the comparisons of a normalised text, such as "taller than one metre", which no graph states."""
     return [match[0] for match in _COMPARISON.finditer(text)]
@@ -209,6 +224,7 @@ def replace_idioms(text: str) -> str:
     """Return a normalised sentence with idioms replaced."""
     text = _ARROW.sub(" to ", text)
     text = _LEAVE_ALONE.sub(r"do not touch \1", text)
+    text = _BRACKETS.sub(_described_before, text)
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
     text = _COMPARISON.sub("", text)

@@ -9,7 +9,7 @@ from gausslite.task.lexicon import word_set
 GO_VERBS: Final = word_set(
     "go navigate drive move walk head proceed travel come approach reach follow cross enter exit return run roll fly "
     "advance get steer park dock explore patrol roam tour wander visit escort hurry rush climb descend crawl cruise "
-    "swim sail land jog race ascend"
+    "swim sail land jog race ascend continue reverse veer step swing circle swerve back"
 )
 CARRY_VERBS: Final = word_set(
     "bring take carry deliver fetch hand pass give transport haul transfer relocate send shift drag push pull slide "
@@ -20,7 +20,9 @@ PLACE_VERBS: Final = word_set(
     "put place set drop leave stack hang throw load insert pour store stow deposit unload position arrange rest dump "
     "toss lay pile plant tuck slip stick wedge shove stuff cram squeeze sprinkle spread scatter bury park fling hurl "
     "lean prop return pack file deploy install transplant tip slide hide ladle scoop spoon funnel drain discard "
-    "recycle stash lodge drape embed immerse dip suspend fit pop"
+    "recycle stash lodge drape embed immerse dip suspend fit pop serve "
+    # what happens in a place: "warm the mug in the microwave"
+    "heat warm cook bake boil fry toast roast microwave chill cool freeze thaw soak keep"
 )
 TOOL_VERBS: Final = word_set(
     "clean wipe vacuum sweep mop wash scrub dust polish rinse disinfect sanitize sanitise tidy brush dry sterilize "
@@ -35,8 +37,10 @@ LOOKING_VERBS: Final = (
     SEARCH_VERBS | GO_VERBS | word_set("find locate identify detect spot map reconstruct photograph count track avoid")
 )
 # with and without an object: "move to the chair", "move the chair to the door"
-MOVING_VERBS: Final = word_set("move roll run advance return get land park dock drive fly race")
+MOVING_VERBS: Final = word_set("move roll run advance return get land park dock drive fly race swing back reverse")
 # "stop behind the car": the car is the target
+# a room that the robot leaves or crosses
+LEAVING_VERBS: Final = word_set("exit leave cross pass traverse")
 STOPPING_VERBS: Final = word_set("stop wait stand stay sit park halt pause hover")
 # "hand the nurse the towel": the first noun is the recipient
 GIVING_VERBS: Final = word_set(
@@ -208,7 +212,7 @@ def is_particle(verb: str, word: str) -> bool:
     """Return True if the word belongs to the verb: "on" in "turn on the lamp", "at" in "look at the lamp"."""
     if word in ("on", "in"):
         return verb in _TAKES_AN_OBJECT or (word == "on" and verb in _SWITCHED_ON)
-    return word in _PARTICLES
+    return word in _PARTICLES and not (word in ("into", "onto") and verb in GO_VERBS)
 
 
 def _stem(stem: str) -> str | None:

@@ -51,9 +51,10 @@ def score_lines(score: ParserScore) -> str:
         f"{score.backend}: {score.sentences} sentences, exact graphs {score.exact:.1%}, "
         f"targets {score.target_set:.1%}, anchors {score.anchor_set:.1%}",
         f"  roles {score.role_set:.1%}, relations {score.relation_set:.1%}, attributes {score.attribute_set:.1%}, "
-        f"excluded objects {score.excluded_set:.1%}; {score.reversed_relations} relations negated wrongly",
+        f"excluded objects {score.excluded_set:.1%}; {len(score.opposites)} opposites without a warning",
         f"  {score.median_ms:.2f} ms per sentence (median), {score.slowest_ms:.2f} ms maximum",
     ]
     if score.by_fallback:
         lines.append(f"  {score.by_fallback} parsed by rules after the backend failed")
+    lines += [f"  opposite: {text}" for text in score.opposites]
     return "\n".join([*lines, *(f"  not exact: {text}" for text in score.wrong)])

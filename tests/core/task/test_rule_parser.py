@@ -19,6 +19,7 @@ from gausslite_bench.parser_scores import load_sentences, matching_parts, score_
 SENTENCES = load_sentences()
 PAPER_SENTENCES = 6
 DAILY_TASKS = Path(__file__).with_name("daily_tasks.json")
+FIRST_SIGHT = Path(__file__).with_name("first_sight")
 
 
 @pytest.mark.parametrize("expected", SENTENCES[:PAPER_SENTENCES], ids=lambda graph: graph.text)
@@ -31,7 +32,15 @@ def test_graphs_of_ordinary_sentences_are_exact():
     print(f"exact graphs: {score.exact:.1%} of {score.sentences}; wrong: {score.wrong}")
     assert score.sentences >= 600
     assert score.exact >= 0.95, score.wrong
-    assert score.reversed_relations == 0
+    assert score.opposites == ()
+
+
+@pytest.mark.parametrize("path", sorted(FIRST_SIGHT.glob("*.json")), ids=lambda path: path.stem)
+def test_no_sentence_of_a_foreign_set_is_read_as_its_opposite(path):
+    score = score_parser("rules", RuleParser(), load_sentences(path))
+    print(f"exact graphs: {score.exact:.1%} of {score.sentences}; wrong: {score.wrong}")
+    assert score.opposites == ()
+    assert score.exact >= 0.6
 
 
 @pytest.mark.parametrize("expected", load_sentences(DAILY_TASKS), ids=lambda graph: graph.text)
@@ -247,6 +256,11 @@ def test_pictures_maps_and_lists_are_objects_where_the_robot_handles_them(text, 
     assert (graph.targets, graph.anchors) == (targets, anchors)
 
 
+FOREIGN = (
+    "Bringe mir bitte die rote Tasse vom Tisch", "Nimm den Becher", "Ramasse la tasse rouge sur la table",
+    "recoge la taza de la mesa", "print('hello world')", "SELECT * FROM tasks", "rm -rf / && echo cup",
+    "for i in range(3): move(i)", "import numpy as np",
+)  # fmt: skip
 NO_OBJECT = ("", "   ", "asdf qwer", "pick up", "go and clean", "!?!", "12 34", "please", "Ignore the vase", "red")
 MANY = [f"{colour} {noun}" for colour in ("red", "blue", "green") for noun in sorted(COMMON_ANCHORS)[:6]]
 
@@ -254,7 +268,7 @@ MANY = [f"{colour} {noun}" for colour in ("red", "blue", "green") for noun in so
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        *((text, r"expected .* names an object, such as") for text in NO_OBJECT),
+        *((text, r"expected .* names an object, such as") for text in (*NO_OBJECT, *FOREIGN)),
         ("find the m\udcffg", "expected UTF-8"),
         ("a" * 1001, "at most 1000 characters, got 1001"),
         (f"Find the {', the '.join(MANY)}", "at most 16 objects, got 18"),

@@ -1,0 +1,96 @@
+"""Write src/gausslite/domain/nouns.txt, the nouns of things that can be seen, from the files of WordNet 3.0.
+
+    python3 tools/noun_vocabulary.py /usr/share/wordnet LICENSE_OF_WORDNET > src/gausslite/domain/nouns.txt
+
+The folder is that of the Debian package wordnet-base; the licence is the text that its copies must contain.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+# lexicographer files of things that can be seen, in the order in which a task means them
+KINDS = {6: "artifact", 13: "food", 20: "plant", 5: "animal", 8: "body", 17: "object", 27: "substance", 18: "person"}
+# all nouns of these kinds; of the others, those that occur in WordNet's tagged texts
+COMPLETE = (6, 13)
+MAX_WORDS = 3
+
+
+def main(folder: Path, licence: Path) -> None:
+    """Print the licence as comments, then one line per synset: the lines of its hypernyms, and its words."""
+    synsets = read_synsets(folder)
+    order = sense_order(folder, synsets)
+    kept = kept_words(folder, synsets)
+    used: dict[str, None] = {}
+    for offset in kept:
+        visit(offset, synsets, used)
+    line_of = {offset: number for number, offset in enumerate(used)}
+    print(
+        "# Nouns of things that can be seen, from WordNet 3.0 (tools/noun_vocabulary.py), one set of synonyms a line:"
+    )
+    print(
+        "# the numbers of the lines of its hypernyms, counted from 0, and its words; * marks a word with another first"
+    )
+    print("# meaning. The licence of WordNet:\n#")
+    print("\n".join(f"# {line}".rstrip() for line in licence.read_text().splitlines()))
+    for offset in used:
+        words = ",".join(
+            word.replace("_", " ") + ("" if order[word][0] == offset else "*") for word in kept.get(offset, ())
+        )
+        print(" ".join(str(line_of[above]) for above in synsets[offset][2]), words, sep="|")
+
+
+def read_synsets(folder: Path) -> dict[str, tuple[int, list[str], list[str]]]:
+    """Return the kind, the words and the hypernyms of each synset that is no instance, such as a town."""
+    synsets = {}
+    for line in (folder / "data.noun").read_text().splitlines():
+        if line.startswith("  "):
+            continue
+        fields = line.partition("|")[0].split()
+        count = int(fields[3], 16)
+        pointers = fields[5 + 2 * count :]
+        hypernyms = [pointers[at + 1] for at in range(0, len(pointers), 4) if pointers[at] == "@"]
+        if "@i" not in pointers:
+            synsets[fields[0]] = int(fields[1]), fields[4 : 4 + 2 * count : 2], hypernyms
+    return synsets
+
+
+def sense_order(folder: Path, synsets: dict[str, tuple[int, list[str], list[str]]]) -> dict[str, list[str]]:
+    """Return the synsets of each word: things before persons, then the more frequent first."""
+    kinds, order = list(KINDS), {}
+    for line in (folder / "index.noun").read_text().splitlines():
+        if not line.startswith("  "):
+            fields = line.split()
+            senses = [at for at in fields[-int(fields[2]) :] if at in synsets and synsets[at][0] in KINDS]
+            order[fields[0]] = sorted(senses, key=lambda at: kinds.index(synsets[at][0]))
+    return order
+
+
+def kept_words(folder: Path, synsets: dict[str, tuple[int, list[str], list[str]]]) -> dict[str, list[str]]:
+    """Return the words of each synset that a task may name."""
+    frequency: Counter[str] = Counter()
+    for line in (folder / "cntlist.rev").read_text().splitlines():
+        key, _, count = line.split()
+        frequency[key.partition("%")[0]] += int(count)
+    kept: dict[str, list[str]] = {}
+    for offset, (kind, words, _) in synsets.items():
+        if kind in KINDS:
+            named = [word for word in words if word == word.lower() and word.count("_") < MAX_WORDS]
+            named = [word for word in named if kind in COMPLETE or frequency[word]]
+            if named:
+                kept[offset] = named
+    return kept
+
+
+def visit(offset: str, synsets: dict[str, tuple[int, list[str], list[str]]], used: dict[str, None]) -> None:
+    """Add a synset after its hypernyms."""
+    if offset not in used:
+        for above in synsets[offset][2]:
+            visit(above, synsets, used)
+        used[offset] = None
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
