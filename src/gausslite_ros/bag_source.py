@@ -345,16 +345,21 @@ class BagSource:
         return {}
 
     def _read_cameras(self, tree: TransformTree, first_ns: int) -> RgbdCamera:
-        options = self._options
         colour = self._read_colour_camera()
+        if colour.depth_registered is not None and not self._options.aligned:
+            self._options = replace(self._options, aligned="yes" if colour.depth_registered else "no")
+        options = self._options
         if is_aligned(options, self._depth.name, self._depth.frame, self._colour.frame):
             return join_cameras(colour, self._read_aligned_camera(colour), np.eye(4), options.axes)
         depth = self._read_camera(self._depth, options.depth_info, "depth_info")
-        T = tree.at(options.camera or self._colour.frame, self._depth.frame, first_ns / 10**9)
+        try:
+            T = tree.at(options.camera or self._colour.frame, self._depth.frame, first_ns / 10**9)
+        except DatasetError as error:
+            raise DatasetError(f"{error}; if depth is aligned to colour, state aligned=yes") from None
         if T is None:
             raise DatasetError(
                 f"{self._bag.path}: tf: no transform from {self._depth.frame!r} to {self._colour.frame!r} at the "
-                "time of the first colour image; expected it in tf_static"
+                "time of the first colour image; expected it in tf_static, or aligned=yes if depth is aligned to colour"
             )
         if not options.aligned:
             require_own_camera(f"{self._bag.path}: {self._depth.name}", colour, depth, T)

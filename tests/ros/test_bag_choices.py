@@ -157,7 +157,7 @@ def test_the_advice_on_the_unit_of_a_bag_is_one_that_bags_read(tmp_path: Path) -
 def test_a_camera_file_states_intrinsics_lens_and_unit_as_in_a_folder(tmp_path: Path) -> None:
     bag = write_small_bag(tmp_path / "b.mcap", depth=depth_as("16UC1", lambda depth: depth * 5))
     camera = {"w": SIZE[0], "h": SIZE[1], "fx": 25.0, "fy": 25.0, "cx": 15.0, "cy": 12.0, "scale": 5000}
-    lens = {"distortion_model": "plumb_bob", "distortion": [0.1, 0.0, 0.0, 0.0]}
+    lens = {"distortion_model": "plumb_bob", "distortion": [0.1, 0.0, 0.0, 0.0], "depth_registered": True}
     (tmp_path / "camera.json").write_text(json.dumps({"camera": camera | lens}))
     address = BagAddress.parse(f"bag:{bag}?camera_file={tmp_path / 'camera.json'}")
     assert address is not None
@@ -193,6 +193,18 @@ def test_depth_beside_colour_with_its_intrinsics_is_a_question(tmp_path: Path) -
 @pytest.mark.parametrize("topic", ["/camera/aligned_depth_to_color/image_raw", "/camera/depth_registered/image_raw"])
 def test_the_names_of_aligned_depth_are_known(tmp_path: Path, topic: str) -> None:
     require_small_bag(frames_of(write_with_depth_beside(tmp_path / "b.mcap", topic)))
+
+
+def test_depth_without_a_transform_or_camera_may_be_stated_to_be_aligned(tmp_path: Path) -> None:
+    def depth(bag: Writer, i: int) -> None:
+        bag.write("/sensor/depth", IMAGE, time_of(i), image(i, "16UC1", depth_mm_of(i), BESIDE))
+
+    bag = write_small_bag(tmp_path / "b.mcap", depth=depth)
+    with pytest.raises(DatasetError, match="or state aligned=yes"):
+        frames_of(bag)
+    with pytest.raises(DatasetError, match="if depth is aligned to colour, state aligned=yes"):
+        frames_of(f"bag:{bag}?depth_info=/camera/color/camera_info")
+    require_small_bag(frames_of(f"bag:{bag}?aligned=yes"))
 
 
 def test_depth_of_a_camera_of_its_own_is_registered(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> 
     if not source.depth_registered and stated.registration is None and not stated.depth_as_recorded:
         print_message(
             f"{spec}: this layout does not state whether depth is registered to colour; the registration is estimated "
-            f"now, --set register-depth={NONE} uses depth as recorded"
+            f'now; "depth_registered": true in cam_params.json states it, register-depth={NONE} uses depth as it is'
         )
     estimates = ["lens", "shutter"] if stated.correction is None and not source.camera_ideal else []
     estimates += ["errors of the poses"] if stated.pose_prior is None and not source.poses_exact else []

@@ -279,12 +279,14 @@ class FolderCamera:
     """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none.
 
     note: message that names a file of another folder; empty if the camera's file is the recording's own.
+    depth_registered: whether each depth pixel belongs to the colour pixel at its place, None if it is not stated.
     """
 
     camera: Camera
     units_per_metre: float | None = None
     lens: Lens | None = None
     note: str = ""
+    depth_registered: bool | None = None
 
 
 def read_folder_camera(
@@ -339,7 +341,8 @@ def read_matrix(path: Path) -> FileIntrinsics:
 def read_json_camera(path: Path) -> FolderCamera:
     """Return the camera of {"camera": {"w","h","fx","fy","cx","cy","scale"}}, scale: depth units per metre.
 
-    "distortion_model" and "distortion" (a list) may state the lens. Raises DatasetError.
+    "distortion_model" and "distortion" (a list) may state the lens, "depth_registered" (true or false) whether depth
+    belongs to the colour pixels. Raises DatasetError.
     """
     try:
         fields = json.loads(read_text(path))["camera"]
@@ -352,8 +355,13 @@ def read_json_camera(path: Path) -> FolderCamera:
         raise DatasetError(f"{path}: expected a positive depth scale, got {numbers['scale']}")
     if not (np.isfinite(numbers["w"]) and np.isfinite(numbers["h"])):
         raise DatasetError(f"{path}: expected a finite width and height, got {numbers['w']} and {numbers['h']}")
-    intrinsics = FileIntrinsics(numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"])
-    return FolderCamera(intrinsics.camera(str(path), int(numbers["w"]), int(numbers["h"])), numbers["scale"], lens)
+    registered = fields.get("depth_registered")
+    if not isinstance(registered, bool | None):
+        raise DatasetError(f"{path}: depth_registered: expected true or false, got {registered!r}")
+    camera = FileIntrinsics(numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"]).camera(
+        str(path), int(numbers["w"]), int(numbers["h"])
+    )
+    return FolderCamera(camera, numbers["scale"], lens, registered)
 
 
 def read_camera_info(path: Path) -> FolderCamera:

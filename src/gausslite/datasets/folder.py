@@ -165,6 +165,8 @@ class FolderSource:
     _units: DepthUnits
     _up_axis: UpAxis
     _origin = Origin()
+    _layout_has_registered_depth: bool
+    _stated_registered: bool | None = None
 
     def __init__(self, folder: Path) -> None:
         """Subclasses also call `_set_camera` and set `_up_axis`."""
@@ -174,6 +176,7 @@ class FolderSource:
         """Use this camera and its depth units, if it states them."""
         self._camera, self._lens, self._camera_note = found.camera, found.lens, found.note
         self._unit_stated = found.units_per_metre is not None
+        self._stated_registered = found.depth_registered
         self._units = replace(default_units, per_metre=found.units_per_metre or default_units.per_metre)
 
     @property
@@ -205,6 +208,12 @@ class FolderSource:
     def up_axis(self) -> UpAxis:
         """The layout's upward direction, unless the caller gives another."""
         return self._up_axis
+
+    @property
+    def depth_registered(self) -> bool:
+        """What the camera's file states, else what the layout guarantees."""
+        stated = self._stated_registered
+        return self._layout_has_registered_depth if stated is None else stated
 
     @property
     def camera_ideal(self) -> bool:

@@ -31,6 +31,9 @@ class ReplicaSource(NumberedFolderSource):
     Times are the frame numbers at 30 Hz. Raises DatasetError, PoseError.
     """
 
+    _layout_has_registered_depth = True
+    """One camera renders both images."""
+
     def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
         self._results = folder / "results"
@@ -54,11 +57,6 @@ class ReplicaSource(NumberedFolderSource):
     def recognises(folder: Path) -> bool:
         """True if the folder has this layout."""
         return (folder / "traj.txt").is_file() or any((folder / "results").glob("frame??????.*"))
-
-    @property
-    def depth_registered(self) -> bool:
-        """True: one camera renders both images."""
-        return True
 
     def _depth_path(self, number: int) -> Path:
         return self._results / f"depth{number:06d}.png"

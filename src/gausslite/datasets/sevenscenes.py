@@ -39,6 +39,9 @@ class SevenScenesSource(NumberedFolderSource):
     number, or only zeros, are excluded. Times are the frame numbers at 30 Hz. Raises DatasetError.
     """
 
+    _layout_has_registered_depth = False
+    """Colour and depth come from two cameras."""
+
     def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
         self._find_colours(folder, folder.iterdir(), _COLOUR_NAME, "frame-000000.color.png or .jpg")
@@ -59,11 +62,6 @@ class SevenScenesSource(NumberedFolderSource):
         In RedKitchen it differs by 2.5 degrees from the normal of the table, which is 27 degrees off -y.
         """
         return self._up_axis
-
-    @property
-    def depth_registered(self) -> bool:
-        """False: colour and depth come from two cameras."""
-        return False
 
     def _depth_path(self, number: int) -> Path:
         return self._folder / f"frame-{number:06d}.depth.png"

@@ -71,6 +71,9 @@ class TumSource(FolderSource):
     from 0. Raises DatasetError, PoseError.
     """
 
+    _layout_has_registered_depth = True
+    """The layout has registered depth."""
+
     def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
         matches, self._recorded = _associate(folder, require_poses)
@@ -86,11 +89,6 @@ class TumSource(FolderSource):
     def recognises(folder: Path) -> bool:
         """True if the folder has this layout."""
         return (folder / "rgb.txt").is_file() or (folder / "groundtruth.txt").is_file()
-
-    @property
-    def depth_registered(self) -> bool:
-        """True: the layout has registered depth."""
-        return True
 
     @property
     def excluded_frames(self) -> str:

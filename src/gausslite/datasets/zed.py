@@ -39,6 +39,9 @@ class ZedSource(NumberedFolderSource):
     is rectified, and depth belongs to it. Frames without a pose are excluded. Raises DatasetError, PoseError.
     """
 
+    _layout_has_registered_depth = True
+    """The SDK computes depth for the left image."""
+
     def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
         self._find_colours(folder, folder.iterdir(), _COLOUR_NAME, "left000000.png")
@@ -62,11 +65,6 @@ class ZedSource(NumberedFolderSource):
     def up_axis(self) -> UpAxis:
         """-y, unless the caller gives another: the SDK's tracking aligns its world with gravity."""
         return self._up_axis
-
-    @property
-    def depth_registered(self) -> bool:
-        """True: the SDK computes depth for the left image."""
-        return True
 
     def _depth_path(self, number: int) -> Path:
         exact = self._folder / f"depth{number:06d}.npy"

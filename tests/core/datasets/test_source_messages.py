@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from gausslite.cli.main import main
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import open_source
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 
 EXACT = PoseExposurePrior()
@@ -41,12 +43,26 @@ def test_an_estimated_registration_is_reported(tmp_path: Path, capsys: pytest.Ca
         notice, result = capsys.readouterr().err.splitlines()
         assert notice == (
             f"{seven}: this layout does not state whether depth is registered to colour; the registration is estimated "
-            "now, --set register-depth=none uses depth as recorded"
+            'now; "depth_registered": true in cam_params.json states it, register-depth=none uses depth as it is'
         )
         assert result.startswith("register-depth none: registration: expected at least 1000 depth edge points")
     for spec, option in ((seven, NONE), (tum, None), (tum, AUTO)):
         assert calibrate(spec, option, EXACT).registration is None
     assert capsys.readouterr().err == ""
+
+
+def test_a_camera_file_states_that_depth_is_registered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seven, tum = write_seven_scenes(tmp_path / "seq"), write_tum(tmp_path / "fr1")
+    for folder, registered in ((seven, True), (tum, False)):
+        camera: dict[str, object] = {"w": 16, "h": 12, "fx": 20, "fy": 20, "cx": 7.5, "cy": 5.5, "scale": 1000}
+        (folder / "cam_params.json").write_text(json.dumps({"camera": {**camera, "depth_registered": registered}}))
+        assert open_source(str(folder)).depth_registered is registered
+    calibration = calibrate(seven, AUTO, EXACT)
+    assert (calibration.registration, calibration.source.depth_registered) == (None, True)
+    assert capsys.readouterr().err == ""
+    (seven / "cam_params.json").write_text(json.dumps({"camera": {**camera, "depth_registered": "yes"}}))
+    with pytest.raises(DatasetError, match="depth_registered: expected true or false, got 'yes'"):
+        open_source(str(seven))
 
 
 def test_an_estimated_pose_prior_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
