@@ -153,8 +153,8 @@ def choose_colour(bag: BagFile, topics: Sequence[ImageTopic], options: BagOption
         if candidates:
             return _only(bag, candidates, "colour", "color")
     raise DatasetError(
-        f"{bag.path}: expected a topic with colour images ({', '.join(COLOUR_ENCODINGS)}), got {_listed(bag, topics)}; "
-        "choose one with color=TOPIC"
+        f"{bag.path}: expected a topic with colour images, got {_listed(bag, topics)}; choose one with color=TOPIC, of "
+        f"the encodings {', '.join(COLOUR_ENCODINGS)}, or with JPEG or PNG images"
     )
 
 
