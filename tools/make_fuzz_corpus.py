@@ -13,11 +13,10 @@ from google.protobuf.message import Message
 
 from gausslite.codec.json import encode_object_report
 from gausslite.codec.ply import ply_bytes
-from gausslite.codec.stored import encode_free_space, to_records
+from gausslite.codec.stored import to_records
 from gausslite.codec.subset_codec import SubsetCoding, encode_subset
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.frame import Frame
-from gausslite.domain.free_space import BLOCK_VOXELS, FreeSpace
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.pose import Twist
 from gausslite.domain.voxels import (
@@ -58,8 +57,6 @@ def codec_messages() -> Iterator[tuple[str, str, bytes]]:
     """Yield the messages that are decoded without a service."""
     for name, subset, coding in subsets():
         yield "subset", name, encode_subset(subset, GRID, coding)
-    yield "free-space", "three-blocks", encode_free_space(free_space(3), GRID)
-    yield "free-space", "empty", encode_free_space(free_space(0), GRID)
     yield "object-report", "two-objects", encode_object_report(report())
     for name, image in frames():
         yield "keyframe", name, image.SerializeToString()
@@ -95,12 +92,6 @@ def fusion_messages() -> Iterator[tuple[str, str, Message]]:
     yield "FusionService.ExportFusedMap", "of-agent", fusion.ExportFusedMapRequest(strategy=1, agent_id=AGENT_ID)
     yield "FusionService.ReportObjects", "two-objects", report_to_message(SESSION, report())
     yield "FusionService.QueryObjects", "mug", fusion.QueryObjectsRequest(mission_id="mission", noun="mug")
-    free = encode_free_space(free_space(2), GRID)
-    yield (
-        "FusionService.ContributeFreeSpace",
-        "blocks",
-        fusion.ContributeFreeSpaceRequest(session_id=SESSION, free_space=free),
-    )
     view = fusion.RenderFusedViewRequest(
         camera=convert.camera_to_message(CAMERA), t_world_camera=convert.transform_to_message(np.eye(4)), layer=1
     )
@@ -165,12 +156,6 @@ def frames(lens: Lens | None = None) -> Iterator[tuple[str, Message]]:
     motion = CameraMotion(Twist(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.2, 0.0])), 0.02, 0.01)
     moving = Frame(2, 2_000_000, rgb, plain.depth_m, CAMERA, np.eye(4), motion)
     yield "moving", convert.live_frame_to_message(moving, lens)
-
-
-def free_space(blocks: int) -> FreeSpace:
-    """Return blocks of free space with some counts."""
-    counts = np.arange(blocks * BLOCK_VOXELS, dtype=np.uint8).reshape(blocks, BLOCK_VOXELS) % 4
-    return FreeSpace(np.arange(blocks, dtype=np.int64) + 1000, counts)
 
 
 def report() -> ObjectReport:

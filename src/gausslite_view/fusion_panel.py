@@ -95,6 +95,7 @@ class FusionPanel:
             *(
                 f"{agent.agent_id}{'' if agent.joined else ' (left)'}: wins {agent.won_voxels:,} of {agent.voxels:,} "
                 f"voxels, {(agent.roi_bytes + agent.handover_bytes) / 1e6:.1f} MB received"
+                f"{'; ' if agent.alignment.message else ''}{agent.alignment.message}"
                 for agent in status.agents
             ),
         ]

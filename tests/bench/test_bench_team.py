@@ -72,6 +72,20 @@ def test_positions_of_objects_are_compared_with_ground_truth(
     assert "| home-4 x 2 |" in (tmp_path / "positions.md").read_text()
 
 
+def test_frames_of_pairs_are_judged_without_a_false_alarm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    size = ("--size", "80x60", "--frames", "12", "--views", "1", "--max-gaussians", "6000", "--iterations", "2")
+    arguments = ("bench", "team", "--frame-pairs", "60", "--homes", "1,4", "--policies", "uniform", "--threads", "1")
+    assert main([*arguments, *size, "--json", "--out", str(tmp_path)]) == 0
+    pairs = json.loads(capsys.readouterr().out)["scenes"]
+    outcomes = {error: [pair["outcome"] for pair in pairs if pair["error"] == error] for error in ("none", "gross")}
+    assert len(outcomes["none"]) == 30
+    assert set(outcomes["none"]) <= {"fits", "not compared"}
+    assert outcomes["none"].count("fits") >= 10
+    compared = [outcome for outcome in outcomes["gross"] if outcome != "not compared"]
+    assert compared.count("contradicted") >= 0.8 * len(compared) > 5
+    assert "| whole | gross |" in (tmp_path / "frame-pairs.md").read_text()
+
+
 def test_parts_of_a_recording_make_a_team(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_seven_scenes(tmp_path / "wall", tuple(range(18)))
     voxels = np.stack(np.meshgrid(range(-4, 4), range(-4, 4), [19, 20], indexing="ij"), axis=-1).reshape(-1, 3)

@@ -27,7 +27,6 @@ from gausslite.domain.objects import ObjectLandmark, ObjectReport
 from gausslite.domain.relevance import DetectedImage
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
-from gausslite.mapping.free_space import FreeSpaceMap
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
@@ -113,7 +112,6 @@ def newest_camera_view(mapper: GaussianMapper, detected: DetectedImage | None) -
 
 _log = logging.getLogger(__name__)
 _Result = TypeVar("_Result")
-_FREE_SPACE_FRAMES = 5
 
 
 class MappingWorker:
@@ -139,7 +137,6 @@ class MappingWorker:
         self.uplink = uplink
         self._on_change = on_change
         self._load = load or LoadSettings()
-        self._free_space = FreeSpaceMap(grid) if self._load.free_space else None
         self._clock = clock
         self._mapper = build_mapper(settings)
         self._sent_voxels = SentVoxelTracker(grid)
@@ -353,7 +350,6 @@ class MappingWorker:
         )
         if self._keyframe_upload is not None:
             self._keyframe_upload.enqueue_newest(self._mapper.keyframes())
-        self._observe_free_space(frame)
         self._status.add_outcome(outcome)
         self._timeline.add(outcome)
         self._recorder.record(self._mapper.poses, self._mapper.gaussians)
@@ -385,13 +381,6 @@ class MappingWorker:
             self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
             self._on_change()
         return inserted
-
-    def _observe_free_space(self, frame: Frame) -> None:
-        """Observe every fifth mapped frame's free space, and send the changes."""
-        if self._free_space is None or self.uplink is None or self._mapper.revision % _FREE_SPACE_FRAMES != 1:
-            return
-        self._free_space.observe(frame)
-        self.uplink.enqueue_free_space(self._free_space.collect_changes())
 
     def _enqueue_all_keyframes(self, mapper: GaussianMapper) -> None:
         if self._keyframe_upload is not None:

@@ -38,7 +38,6 @@ class LoadSettings:
     """Length and policy of the frame queue, and training while it is empty.
 
     idle_iterations: the most iterations after each frame while no other frame waits. Maps then depend on the clock.
-    free_space: observe the free space of every fifth frame, for the fusion server.
     """
 
     queue_frames: int = option(4, "length of the frame queue", key="queue", low=1, high=1000)
@@ -48,9 +47,6 @@ class LoadSettings:
         "training iterations while the queue is empty (default: 64 at a rate, else 0)",
         low=0,
         high=10_000,
-    )
-    free_space: bool = option(
-        False, "send what the camera has observed as free: it shows frames that do not fit (default: true)"
     )
 
     def __post_init__(self) -> None:
@@ -208,13 +204,16 @@ PROGRAM = Program.of(
     "iterations rate exit-when-done",
     defaults={
         "source": None,
-        "free-space": True,
         "keyframes": None,
         "idle-iterations": None,
         "save-interval": 60.0,
     },
     computed={"idle-iterations": _idle_iterations_unless_set},
-    removed={**REMOVED, "traces": "the package opentelemetry-instrumentation-grpc traces calls"},
+    removed={
+        **REMOVED,
+        "traces": "the package opentelemetry-instrumentation-grpc traces calls",
+        "free-space": "the server compares surfaces only",
+    },
 )
 
 

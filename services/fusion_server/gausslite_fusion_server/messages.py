@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.stored import decode_free_space
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import (
     GaussLiteError,
@@ -104,13 +103,6 @@ async def outcome_of(engine: FusionEngine, queued: QueuedSubset) -> pb.SubsetOut
     stored = TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted))
     engine.record_traffic(queued.agent_id, queued.traffic.plus(stored))
     return outcome
-
-
-def store_free_space(engine: FusionEngine, request: pb.ContributeFreeSpaceRequest, caller: Caller) -> int:
-    """Store free space; returns the agent's number of free voxels. Raises CodecError, QuotaError and the like."""
-    agent_of_session(engine, request.session_id, caller)
-    blocks, grid = decode_free_space(request.free_space)
-    return engine.contribute_free_space(request.session_id, blocks, grid)
 
 
 def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest, caller: Caller) -> None:
@@ -249,6 +241,5 @@ def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
         last_update_seq=agent.last_update_seq,
         last_seen_ns=agent.traffic.last_seen_ns,
         targets=agent.targets,
-        free_voxels=agent.free_voxels,
         alignment=alignment_to_message(agent.alignment),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
+import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -40,13 +41,13 @@ from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.messages import (
     ExportedFile,
     agent_of_session,
+    alignment_to_message,
     contribution_to_message,
     declared_frame_from_message,
     enqueue_subset,
     layer_from_message,
     outcome_of,
     read_keyframe,
-    store_free_space,
     store_keyframe,
     view_to_message,
 )
@@ -115,6 +116,8 @@ _MAX_REPORTED_REJECTIONS = 1000
 _WORKERS = 4
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
+_ALIGN_PAUSE = 4.0
+"""Shortest pause after a comparison of frames, in its durations: it takes a fifth of a core at most."""
 
 _Result = TypeVar("_Result")
 
@@ -131,9 +134,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
         self._encoded_parts = EncodedPartCache()
-        # one thread: an estimate of frames or a rendering must not delay the acknowledgements
+        # one thread each: a comparison of frames or a rendering must not delay the acknowledgements
+        self._aligner = ThreadPoolExecutor(1, "align")
         self._background = ThreadPoolExecutor(1, "background")
-        self._aligning = False
+        self._aligning, self._align_pause_s = False, _ALIGN_DELAY_S
         self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
@@ -161,6 +165,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     def close(self) -> None:
         """Wait until the work in threads has ended."""
+        self._aligner.shutdown(wait=True, cancel_futures=True)
         self._background.shutdown(wait=True, cancel_futures=True)
         self._workers.shutdown(wait=True)
         self._decoder.shutdown(wait=True)
@@ -197,7 +202,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Renew the agent's lease; return what identifies the stored updates."""
         agent_id = agent_of_session(self._engine, request.session_id, Caller.of(context))
         return pb.KeepSessionResponse(
-            highest_update_seq=self._engine.highest_update_seq(agent_id), incarnation_id=self._engine.incarnation_id
+            highest_update_seq=self._engine.highest_update_seq(agent_id),
+            incarnation_id=self._engine.incarnation_id,
+            alignment=alignment_to_message(self._engine.alignment(agent_id)),
         )
 
     async def GetUpdateDigests(
@@ -315,13 +322,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             objects=[object_to_message(team_object.landmark, team_object.observers) for team_object in objects]
         )
 
-    async def ContributeFreeSpace(
-        self, request: pb.ContributeFreeSpaceRequest, context: Any
-    ) -> pb.ContributeFreeSpaceResponse:
-        """Replace what an agent observed as free in some blocks of voxels."""
-        free_voxels = await self._work(store_free_space, self._engine, request, Caller.of(context))
-        return pb.ContributeFreeSpaceResponse(free_voxels=free_voxels)
-
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
         """Render a layer of the map from a camera pose."""
         self._gate.require_open()
@@ -353,14 +353,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """End a session; with `forget` the agent's updates are deleted."""
         agent_of_session(self._engine, request.session_id, Caller.of(context))
         revision = await self._work(self._engine.leave, request.session_id, request.forget)
-        self._map_changes.notify()
+        self._publish_changes()
         return pb.LeaveSessionResponse(fused_revision=revision)
 
     async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
         """End an agent's session and delete its data; with `ban` its later joins are refused."""
         self._engine.require_mission(request.mission_id)
         voxels = await self._work(self._engine.evict, request.agent_id, request.ban)
-        self._map_changes.notify()
+        self._publish_changes()
         _log.warning("agent %s: %s, data of %d voxels deleted", request.agent_id, _evicted(request), voxels)
         return pb.EvictAgentResponse(fused_revision=self._engine.revision, voxels=voxels)
 
@@ -392,13 +392,20 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Estimate the agents' frames soon, unless an estimate is pending or running. Use on the event loop."""
         if not self._aligning:
             self._aligning = True
-            asyncio.get_running_loop().call_later(_ALIGN_DELAY_S, self._align)
+            asyncio.get_running_loop().call_later(self._align_pause_s, self._align)
 
     def _align(self) -> None:
         if not self._gate.is_open:
             return
-        future = asyncio.get_running_loop().run_in_executor(self._background, self._engine.align_due)
+        future = asyncio.get_running_loop().run_in_executor(self._aligner, self._align_due)
         future.add_done_callback(self._after_aligning)
+
+    def _align_due(self) -> bool:
+        start_s = time.monotonic()
+        try:
+            return self._engine.align_due()
+        finally:
+            self._align_pause_s = max(_ALIGN_DELAY_S, _ALIGN_PAUSE * (time.monotonic() - start_s))
 
     def _after_aligning(self, future: asyncio.Future[bool]) -> None:
         self._aligning = False

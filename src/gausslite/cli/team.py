@@ -234,6 +234,12 @@ def _uplink_lines(uplink: Mapping[str, Any]) -> Iterator[str]:
     yield f"waiting    {uplink['voxels_waiting']} voxels, {uplink['keyframes_waiting']} keyframes"
 
 
+def _frame_line(alignment: Mapping[str, Any]) -> str:
+    state = alignment["state"].removeprefix("ALIGNMENT_STATE_").lower().replace("unspecified", "not compared")
+    reason = alignment["message"].removeprefix("frame: ")
+    return f"frame {state}{': ' if reason else ''}{reason}"
+
+
 def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
     yield f"fusion server, mission {status['mission_id'] or '(no agent has joined yet)'}"
     yield f"fused map  {status['fused_gaussians']} Gaussians in {status['fused_voxels']} voxels"
@@ -244,5 +250,6 @@ def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
             f"wins {agent['won_voxels']} of {agent['voxels']} voxels, {agent['keyframes']} keyframes; "
             f"received {agent['roi_bytes']} bytes of the task's region, {agent['handover_bytes']} of handovers"
         )
+        yield f"           {_frame_line(agent['alignment'])}"
     if status["banned_agents"]:
         yield f"banned     {', '.join(status['banned_agents'])}"

@@ -1,247 +1,221 @@
-"""Measure how an agent's frame fits the map of the other agents, by coloured point-to-plane ICP on their Gaussians."""
+"""Compare two maps by samples of their surfaces: how they fit, and the rigid motion with which they fit better.
+
+small_gicp finds motions from half of the overlap. Whether one of them holds is decided on the other half, by distance
+and by colour, because the optimum of a registration alone is 15 to 30 mm off even between maps in the same frame.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+import small_gicp
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import inverse, transform_of, transform_points, twist_of
-from gausslite.domain.voxels import VoxelGrid
+from gausslite.domain.pose import rotation_angle_deg, transform_points
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, gather_rows
 
-_MAX_SOURCE, _MAX_REFERENCE = 2500, 8000
-_PRIOR_TRANSLATION_M, _PRIOR_ROTATION_RAD = 0.15, 0.05
-_NEIGHBOURS = 12
+MIN_SAMPLES = 60
+_SAMPLES_PER_VOXEL = 3
 _MIN_OPACITY = 0.3
-_REACH_M = (0.30, 0.30, 0.20, 0.20, 0.15, 0.15, 0.10, 0.10, 0.08, 0.08, 0.08, 0.08)
-"""Longest distance of a match in each iteration."""
-_MIN_COMPARED = 50
-_INDEPENDENT_SAMPLES = 150
-_OVERLAP_M = 0.10
-_COLOUR_WEIGHT_M = 0.1
-"""Geometric residual that weighs as much as a luminance difference of 1."""
-_OVERLAP_GRID = VoxelGrid(0.5)
-_MIN_NORMAL_COSINE = 0.8
-"""Cosine of the largest angle between the normals of a match (37 deg)."""
-_BACK_MATCH_M = 0.05
-"""Largest distance between a sample and the one that is nearest to its own reference."""
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
+_NEIGHBOURS = 10
+_REACH_M = (0.15, 0.5, 1.0)
+"""Longest distance of a match in the first registration of each trial; the later ones are shorter."""
+_REFINE_M = (0.3, 0.15)
+_ITERATIONS = 30
+_MAX_SHIFT_M, _MAX_ROTATION_DEG = 1.5, 45.0
+"""Larger motions fit some other part of the map by chance."""
+_MAX_DISTANCE_M, _MAX_COLOUR = 0.1, 0.25
+"""Residuals saturate here, and a sample without a match has these."""
+_SHARED_GRID, _BLOCK_GRID = VoxelGrid(0.5), VoxelGrid(0.25)
+_MIN_SHARED, _MIN_BLOCK = 10, 3
+_MIN_BLOCKS = 8
+_MIN_MATCHED = 0.4
+_SIGMAS = 4.0
+"""Of 650 pairs of maps in the same frame, none has a motion with such gains of both residuals."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Misfit:
-    """How samples of one map fit another: median point-to-plane distance and luminance difference of the matches.
-
-    overlap: share of the samples within 10 cm of the other map's samples.
-    """
+    """Mean point-to-plane distance and luminance difference of samples of one map to another, both saturated."""
 
     distance_m: float
     colour: float
-    overlap: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFit:
-    """The rigid correction that fits an agent's map to the others', and the misfit before and after it.
+    """A motion of the source map, and the misfit before and after it on the held-out half of the overlap.
 
-    shift_m, rotation_deg: the correction's motion of the overlap's centre and its angle. compared: number of samples.
+    shift_m, rotation_deg: the motion of the overlap's centre and its angle. compared: number of held-out samples.
+    is_better: distance and colour improve by more than four times their uncertainty.
     """
 
-    T_fused_agent: Float64[ndarray, "4 4"]
+    motion: Float64[ndarray, "4 4"]
     before: Misfit
     after: Misfit
     shift_m: float
     rotation_deg: float
     compared: int
+    is_better: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceSamples:
-    """Points of a surface with normals, luminance and its gradient along the surface (per metre)."""
+    """Means of opaque Gaussians and their luminance."""
 
     points_m: Float64[ndarray, "n 3"]
-    normals: Float64[ndarray, "n 3"]
     luminance: Float64[ndarray, " n"]
-    gradients: Float64[ndarray, "n 3"]
 
-    @classmethod
-    def of(cls, gaussians: Gaussians, limit: int = _MAX_REFERENCE, seed: int = 0) -> SurfaceSamples:
-        """Draw samples from the means of opaque Gaussians; the local plane and gradient come from their neighbours."""
-        points, luminance = _sample(gaussians, limit, seed)
-        if len(points) <= _NEIGHBOURS:
-            return cls(points, np.zeros_like(points), luminance, np.zeros_like(points))
-        near = _nearest(points, points, _NEIGHBOURS)
-        offsets = points[near] - points[near].mean(axis=1, keepdims=True)
-        covariance = np.einsum("nki,nkj->nij", offsets, offsets)
-        _, axes = np.linalg.eigh(covariance)
-        normals = axes[:, :, 0]
-        differences = luminance[near] - luminance[near].mean(axis=1, keepdims=True)
-        slope = np.einsum("nki,nk->ni", offsets, differences)
-        # the ridge is relative to the neighbourhood's size, so that noise across the plane gives no gradient
-        ridge = 0.1 * np.trace(covariance, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
-        gradients = np.linalg.solve(covariance + ridge, slope[:, :, None])[:, :, 0]
-        gradients -= np.einsum("ni,ni->n", gradients, normals)[:, None] * normals
-        return cls(points, normals, luminance, gradients)
+    def __len__(self) -> int:
+        return len(self.points_m)
 
     def moved(self, T: Float64[ndarray, "4 4"]) -> SurfaceSamples:
         """Return the samples after a rigid motion."""
-        turn = T[:3, :3].T
-        return replace(
-            self,
-            points_m=transform_points(T, self.points_m),
-            normals=self.normals @ turn,
-            gradients=self.gradients @ turn,
+        return SurfaceSamples(transform_points(T, self.points_m), self.luminance)
+
+    def take(self, rows: Int64[ndarray, " m"] | Bool[ndarray, " n"]) -> SurfaceSamples:
+        """Return these samples."""
+        return SurfaceSamples(self.points_m[rows], self.luminance[rows])
+
+    @classmethod
+    def of(cls, batch: VoxelBatch) -> SurfaceSamples:
+        """Return the samples of each voxel, in their order."""
+        rows = opaque_rows(batch)
+        return cls(batch.gaussians.means_m[rows].astype(np.float64), batch.gaussians.rgb[rows] @ _LUMINANCE)
+
+    @classmethod
+    def concatenate(cls, parts: list[SurfaceSamples]) -> SurfaceSamples:
+        """Return the samples of all parts."""
+        return cls(
+            np.concatenate([np.zeros((0, 3)), *(part.points_m for part in parts)]),
+            np.concatenate([np.zeros(0), *(part.luminance for part in parts)]),
         )
 
 
-def crop_to_overlap(
-    source: Gaussians, reference: Gaussians, T_fused_agent: Float64[ndarray, "4 4"]
-) -> tuple[Gaussians, Gaussians]:
-    """Return the Gaussians of both maps in the cubes of 50 cm that both occupy, so that the samples are dense there.
+def opaque_rows(batch: VoxelBatch) -> Int64[ndarray, " n"]:
+    """Return the three most opaque Gaussians of each voxel, without transparent ones."""
+    voxel = np.repeat(np.arange(len(batch)), batch.counts)
+    order = np.lexsort((-batch.gaussians.opacities, voxel))
+    rows = order[gather_rows(batch.offsets[:-1], np.minimum(batch.counts, _SAMPLES_PER_VOXEL))]
+    chosen: Int64[ndarray, " n"] = rows[batch.gaussians.opacities[rows] >= _MIN_OPACITY]
+    return chosen
 
-    Raises InvalidInputError for means outside the range of the grid.
+
+class _Target:
+    """Samples with a search tree and normals."""
+
+    def __init__(self, samples: SurfaceSamples) -> None:
+        self._samples = samples
+        self.cloud = small_gicp.PointCloud(samples.points_m)
+        self.tree = small_gicp.KdTree(self.cloud)
+        small_gicp.estimate_normals_covariances(self.cloud, self.tree, num_neighbors=_NEIGHBOURS)
+        self._normals = np.asarray(self.cloud.normals())[:, :3]
+
+    def residuals(
+        self, moved: SurfaceSamples
+    ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"], Bool[ndarray, " n"]]:
+        """Return distance and colour difference of each sample as shares of their limits, and which have a match."""
+        found, squares = self.tree.batch_nearest_neighbor_search(moved.points_m)
+        near, away_m = np.asarray(found, np.int64), np.sqrt(np.asarray(squares, np.float64))
+        offset = moved.points_m - self._samples.points_m[near]
+        matched = away_m < _MAX_DISTANCE_M
+        distance_m = np.abs(np.einsum("ni,ni->n", offset, self._normals[near]))
+        colour = moved.luminance - self._samples.luminance[near]
+        if matched.any():
+            # agents' exposures may differ
+            colour -= np.median(colour[matched])
+        distance = np.where(matched, np.minimum(distance_m / _MAX_DISTANCE_M, 1.0), 1.0)
+        return distance, np.where(matched, np.minimum(np.abs(colour) / _MAX_COLOUR, 1.0), 1.0), matched
+
+
+def fit_frame(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
+    """Return the motion of the source that fits it best to the target; None if they share too little surface.
+
+    They share the cubes of 50 cm that both occupy. Without a motion that fits better, it is the identity.
     """
-    moved = transform_points(T_fused_agent, source.means_m.astype(np.float64)).astype(np.float32)
-    source_keys, reference_keys = _OVERLAP_GRID.keys(moved), _OVERLAP_GRID.keys(reference.means_m)
-    common = np.intersect1d(source_keys, reference_keys)
-    return source.take(np.isin(source_keys, common)), reference.take(np.isin(reference_keys, common))
-
-
-def fit_frame(source: Gaussians, reference: SurfaceSamples, start: Float64[ndarray, "4 4"]) -> FrameFit | None:
-    """Fit the source map to the reference from an initial T_fused_agent; None if fewer than 50 samples match.
-
-    The fit is a robust Gauss-Newton with a weak prior at the start, so directions that the overlap does not constrain
-    keep the initial value.
-    """
-    samples = SurfaceSamples.of(source, _MAX_SOURCE, seed=1)
-    T = start.copy()
-    if min(len(samples.points_m), len(reference.points_m)) < _MIN_COMPARED:
+    if min(len(source), len(target)) < MIN_SAMPLES:
         return None
-    before = _misfit(samples, reference, T)
-    for reach_m in _REACH_M:
-        update = _step(samples.moved(T), reference, reach_m, T @ inverse(start))
-        if update is None:
-            return None
-        T = update @ T
-    matches = _match(samples.moved(T), reference, _OVERLAP_M)
-    if len(matches[0]) < _MIN_COMPARED:
+    shared = _in_shared_cubes(source.points_m, target.points_m)
+    blocks, is_first = _blocks(source.points_m)
+    held_out = shared & ~is_first
+    if min(_occupied(blocks[held_out]), _occupied(blocks[shared & is_first])) < _MIN_BLOCKS:
         return None
-    after = _misfit(samples, reference, T)
-    centre = samples.points_m[matches[0]].mean(axis=0)[None]
-    shift = transform_points(T, centre) - transform_points(start, centre)
-    turn = T[:3, :3] @ start[:3, :3].T
-    rotation_deg = float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
-    return FrameFit(T, before, after, float(np.linalg.norm(shift)), rotation_deg, len(matches[0]))
+    places = _Target(target)
+    centre_m = source.points_m[shared].mean(axis=0)
+    # of what both see at first; so a motion cannot gain by covering more of the other map
+    chosen, first = source.take(shared & is_first), source.take(is_first)
+    costs = [
+        (sum(float(part.mean()) for part in places.residuals(chosen.moved(T))[:2]), T)
+        for T in (np.eye(4), *_trials(first, places, centre_m))
+    ]
+    motion = min(costs, key=lambda cost: cost[0])[1]
+    return _evaluate(source.take(held_out), blocks[held_out], places, motion, centre_m)
 
 
-def _step(
-    moved: SurfaceSamples,
-    reference: SurfaceSamples,
-    reach_m: float,
-    correction: Float64[ndarray, "4 4"],
-) -> Float64[ndarray, "4 4"] | None:
-    """Return one Gauss-Newton update in the fused frame; None with too few matches. correction: all updates so far."""
-    rows, near = _match(moved, reference, reach_m)
-    if len(rows) < _MIN_COMPARED:
-        return None
-    points = moved.points_m[rows]
-    offset, normals, gradients = (
-        points - reference.points_m[near],
-        reference.normals[near],
-        reference.gradients[near],
+def _trials(
+    source: SurfaceSamples, target: _Target, centre_m: Float64[ndarray, "3"]
+) -> Iterator[Float64[ndarray, "4 4"]]:
+    """Yield the motions that registrations with different first reaches find."""
+    cloud = small_gicp.PointCloud(source.points_m)
+    small_gicp.estimate_normals_covariances(cloud, num_neighbors=_NEIGHBOURS)
+    for first_m in _REACH_M:
+        T = np.eye(4)
+        for reach_m in (first_m, *(reach_m for reach_m in _REFINE_M if reach_m < first_m)):
+            result = small_gicp.align(target.cloud, cloud, target.tree, T, "GICP", reach_m, max_iterations=_ITERATIONS)
+            T = np.asarray(result.T_target_source, np.float64)
+        if _shift_m(T, centre_m) <= _MAX_SHIFT_M and rotation_angle_deg(T, np.eye(4)) <= _MAX_ROTATION_DEG:
+            yield T
+
+
+def _evaluate(
+    held_out: SurfaceSamples,
+    blocks: Int64[ndarray, " n"],
+    target: _Target,
+    motion: Float64[ndarray, "4 4"],
+    centre_m: Float64[ndarray, "3"],
+) -> FrameFit:
+    before, after = target.residuals(held_out), target.residuals(held_out.moved(motion))
+    is_better = after[2].mean() >= _MIN_MATCHED and all(
+        _is_gain(old - new, blocks) for old, new in zip(before[:2], after[:2], strict=True)
     )
-    distance = np.einsum("ni,ni->n", offset, normals)
-    colour = moved.luminance[rows] - reference.luminance[near] - np.einsum("ni,ni->n", gradients, offset)
-    # agents' exposures may differ
-    colour -= np.median(colour)
-    # rotations about the centre of the matches, so that they are independent of the translation
-    centre = points.mean(axis=0)
-    arms = points - centre
-    jacobian = np.vstack([_rows_of(normals, arms), -_COLOUR_WEIGHT_M * _rows_of(gradients, arms)])
-    residual = np.concatenate([distance, _COLOUR_WEIGHT_M * colour])
-    weight = np.concatenate([_tukey(distance), _tukey(_COLOUR_WEIGHT_M * colour)])
-    scale = np.concatenate(
-        [np.full(len(rows), _spread(distance)), np.full(len(rows), _spread(_COLOUR_WEIGHT_M * colour))]
+    misfit_before, misfit_after = (
+        Misfit(_MAX_DISTANCE_M * float(distance.mean()), _MAX_COLOUR * float(colour.mean()))
+        for distance, colour, _ in (before, after)
     )
-    # neighbouring samples err together, so many count as few: else noise would turn the map about a poor overlap
-    weight /= np.square(scale) * max(1.0, len(rows) / _INDEPENDENT_SAMPLES)
-    prior = np.diag([_PRIOR_TRANSLATION_M**-2.0] * 3 + [_PRIOR_ROTATION_RAD**-2.0] * 3)
-    hessian = (jacobian * weight[:, None]).T @ jacobian + prior
-    to_centre, back = np.eye(4), np.eye(4)
-    to_centre[:3, 3], back[:3, 3] = -centre, centre
-    so_far = twist_of(to_centre @ correction @ back)
-    twist = -np.linalg.solve(hessian, (jacobian * weight[:, None]).T @ residual + prior @ so_far)
-    update: Float64[ndarray, "4 4"] = back @ transform_of(twist) @ to_centre
-    return update
+    rotation_deg, shift_m = rotation_angle_deg(motion, np.eye(4)), _shift_m(motion, centre_m)
+    return FrameFit(motion, misfit_before, misfit_after, shift_m, rotation_deg, len(held_out), bool(is_better))
 
 
-def _rows_of(directions: Float64[ndarray, "n 3"], arms: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 6"]:
-    return np.hstack([directions, np.cross(arms, directions)])
+def _is_gain(gains: Float64[ndarray, " n"], blocks: Int64[ndarray, " n"]) -> bool:
+    """Return whether a residual shrinks by more than its uncertainty; neighbours err together, so blocks count."""
+    names, of_sample, counts = np.unique(blocks, return_inverse=True, return_counts=True)
+    means = (np.bincount(of_sample, gains, len(names)) / counts)[counts >= _MIN_BLOCK]
+    if len(means) < _MIN_BLOCKS:
+        return False
+    return bool(means.mean() > max(_SIGMAS * means.std(ddof=1) / np.sqrt(len(means)), 0.0))
 
 
-def _spread(residual: Float64[ndarray, " n"]) -> float:
-    """Return a robust standard deviation; at least a millimetre."""
-    return max(1e-3, 1.4826 * float(np.median(np.abs(residual))))
+def _in_shared_cubes(points_m: Float64[ndarray, "n 3"], others_m: Float64[ndarray, "m 3"]) -> Bool[ndarray, " n"]:
+    """Return which points are in cubes that hold at least ten of the other points."""
+    keys, counts = np.unique(_SHARED_GRID.keys(others_m.astype(np.float32)), return_counts=True)
+    shared: Bool[ndarray, " n"] = np.isin(_SHARED_GRID.keys(points_m.astype(np.float32)), keys[counts >= _MIN_SHARED])
+    return shared
 
 
-def _tukey(residual: Float64[ndarray, " n"]) -> Float64[ndarray, " n"]:
-    share = np.clip(np.abs(residual) / (4.685 * _spread(residual)), 0.0, 1.0)
-    weight: Float64[ndarray, " n"] = np.square(1.0 - np.square(share))
-    return weight
+def _blocks(points_m: Float64[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Bool[ndarray, " n"]]:
+    """Return the block of each point, and whether it belongs to the first half: a chessboard of blocks."""
+    keys = _BLOCK_GRID.keys(points_m.astype(np.float32))
+    return keys, _BLOCK_GRID.indices(keys).sum(axis=1) % 2 == 0
 
 
-def _misfit(samples: SurfaceSamples, reference: SurfaceSamples, T: Float64[ndarray, "4 4"]) -> Misfit:
-    moved = samples.moved(T)
-    rows, near = _match(moved, reference, _REACH_M[0])
-    if len(rows) == 0:
-        return Misfit(float("inf"), 1.0, 0.0)
-    offset = moved.points_m[rows] - reference.points_m[near]
-    distance = np.abs(np.einsum("ni,ni->n", offset, reference.normals[near]))
-    colour = np.abs(moved.luminance[rows] - reference.luminance[near])
-    overlap = float(np.mean(np.linalg.norm(offset, axis=1) <= _OVERLAP_M) * len(rows) / len(moved.points_m))
-    return Misfit(float(np.median(distance)), float(np.median(colour)), overlap)
+def _occupied(blocks: Int64[ndarray, " n"]) -> int:
+    """Return the number of blocks with enough samples to count."""
+    return int(np.count_nonzero(np.unique(blocks, return_counts=True)[1] >= _MIN_BLOCK))
 
 
-def _match(
-    moved: SurfaceSamples, reference: SurfaceSamples, reach_m: float
-) -> tuple[Int64[ndarray, " m"], Int64[ndarray, " m"]]:
-    """Return the samples with a match within reach, and the indices of the matched references.
-
-    The normals of a match agree, and the reference's own nearest sample is near: so a mug is not matched to the table
-    under it, nor the part of a table that only one agent has mapped to the edge of the other's part.
-    """
-    near = _nearest(moved.points_m, reference.points_m, 1)[:, 0]
-    distance_m = np.linalg.norm(moved.points_m - reference.points_m[near], axis=1)
-    cosine = np.abs(np.einsum("ni,ni->n", moved.normals, reference.normals[near]))
-    rows = np.flatnonzero((distance_m <= reach_m) & (cosine >= _MIN_NORMAL_COSINE))
-    if len(rows) == 0:
-        return rows, rows
-    back = _nearest(reference.points_m[near[rows]], moved.points_m, 1)[:, 0]
-    rows = rows[np.linalg.norm(moved.points_m[rows] - moved.points_m[back], axis=1) <= _BACK_MATCH_M]
-    return rows, near[rows]
-
-
-def _nearest(points: Float64[ndarray, "n 3"], reference: Float64[ndarray, "m 3"], count: int) -> Int64[ndarray, "n k"]:
-    """Return the indices of the `count` nearest references of each point, unordered; memory is bounded by blocks."""
-    origin = reference.mean(axis=0)
-    a, b = (points - origin).astype(np.float32), (reference - origin).astype(np.float32)
-    squares = np.square(b).sum(axis=1)
-    found = []
-    for start in range(0, len(a), 1000):
-        distance = squares - 2.0 * (a[start : start + 1000] @ b.T)
-        if count == 1:
-            found.append(distance.argmin(axis=1)[:, None])
-        else:
-            found.append(np.argpartition(distance, count, axis=1)[:, :count])
-    return np.concatenate(found).astype(np.int64)
-
-
-def _sample(gaussians: Gaussians, limit: int, seed: int) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, " n"]]:
-    """Return the means and luminances of at most `limit` opaque Gaussians, drawn at random."""
-    rows = np.flatnonzero(gaussians.opacities >= _MIN_OPACITY)
-    if len(rows) > limit:
-        rows = np.sort(np.random.default_rng(seed).choice(rows, limit, replace=False))
-    return gaussians.means_m[rows].astype(np.float64), gaussians.rgb[rows].astype(np.float64) @ _LUMINANCE
+def _shift_m(T: Float64[ndarray, "4 4"], centre_m: Float64[ndarray, "3"]) -> float:
+    return float(np.linalg.norm(transform_points(T, centre_m[None])[0] - centre_m))

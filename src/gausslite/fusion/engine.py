@@ -13,12 +13,12 @@ from numpy import ndarray
 
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import MismatchError, NotPermittedError
-from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
+from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.fused_map import FusedMapLayers, save_refinement
 from gausslite.fusion.keyframes import (
     AgentKeyframe,
@@ -62,7 +62,6 @@ def _contribution(store: FusionStore, mission: MissionData, agent_id: str) -> Ag
         last_update_seq=totals.highest_update_seq,
         keyframes=mission.keyframes.count(agent_id),
         targets=mission.objects.targets(agent_id),
-        free_voxels=mission.free_space.free_voxels(agent_id),
         alignment=mission.alignments.get(agent_id),
         traffic=mission.traffic.of(agent_id),
     )
@@ -210,36 +209,25 @@ class FusionEngine:
         self._committer.commit()
 
     def align_due(self) -> bool:
-        """Estimate the frames of the agents with enough new updates; returns whether the fused map changed.
+        """Compare the frames of the agents with enough new updates; returns whether the fused map changed.
 
-        It takes up to seconds, mostly without the lock. Call it from one thread at a time. Raises StorageError.
+        It takes up to seconds, without the lock but for slices. Call it from one thread at a time. Raises StorageError.
         """
-        changed = False
-        for agent_id in self._mission.aligner.due():
-            keys = self._mission.aligner.estimate(agent_id)
-            with self._lock:
-                self._mission.maps.record(agent_id, keys)
-                changed |= self._mission.agents.drop_contradicted(agent_id) or len(keys) > 0
-        return changed
+        before = self.revision
+        self._mission.aligner.run(self._apply_frame, self._drop_contradicted)
+        return self.revision != before
+
+    def alignment(self, agent_id: str) -> FrameAlignment:
+        """Return how the agent's frame fits the fused map."""
+        with self._lock:
+            return self._mission.alignments.get(agent_id)
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
         """Set the motion from the agent's frame to the fused map's that the agent declares. Raises StorageError."""
         with self._lock:
-            self._mission.alignments.declare(agent_id, T_fused_agent)
-            self._mission.maps.record(agent_id, self._mission.votes.refresh(agent_id))
-
-    def contribute_free_space(self, session_id: str, blocks: FreeSpace, grid: VoxelGrid) -> int:
-        """Replace what an agent observed as free in these blocks; returns its number of free voxels.
-
-        Raises SessionUnknownError, MismatchError (another grid), QuotaError, StorageError.
-        """
-        with self._lock:
-            agent_id = self._mission.members.session(session_id).agent_id
-            if grid != self.grid:
-                raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
-            self._mission.free_space.contribute(agent_id, blocks)
-            self._mission.aligner.record_free_space(agent_id)
-            return self._mission.free_space.free_voxels(agent_id)
+            is_new = self._mission.aligner.declare(agent_id, T_fused_agent)
+        if is_new:
+            self._apply_frame(agent_id)
 
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
@@ -348,6 +336,16 @@ class FusionEngine:
         with self._lock:
             self._store.close()
 
+    def _apply_frame(self, agent_id: str) -> None:
+        """Move the agent's map to its frame and state as they are now, in slices between which messages are served."""
+        for keys in self._mission.votes.slices(agent_id):
+            with self._lock:
+                self._mission.maps.record(agent_id, self._mission.votes.move(agent_id, keys))
+
+    def _drop_contradicted(self, agent_id: str) -> bool:
+        with self._committer.committing, self._lock:
+            return self._mission.agents.drop_contradicted(agent_id)
+
     def _check_update(self, update: PendingUpdate) -> RoiSubset:
         """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
         self._mission.members.session(update.session_id)
@@ -362,8 +360,6 @@ class FusionEngine:
         """Update the fused map after a commit."""
         self._mission.aligner.record(subset.agent_id, outcome.accepted)
         if len(outcome.accepted):
-            self._mission.maps.record(
-                subset.agent_id, self._mission.votes.changed_keys(subset.agent_id, outcome.accepted)
-            )
+            self._mission.maps.record(subset.agent_id, self._mission.votes.move(subset.agent_id, outcome.accepted))
             self._mission.agents.drop_outgrown(subset.agent_id)
         self._mission.traffic.save_if_due()

@@ -1,13 +1,13 @@
 """The motion from each agent's frame to the fused map's, with its state: as sent, aligned, corrected, quarantined.
 
-The agent that contributes first defines the fused frame, unless it declares another one. Each later agent is compared
-with the agents before it. Odometry drifts, so the motion is a sequence of segments: an estimate from the agent's
-updates since the last one applies to these updates and to later ones.
+The agent that contributes first defines the fused frame, unless it declares another one. Odometry drifts, so the motion
+is a sequence of segments: a correction from the agent's updates since the last one applies to these and to later ones.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -16,19 +16,21 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import CodecError, GaussLiteError
-from gausslite.domain.pose import require_rigid
+from gausslite.domain.pose import inverse, require_rigid, rotation_angle_deg
 from gausslite.fusion.alignment import FrameFit, Misfit
 from gausslite.fusion.store import FusionStore
 
 RECORD = "alignment"
 _MAX_SEGMENTS = 200
+_WITNESSES = 2
+"""A lone contradiction quarantines only if a second part of the agent's data repeats it."""
 
 
 class AlignmentState(StrEnum):
     """How an agent's contribution is used."""
 
     UNKNOWN = "unknown"
-    """Too little overlap with the agents before it, and not in their free space: used as sent, or as declared."""
+    """Too little overlap with other agents: used as sent, or as declared."""
     REFERENCE = "reference"
     ALIGNED = "aligned"
     CORRECTED = "corrected"
@@ -37,29 +39,31 @@ class AlignmentState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AlignmentSettings:
-    """When a misfit is corrected and when it is quarantined.
+    """When a misfit is corrected, and when two maps contradict each other.
 
-    min_shift_m, min_rotation_deg: smaller misfits are noise of the maps and are not corrected. min_improvement: the
-    factor by which a correction has to reduce the median point-to-plane distance. max_distance_m: a larger distance is
-    quarantined unless a correction within max_shift_m and max_rotation_deg reduces it below. refit_share: an estimate
-    is due when this share of the agent's voxels has changed since the last one. min_overlap: share of the samples that
-    match within 10 cm after a fit; with fewer, the fit is chance. max_contradicted_share: after such a fit, an agent is
-    quarantined if agents before it have observed free space where a larger share of its Gaussians is.
+    min_shift_m, min_rotation_deg: smaller motions are errors of the registration, which occur between maps in the same
+    frame. max_shift_m, max_rotation_deg: a larger motion that fits better is a contradiction. max_distance_m: so is a
+    larger mean distance, saturated at 10 cm, where both maps have surfaces. refit_share: a comparison is due when so
+    many voxels have changed since the last one, as a share of the agent's voxels.
     """
 
-    min_shift_m: float = 0.01
-    min_rotation_deg: float = 1.0
+    min_shift_m: float = 0.03
+    min_rotation_deg: float = 1.5
     max_shift_m: float = 0.25
     max_rotation_deg: float = 8.0
-    max_distance_m: float = 0.03
-    min_improvement: float = 1.4
+    max_distance_m: float = 0.065
     refit_share: float = 0.25
-    min_overlap: float = 0.3
-    max_contradicted_share: float = 0.05
 
-    def is_chance(self, fit: FrameFit) -> bool:
-        """Return whether the maps may share too little surface to compare the frames."""
-        return fit.after.overlap < self.min_overlap and fit.before.distance_m <= self.max_distance_m
+    def contradicts(self, fit: FrameFit) -> bool:
+        """Return whether no allowed correction explains the misfit."""
+        if fit.is_better:
+            return fit.shift_m > self.max_shift_m or fit.rotation_deg > self.max_rotation_deg
+        return fit.before.distance_m > self.max_distance_m
+
+    def corrects(self, fit: FrameFit) -> bool:
+        """Return whether the motion is applied."""
+        is_large = fit.shift_m >= self.min_shift_m or fit.rotation_deg >= self.min_rotation_deg
+        return fit.is_better and is_large and not self.contradicts(fit)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +71,7 @@ class FrameAlignment:
     """The state of one agent.
 
     segments: (lowest update_seq, T_fused_agent), ascending. order: rank of its first update among the agents.
+    against: the agents that it contradicts. message: why it is corrected, quarantined or about to be.
     """
 
     order: int
@@ -75,6 +80,7 @@ class FrameAlignment:
     fit: FrameFit | None = None
     message: str = ""
     declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    against: tuple[str, ...] = ()
 
     @property
     def T_fused_agent(self) -> Float64[ndarray, "4 4"]:  # noqa: N802 - a transform names both frames
@@ -86,6 +92,11 @@ class FrameAlignment:
         """Return whether all updates are used as sent."""
         return all(np.array_equal(T, np.eye(4)) for T in (self.declared, *(T for _, T in self.segments)))
 
+    @property
+    def is_used(self) -> bool:
+        """Return whether the vote reads the agent's updates."""
+        return self.state is not AlignmentState.QUARANTINED
+
     def segment_of(self, update_seqs: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
         """Return the index of each update's segment; -1 for updates before the first, which use the declared motion."""
         firsts = np.array([first for first, _ in self.segments], np.int64)
@@ -95,40 +106,74 @@ class FrameAlignment:
         """Return T_fused_agent of a segment."""
         return self.declared if segment < 0 else self.segments[segment][1]
 
-    def without_overlap(self, contradicted_share: float, settings: AlignmentSettings) -> FrameAlignment:
-        """Return the alignment of an agent that cannot be fitted; contradicted_share: see AlignmentSettings."""
-        if contradicted_share > settings.max_contradicted_share:
-            message = (
-                f"frame: {contradicted_share:.0%} of its Gaussians are where agents before it have observed free "
-                f"space, expected at most {settings.max_contradicted_share:.0%}; check the agent's localisation"
-            )
-            return replace(self, state=AlignmentState.QUARANTINED, fit=None, message=message)
-        if self.state is AlignmentState.QUARANTINED and self.fit is None:
-            return replace(self, state=AlignmentState.UNKNOWN, message="")
-        return self
+    def corrected(self, fit: FrameFit, first_seq: int) -> FrameAlignment:
+        """Return the alignment with the fit's motion for the updates from first_seq on; the first one is for all."""
+        segment = (first_seq if self.segments else 0, fit.motion @ self.T_fused_agent)
+        return replace(self, fit=fit, against=(), segments=(*self.segments[1 - _MAX_SEGMENTS :], segment))
 
-    def after_fit(self, fit: FrameFit, first_seq: int, settings: AlignmentSettings) -> FrameAlignment:
-        """Return the alignment after a fit of the updates from first_seq on, which started at T_fused_agent."""
-        too_far = fit.shift_m > settings.max_shift_m or fit.rotation_deg > settings.max_rotation_deg
-        is_bad = fit.before.distance_m > settings.max_distance_m
-        is_poor = fit.after.distance_m > settings.max_distance_m or fit.after.overlap < settings.min_overlap
-        if is_bad and (too_far or is_poor):
+    def in_state(self, against: Mapping[str, FrameFit], is_quarantined: bool, is_first: bool) -> FrameAlignment:
+        """Return the alignment in the state that follows from its contradictions. is_first: no other defines a frame"""
+        message, last = "", self.fit if not self.against else None
+        if against:
+            name, last = next(iter(against.items()))
+            misfit = f"its surfaces are {1e3 * last.before.distance_m:.0f} mm away"
+            motion = f"{last.shift_m:.2f} m and {last.rotation_deg:.0f} deg would fit better"
             message = (
-                f"frame: expected a misfit of at most {settings.max_shift_m:g} m and {settings.max_rotation_deg:g} "
-                f"deg, and after its correction {1e3 * settings.max_distance_m:g} mm and an overlap of "
-                f"{settings.min_overlap:.0%}, got {fit.shift_m:.2f} m, {fit.rotation_deg:.1f} deg, "
-                f"{1e3 * fit.after.distance_m:.0f} mm and {fit.after.overlap:.0%}; check the agent's localisation"
+                f"frame: contradicts {', '.join(against)}: {motion if last.is_better else misfit} ({name}); check the "
+                f"agent's localisation, or declare its frame with fused-from-agent"
             )
-            return replace(self, state=AlignmentState.QUARANTINED, fit=fit, message=message)
-        is_small = fit.shift_m < settings.min_shift_m and fit.rotation_deg < settings.min_rotation_deg
-        improves = fit.before.distance_m > settings.min_improvement * fit.after.distance_m
-        if is_small or too_far or not improves:
-            state = AlignmentState.ALIGNED if self.is_identity else AlignmentState.CORRECTED
-            return replace(self, state=state, fit=fit, message="")
-        # the first estimate also holds for all updates before it
-        first_seq = first_seq if self.segments else 0
-        segments = (*self.segments[1 - _MAX_SEGMENTS :], (first_seq, fit.T_fused_agent))
-        return replace(self, state=AlignmentState.CORRECTED, segments=segments, fit=fit, message="")
+        if is_quarantined:
+            state = AlignmentState.QUARANTINED
+        elif is_first:
+            state = AlignmentState.REFERENCE
+        elif self.segments:
+            state = AlignmentState.CORRECTED
+            message = message or f"frame: corrected; {self._size()} in all"
+        else:
+            state = AlignmentState.UNKNOWN if last is None or against else AlignmentState.ALIGNED
+        return replace(self, state=state, message=message, against=tuple(against), fit=last)
+
+    def _size(self) -> str:
+        motion = self.T_fused_agent @ inverse(self.declared)
+        return (
+            f"{np.linalg.norm(motion[:3, 3]):.3f} m at the origin and {rotation_angle_deg(motion, np.eye(4)):.1f} deg"
+        )
+
+
+@dataclass(slots=True)
+class Comparison:
+    """The latest fit of two agents' maps, and in how many parts of each agent's data in a row it is a contradiction."""
+
+    fit: FrameFit
+    contradicting: dict[str, int] = field(default_factory=dict)
+
+
+def find_quarantined(
+    orders: Mapping[str, int], comparisons: Mapping[frozenset[str], Comparison]
+) -> dict[str, tuple[str, ...]]:
+    """Return the agents to quarantine, with the accepted agents that each of them contradicts.
+
+    Agents that fit most others are accepted first, then those that contributed first. An agent that contradicts two
+    accepted ones is quarantined. So is one that contradicts a single one, fits none, and repeats it with newer data.
+    """
+    others = {name: orders.keys() - {name} for name in orders}
+    fits: dict[str, set[str]] = {name: set() for name in orders}
+    for name, candidates in others.items():
+        for other in candidates:
+            comparison = comparisons.get(frozenset((name, other)))
+            if comparison is not None and not comparison.contradicting:
+                fits[name].add(other)
+    accepted: list[str] = []
+    quarantined: dict[str, tuple[str, ...]] = {}
+    for name in sorted(orders, key=lambda name: (-len(fits[name]), orders[name])):
+        found = [(other, comparisons.get(frozenset((name, other)))) for other in accepted]
+        against = [(other, c) for other, c in found if c is not None and c.contradicting]
+        is_repeated = any(c.contradicting.get(name, 0) >= _WITNESSES for _, c in against)
+        if len(against) >= _WITNESSES or (is_repeated and not fits[name].intersection(accepted)):
+            quarantined[name] = tuple(other for other, _ in against)
+        else:
+            accepted.append(name)
+    return quarantined
 
 
 class FrameAlignments:
@@ -146,16 +191,14 @@ class FrameAlignments:
     def __contains__(self, agent_id: str) -> bool:
         return agent_id in self._by_agent
 
+    def names(self) -> tuple[str, ...]:
+        """Return the agents that have an alignment, in the order of their first updates."""
+        return tuple(sorted(self._by_agent, key=lambda name: self._by_agent[name].order))
+
     def put(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Replace the agent's alignment. Raises StorageError."""
         self._store.save_record(agent_id, RECORD, _encode(alignment))
         self._by_agent[agent_id] = alignment
-
-    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
-        """Set the motion that the agent declares; estimates from before are dropped if it changed."""
-        current = self.get(agent_id)
-        if not np.array_equal(current.declared, T_fused_agent):
-            self.put(agent_id, FrameAlignment(current.order, declared=T_fused_agent))
 
     def remove_agent(self, agent_id: str) -> None:
         """Forget the agent; the store deletes its record with its updates."""
@@ -170,16 +213,7 @@ class FrameAlignments:
     @property
     def quarantined(self) -> set[str]:
         """The agents whose contribution is not used."""
-        return {name for name, alignment in self._by_agent.items() if alignment.state is AlignmentState.QUARANTINED}
-
-    def in_other_frames(self) -> set[str]:
-        """Return the agents whose frame differs from the fused map's, as far as is known."""
-        return self.quarantined | set(self.transforms())
-
-    def earlier(self, agent_id: str) -> set[str]:
-        """Return the agents that contributed before this one and are not quarantined."""
-        order = self.get(agent_id).order
-        return {name for name, alignment in self._by_agent.items() if alignment.order < order} - self.quarantined
+        return {name for name, alignment in self._by_agent.items() if not alignment.is_used}
 
 
 def _encode(alignment: FrameAlignment) -> bytes:
@@ -190,13 +224,13 @@ def _encode(alignment: FrameAlignment) -> bytes:
         "segments": [[first, T.reshape(-1).tolist()] for first, T in alignment.segments],
         "declared": alignment.declared.reshape(-1).tolist(),
         "message": alignment.message,
+        "against": list(alignment.against),
         "fit": None
         if fit is None
         else {
-            "T": fit.T_fused_agent.reshape(-1).tolist(),
-            "before": [fit.before.distance_m, fit.before.colour, fit.before.overlap],
-            "after": [fit.after.distance_m, fit.after.colour, fit.after.overlap],
-            "rest": [fit.shift_m, fit.rotation_deg, fit.compared],
+            "motion": fit.motion.reshape(-1).tolist(),
+            "misfits": [fit.before.distance_m, fit.before.colour, fit.after.distance_m, fit.after.colour],
+            "rest": [fit.shift_m, fit.rotation_deg, fit.compared, fit.is_better],
         },
     }
     return json.dumps(value).encode()
@@ -209,13 +243,20 @@ def _decode(data: bytes) -> FrameAlignment:
         stored = value["fit"]
         fit = None
         if stored is not None:
-            before, after = (Misfit(*(float(value) for value in stored[name])) for name in ("before", "after"))
-            shift_m, rotation_deg, compared = stored["rest"]
-            fit = FrameFit(_matrix(stored["T"]), before, after, float(shift_m), float(rotation_deg), int(compared))
-        segments = tuple((int(first), _matrix(T)) for first, T in value["segments"])
-        state = AlignmentState(value["state"])
-        declared = _matrix(value["declared"])
-        return FrameAlignment(int(value["order"]), state, segments, fit, str(value["message"]), declared)
+            misfits = [float(number) for number in stored["misfits"]]
+            shift_m, rotation_deg, compared, is_better = stored["rest"]
+            before, after = Misfit(*misfits[:2]), Misfit(*misfits[2:])
+            motion = _matrix(stored["motion"])
+            fit = FrameFit(motion, before, after, float(shift_m), float(rotation_deg), int(compared), bool(is_better))
+        return FrameAlignment(
+            int(value["order"]),
+            AlignmentState(value["state"]),
+            tuple((int(first), _matrix(T)) for first, T in value["segments"]),
+            fit,
+            str(value["message"]),
+            _matrix(value["declared"]),
+            tuple(str(name) for name in value["against"]),
+        )
     except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
         raise CodecError(f"alignment: expected the JSON of an alignment, got other bytes ({error})") from error
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from threading import RLock
 
-from gausslite.fusion.agent_data import AgentData, FrameAligner
+from gausslite.fusion.agent_data import AgentData
+from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frames import FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers, load_refinement
 from gausslite.fusion.keyframes import FrameDecoder, KeyframePool
@@ -15,7 +16,7 @@ from gausslite.fusion.objects import TeamObjects
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import TrafficLog
 from gausslite.fusion.updates import UpdateChecks
-from gausslite.fusion.vote_input import FreeSpaceRecords, VoteInput
+from gausslite.fusion.vote_input import VoteInput
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +29,6 @@ class MissionData:
     checks: UpdateChecks
     traffic: TrafficLog
     alignments: FrameAlignments
-    free_space: FreeSpaceRecords
     votes: VoteInput
     aligner: FrameAligner
     maps: FusedMapLayers
@@ -43,12 +43,12 @@ class MissionData:
         members = Membership(store, settings)
         keyframes = KeyframePool(store, quotas.keyframe_limits, decode)
         objects, checks, traffic = TeamObjects(store), UpdateChecks(store, quotas), TrafficLog(store)
-        alignments, free_space = FrameAlignments(store), FreeSpaceRecords(store, grid)
+        alignments = FrameAlignments(store)
         votes = VoteInput(store, alignments, grid)
-        aligner = FrameAligner(store, alignments, votes, free_space, lock, settings.alignment)
+        aligner = FrameAligner(store, alignments, lock, grid, settings.alignment)
         refined = load_refinement(store)
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
-        of_agents = aligner, free_space, checks, traffic, keyframes, objects
+        of_agents = checks, traffic, keyframes, objects
         return cls(
             members=members,
             keyframes=keyframes,
@@ -56,9 +56,8 @@ class MissionData:
             checks=checks,
             traffic=traffic,
             alignments=alignments,
-            free_space=free_space,
             votes=votes,
             aligner=aligner,
             maps=maps,
-            agents=AgentData(store, votes, maps, alignments, of_agents),
+            agents=AgentData(store, votes, maps, alignments, aligner, of_agents),
         )

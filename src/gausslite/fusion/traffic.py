@@ -120,7 +120,6 @@ class AgentContribution:
     last_update_seq: int = 0
     keyframes: int = 0
     targets: tuple[str, ...] = ()
-    free_voxels: int = 0
     alignment: FrameAlignment = field(default_factory=lambda: FrameAlignment(0))
     traffic: TrafficCounters = field(default_factory=TrafficCounters)
 

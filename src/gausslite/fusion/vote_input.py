@@ -1,188 +1,234 @@
-"""The voxel updates as the vote reads them, in the fused frame without quarantined agents; what agents saw as free."""
+"""The voxel updates as the vote reads them: in the fused frame, without quarantined agents."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored import MAX_BLOCKS, decode_free_space, encode_free_space
-from gausslite.domain.errors import InvalidInputError, QuotaError
-from gausslite.domain.free_space import FreeSpace
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
-from gausslite.domain.voxel_changes import VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxels import (
     VoxelBatch,
     VoxelGrid,
-    VoxelIndex,
-    empty_batch,
     group_by_voxel,
+    merge_batches,
     select_keys,
     select_voxels,
 )
-from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameAlignments
+from gausslite.fusion.frames import FrameAlignments
 from gausslite.fusion.store import FusionStore, VoxelScoreTable
 
-RECORD = "free_space"
-_STORED_BYTES = 1 << 23
-MIN_VIEWS = 2
-"""Views of one agent that have to agree: one view may have a wrong depth or pose."""
+SLICE_VOXELS = 128
+_Cells = dict[int, tuple[int, int]]
+"""Σkappa and number of Gaussians by voxel of the fused grid."""
 
 
-class FreeSpaceRecords:
-    """Each agent's free space, in the store. Not thread-safe; FusionEngine holds a lock."""
+class _MovedVoxels:
+    """Where the voxels of an agent in another frame lie in the fused grid: a voxel has parts of several.
 
-    def __init__(self, store: FusionStore, grid: VoxelGrid) -> None:
-        self._store, self.grid = store, grid
-        stored = store.records(RECORD).items()
-        self._by_agent = {agent_id: decode_free_space(data, _STORED_BYTES)[0] for agent_id, data in stored}
+    Voxels that are not in the index are used as sent; a quarantined voxel is in it, without cells.
+    """
 
-    def contribute(self, agent_id: str, blocks: FreeSpace) -> None:
-        """Replace these blocks of an agent. Raises QuotaError, InvalidInputError for blocks out of the grid's range."""
-        blocks.require_within(self.grid)
-        after = self._by_agent.get(agent_id, FreeSpace.empty()).replace_blocks(blocks)
-        if len(after.keys) > MAX_BLOCKS:
-            raise QuotaError(f"free space: expected at most {MAX_BLOCKS} blocks of an agent, got {len(after.keys)}")
-        self._store.save_record(agent_id, RECORD, encode_free_space(after, self.grid))
-        self._by_agent[agent_id] = after
+    def __init__(self) -> None:
+        self.cells_of: dict[int, _Cells] = {}
+        self.sources_of: dict[int, set[int]] = {}
 
-    def free_voxels(self, agent_id: str) -> int:
-        """Return the number of voxels that the agent has observed as free."""
-        return self._by_agent.get(agent_id, FreeSpace.empty()).free_voxels
+    def replace(self, source: int, cells: _Cells | None) -> set[int]:
+        """Replace the cells of one voxel, None if it is used as sent; returns the fused voxels that may change."""
+        before = self.cells_of.pop(source, None)
+        # without an entry, the voxel was used as sent
+        changed = {source} if before is None or cells is None else set()
+        for cell in before or ():
+            changed.add(cell)
+            self.sources_of[cell].discard(source)
+            if not self.sources_of[cell]:
+                del self.sources_of[cell]
+        if cells is not None:
+            self.cells_of[source] = cells
+            for cell in cells:
+                changed.add(cell)
+                self.sources_of.setdefault(cell, set()).add(source)
+        return changed
 
-    def seen_by(self, agents: Collection[str], keys: Int64[ndarray, " k"]) -> Bool[ndarray, " k"]:
-        """Return True for the voxels that one of these agents has observed as free in two views."""
-        seen = np.zeros(len(keys), np.bool_)
-        for agent_id in self._by_agent.keys() & set(agents):
-            seen |= self._by_agent[agent_id].views(keys, self.grid) >= MIN_VIEWS
-        return seen
-
-    def remove_agent(self, agent_id: str) -> None:
-        """Forget the agent; the store deletes its record with its updates."""
-        self._by_agent.pop(agent_id, None)
+    def totals(self, cell: int) -> tuple[int, int]:
+        """Return Σkappa and number of Gaussians of a voxel of the fused grid."""
+        parts = [self.cells_of[source][cell] for source in self.sources_of[cell]]
+        return sum(kappa for kappa, _ in parts), sum(count for _, count in parts)
 
 
 class VoteInput:
-    """Reads the updates from the store; the moved maps of agents in other frames are cached.
+    """Reads the updates from the store, and moves those of agents in other frames.
 
-    Not thread-safe; FusionEngine holds a lock.
+    The index has the totals of the moved voxels; their Gaussians are moved when they are read. So a message, or a slice
+    of a map whose frame changes, costs its own voxels. Not thread-safe; FusionEngine holds a lock.
     """
 
     def __init__(self, store: FusionStore, alignments: FrameAlignments, grid: VoxelGrid) -> None:
         self._store, self._alignments, self._grid = store, alignments, grid
-        self._moved: dict[str, VoxelBatch] = {}
-        self._trackers: dict[str, VoxelChangeTracker] = {}
+        self._moved: dict[str, _MovedVoxels] = {}
         for agent_id in store.agents():
             if not self._is_as_sent(agent_id):
-                self.refresh(agent_id)
+                for keys in self.slices(agent_id):
+                    self.move(agent_id, keys)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
         return self._store.agents()
 
+    def slices(self, agent_id: str) -> Iterator[Int64[ndarray, " k"]]:
+        """Yield the agent's voxels in slices, as they are now."""
+        table = self._store.scores()
+        index = {name: i for i, name in enumerate(table.agents)}.get(agent_id, -1)
+        keys = table.keys[table.agent_index == index]
+        yield from (keys[start : start + SLICE_VOXELS] for start in range(0, len(keys), SLICE_VOXELS))
+
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         table = self._store.scores(keys)
-        if not self._moved:
-            return table
-        kept = ~np.isin(table.agent_index, [i for i, name in enumerate(table.agents) if name in self._moved])
-        moved = {i: _select(self._moved[name], keys) for i, name in enumerate(table.agents) if name in self._moved}
-        return _merge_scores(table, kept, moved)
+        for index, agent_id in enumerate(table.agents):
+            if agent_id in self._moved:
+                table = self._with_moved(table, index, self._moved[agent_id], keys)
+        return table
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return the updates of one agent on these voxels, or on all; empty in quarantine."""
-        is_moved = agent_id in self._moved
-        return _select(self._moved[agent_id], keys) if is_moved else self._store.batch(agent_id, keys)
+        moved = self._moved.get(agent_id)
+        if moved is None:
+            return self._store.batch(agent_id, keys)
+        if keys is None:
+            as_sent = self._store.batch(agent_id)
+            as_sent = select_voxels(as_sent, ~np.isin(as_sent.keys, _array(moved.cells_of)))
+        else:
+            as_sent = self._store.batch(agent_id, _array(set(keys.tolist()) - moved.cells_of.keys()))
+        cells = list(moved.sources_of) if keys is None else [key for key in keys.tolist() if key in moved.sources_of]
+        sources = set().union(*(moved.sources_of[cell] for cell in cells))
+        found = select_keys(self._move(agent_id, _array(sources)), _array(cells))
+        both = np.isin(as_sent.keys, found.keys)
+        if not both.any():
+            return merge_batches(as_sent, found)
+        # while a map's frame changes, slice by slice, a voxel can have Gaussians of both frames
+        mixed = select_voxels(as_sent, both).gaussians
+        others = ~np.isin(found.keys, as_sent.keys[both])
+        shared = group_by_voxel(Gaussians.concatenate([mixed, select_voxels(found, ~others).gaussians]), self._grid)
+        return merge_batches(select_voxels(as_sent, ~both), select_voxels(found, others), shared)
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the updates of every agent on these voxels, or on all."""
         batches = self._store.batches(keys)
-        return {
-            name: _select(self._moved[name], keys) if name in self._moved else batch for name, batch in batches.items()
-        }
+        return {name: self.batch(name, keys) if name in self._moved else batch for name, batch in batches.items()}
 
-    def refresh(self, agent_id: str) -> Int64[ndarray, " k"]:
-        """Recompute the agent's moved map after its updates or its alignment changed; returns the voxels to compare.
-
-        These are the voxels of the fused grid where the vote may read other data than before.
-        """
-        before = self._moved.pop(agent_id, None)
-        sent = self._store.batch(agent_id)
+    def move(self, agent_id: str, sources: Int64[ndarray, " a"]) -> Int64[ndarray, " k"]:
+        """Move these voxels of the agent by its alignment as it is now; returns the fused voxels that may change."""
+        if self._is_as_sent(agent_id) and agent_id not in self._moved:
+            return sources
+        moved = self._moved.setdefault(agent_id, _MovedVoxels())
+        changed: set[int] = set()
         if self._is_as_sent(agent_id):
-            self._trackers.pop(agent_id, None)
-            return sent.keys if before is None else np.union1d(before.keys, sent.keys)
-        tracker = self._trackers.get(agent_id)
-        is_first = tracker is None
-        if tracker is None:
-            tracker = self._trackers[agent_id] = VoxelChangeTracker()
-        moved = self._move(agent_id, sent)
-        voxels = VoxelIndex.from_points(moved.gaussians.means_m, self._grid)
-        signatures = VoxelSignatures.from_gaussians(moved.gaussians, voxels)
-        changed, removed = tracker.update(signatures)
-        self._moved[agent_id] = moved
-        keys = np.union1d(signatures.keys[changed], removed)
-        return np.union1d(keys, sent.keys) if is_first else keys
-
-    def changed_keys(self, agent_id: str, accepted: Int64[ndarray, " a"]) -> Int64[ndarray, " k"]:
-        """Return the voxels of the fused grid that these accepted updates of the agent may change."""
-        return accepted if self._is_as_sent(agent_id) else self.refresh(agent_id)
+            for source in sources.tolist():
+                changed |= {source} | moved.replace(source, None)
+            if not moved.cells_of:
+                del self._moved[agent_id]
+            return _array(changed)
+        cells_of: dict[int, _Cells] = {source: {} for source in sources.tolist()}
+        if self._alignments.get(agent_id).is_used:
+            batch = self._store.batch(agent_id, sources)
+            gaussians = self._gaussians_in_frame(agent_id, batch)
+            rows = np.flatnonzero(self._in_range(gaussians))
+            for source, cell, kappa, count in _totals_by_cell(batch, gaussians.take(rows), rows, self._grid):
+                cells_of[source][cell] = kappa, count
+        for source, cells in cells_of.items():
+            changed |= moved.replace(source, cells)
+        return _array(changed)
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " k"]:
-        """Forget the agent's moved map; returns its voxels."""
-        self._trackers.pop(agent_id, None)
+        """Forget the agent's moved voxels; returns them."""
         moved = self._moved.pop(agent_id, None)
-        return np.zeros(0, np.int64) if moved is None else moved.keys
+        return _array(() if moved is None else moved.sources_of)
 
     def _is_as_sent(self, agent_id: str) -> bool:
         alignment = self._alignments.get(agent_id)
-        return alignment.is_identity and alignment.state is not AlignmentState.QUARANTINED
+        return alignment.is_identity and alignment.is_used
 
-    def _move(self, agent_id: str, sent: VoxelBatch) -> VoxelBatch:
+    def _move(self, agent_id: str, sources: Int64[ndarray, " s"]) -> VoxelBatch:
+        gaussians = self._gaussians_in_frame(agent_id, self._store.batch(agent_id, sources))
+        return group_by_voxel(gaussians.take(np.flatnonzero(self._in_range(gaussians))), self._grid)
+
+    def _gaussians_in_frame(self, agent_id: str, batch: VoxelBatch) -> Gaussians:
+        """Return the Gaussians in the fused frame, in their order."""
         alignment = self._alignments.get(agent_id)
-        if alignment.state is AlignmentState.QUARANTINED:
-            return empty_batch()
-        return move_batch(sent, self._store.stored(agent_id, sent.keys).update_seqs, alignment, self._grid)
+        segments = alignment.segment_of(self._store.stored(agent_id, batch.keys).update_seqs)
+        used = np.unique(segments)
+        if len(used) == 1:
+            return move_gaussians(batch.gaussians, alignment.transform(int(used[0])))
+        of_gaussian = np.repeat(segments, batch.counts)
+        rows = [np.flatnonzero(of_gaussian == segment) for segment in used]
+        parts = [
+            move_gaussians(batch.gaussians.take(own), alignment.transform(int(segment)))
+            for own, segment in zip(rows, used, strict=True)
+        ]
+        order = np.argsort(np.concatenate([np.zeros(0, np.int64), *rows]))
+        return Gaussians.concatenate(parts).take(order)
+
+    def _in_range(self, gaussians: Gaussians) -> ndarray:
+        """Return which Gaussians are within the range of the grid; the others are dropped."""
+        try:
+            self._grid.keys(gaussians.means_m)
+        except InvalidInputError:
+            return (np.abs(gaussians.means_m) < 0.99 * self._grid.max_coordinate_m).all(axis=1)
+        return np.ones(len(gaussians), np.bool_)
+
+    def _with_moved(
+        self, table: VoxelScoreTable, index: int, moved: _MovedVoxels, keys: Int64[ndarray, " k"] | None
+    ) -> VoxelScoreTable:
+        """Return the table with the agent's moved voxels in place of those of the index."""
+        own = np.flatnonzero(table.agent_index == index)
+        sources = np.fromiter((key in moved.cells_of for key in table.keys[own].tolist()), np.bool_, len(own))
+        replaced = own[sources]
+        wanted = moved.sources_of if keys is None else [key for key in keys.tolist() if key in moved.sources_of]
+        totals = {key: moved.totals(key) for key in wanted}
+        for row in own[~sources].tolist():
+            key = int(table.keys[row])
+            if key in totals and table.counts[row]:
+                kappa, count = totals[key]
+                totals[key] = kappa + int(table.kappa_sums[row]), count + int(table.counts[row])
+        also = own[~sources][np.isin(table.keys[own[~sources]], _array(totals))]
+        kept = np.ones(len(table.keys), np.bool_)
+        kept[replaced] = kept[also] = False
+        sums = np.array([kappa for kappa, _ in totals.values()], np.uint64)
+        counts = np.array([count for _, count in totals.values()], np.uint32)
+        indices = np.concatenate([table.agent_index[kept], np.full(len(totals), index, np.int32)])
+        all_keys = np.concatenate([table.keys[kept], np.array(list(totals), np.int64)])
+        order = np.lexsort((all_keys, indices))
+        return VoxelScoreTable(
+            table.agents,
+            indices[order],
+            all_keys[order],
+            np.concatenate([table.update_seqs[kept], np.zeros(len(totals), np.int64)])[order],
+            np.concatenate([table.kappa_sums[kept], sums])[order],
+            np.concatenate([table.counts[kept], counts])[order],
+        )
 
 
-def move_batch(
-    batch: VoxelBatch, update_seqs: Int64[ndarray, " v"], alignment: FrameAlignment, grid: VoxelGrid
-) -> VoxelBatch:
-    """Return the Gaussians of an agent's updates in the fused frame, grouped by the fused map's voxels.
-
-    Gaussians that leave the range of the grid are dropped.
-    """
-    segments = alignment.segment_of(update_seqs)
-    parts = [
-        move_gaussians(select_voxels(batch, segments == segment).gaussians, alignment.transform(int(segment)))
-        for segment in np.unique(segments)
-    ]
-    gaussians = Gaussians.concatenate(parts)
-    try:
-        return group_by_voxel(gaussians, grid)
-    except InvalidInputError:
-        inside = (np.abs(gaussians.means_m) < 0.99 * grid.max_coordinate_m).all(axis=1)
-        return group_by_voxel(gaussians.take(inside), grid)
+def _totals_by_cell(
+    batch: VoxelBatch, moved: Gaussians, rows: Int64[ndarray, " n"], grid: VoxelGrid
+) -> Iterator[tuple[int, int, int, int]]:
+    """Yield source voxel, fused voxel, Σkappa and number of Gaussians of each pair; rows: the Gaussians in the batch"""
+    if len(rows) == 0:
+        return
+    sources, cells = np.repeat(batch.keys, batch.counts)[rows], grid.keys(moved.means_m)
+    order = np.lexsort((cells, sources))
+    sources, cells = sources[order], cells[order]
+    is_first = np.ones(len(order), np.bool_)
+    is_first[1:] = (sources[1:] != sources[:-1]) | (cells[1:] != cells[:-1])
+    starts = np.flatnonzero(is_first)
+    sums = np.add.reduceat(moved.kappa[order], starts, dtype=np.uint64)
+    counts = np.diff(starts, append=len(order))
+    yield from zip(sources[starts].tolist(), cells[starts].tolist(), sums.tolist(), counts.tolist(), strict=True)
 
 
-def _select(batch: VoxelBatch, keys: Int64[ndarray, " k"] | None) -> VoxelBatch:
-    return batch if keys is None else select_keys(batch, keys)
-
-
-def _merge_scores(table: VoxelScoreTable, kept: ndarray, moved: Mapping[int, VoxelBatch]) -> VoxelScoreTable:
-    """Return the kept rows and those of the moved batches, sorted by agent and key."""
-    index = np.concatenate(
-        [table.agent_index[kept], *(np.full(len(batch), i, np.int32) for i, batch in moved.items())]
-    ).astype(np.int32)
-    keys = np.concatenate([table.keys[kept], *(batch.keys for batch in moved.values())])
-    order = np.lexsort((keys, index))
-    zeros = [np.zeros(len(batch), np.int64) for batch in moved.values()]
-    return VoxelScoreTable(
-        table.agents,
-        index[order],
-        keys[order],
-        np.concatenate([table.update_seqs[kept], *zeros])[order],
-        np.concatenate([table.kappa_sums[kept], *(batch.kappa_sums for batch in moved.values())])[order],
-        np.concatenate([table.counts[kept], *(batch.counts for batch in moved.values())])[order],
-    )
+def _array(keys: Iterable[int]) -> Int64[ndarray, " k"]:
+    """Return these voxel keys, ascending."""
+    return np.array(sorted(keys), np.int64)

@@ -134,7 +134,7 @@ class _AlignmentStateEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Alignm
     ALIGNMENT_STATE_CORRECTED: _AlignmentState.ValueType  # 3
     """The misfit is within the bound; the agent's contribution is corrected by T_fused_agent."""
     ALIGNMENT_STATE_QUARANTINED: _AlignmentState.ValueType  # 4
-    """The misfit exceeds the bound; the agent's contribution is stored but not fused."""
+    """It contradicts other agents' maps; the agent's contribution is stored but not fused."""
 
 class AlignmentState(_AlignmentState, metaclass=_AlignmentStateEnumTypeWrapper): ...
 
@@ -147,7 +147,7 @@ ALIGNMENT_STATE_ALIGNED: AlignmentState.ValueType  # 2
 ALIGNMENT_STATE_CORRECTED: AlignmentState.ValueType  # 3
 """The misfit is within the bound; the agent's contribution is corrected by T_fused_agent."""
 ALIGNMENT_STATE_QUARANTINED: AlignmentState.ValueType  # 4
-"""The misfit exceeds the bound; the agent's contribution is stored but not fused."""
+"""It contradicts other agents' maps; the agent's contribution is stored but not fused."""
 Global___AlignmentState: _TypeAlias = AlignmentState  # noqa: Y015
 
 @_typing.final
@@ -170,7 +170,7 @@ class JoinSessionRequest(_message.Message):
     """Name of the coordinate frame of all poses and means; empty accepts the server's."""
     fresh_map: _builtins.bool
     """The agent begins a new map. Its earlier updates stay in the vote as agent_id + ":earlier", until the new map has
-    the higher sum of kappa in all their voxels. Its keyframes, objects and free space are deleted.
+    the higher sum of kappa in all their voxels. Its keyframes and objects are deleted.
     """
     token: _builtins.str
     """A secret of this robot, the same in all of its joins. While the name's lease lasts, only its holder may join again."""
@@ -281,6 +281,7 @@ class KeepSessionResponse(_message.Message):
 
     HIGHEST_UPDATE_SEQ_FIELD_NUMBER: _builtins.int
     INCARNATION_ID_FIELD_NUMBER: _builtins.int
+    ALIGNMENT_FIELD_NUMBER: _builtins.int
     highest_update_seq: _builtins.int
     """If this is lower than a sequence number that the server has acknowledged, it has lost updates, for example with the
     end of its log. The agent then joins again and compares digests.
@@ -289,15 +290,20 @@ class KeepSessionResponse(_message.Message):
     """The id of the store's content. It changes with a new store, a restored backup and a repair. The agent then joins
     again and compares digests.
     """
+    @_builtins.property
+    def alignment(self) -> Global___FrameAlignment:
+        """How the agent's frame fits, for its log."""
+
     def __init__(
         self,
         *,
         highest_update_seq: _builtins.int = ...,
         incarnation_id: _builtins.str = ...,
+        alignment: Global___FrameAlignment | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["alignment", b"alignment"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["highest_update_seq", b"highest_update_seq", "incarnation_id", b"incarnation_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["alignment", b"alignment", "highest_update_seq", b"highest_update_seq", "incarnation_id", b"incarnation_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -863,7 +869,6 @@ class AgentContribution(_message.Message):
     LAST_UPDATE_SEQ_FIELD_NUMBER: _builtins.int
     LAST_SEEN_NS_FIELD_NUMBER: _builtins.int
     ALIGNMENT_FIELD_NUMBER: _builtins.int
-    FREE_VOXELS_FIELD_NUMBER: _builtins.int
     TARGETS_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     joined: _builtins.bool
@@ -885,8 +890,6 @@ class AgentContribution(_message.Message):
     """The highest sequence number of its updates; 0 without any."""
     last_seen_ns: _builtins.int
     """Time of its latest subset, by the server's clock; 0 before the first."""
-    free_voxels: _builtins.int
-    """Voxels that the agent has observed as free."""
     @_builtins.property
     def alignment(self) -> Global___FrameAlignment: ...
     @_builtins.property
@@ -911,12 +914,11 @@ class AgentContribution(_message.Message):
         last_update_seq: _builtins.int = ...,
         last_seen_ns: _builtins.int = ...,
         alignment: Global___FrameAlignment | None = ...,
-        free_voxels: _builtins.int = ...,
         targets: _abc.Iterable[_builtins.str] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["alignment", b"alignment"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "alignment", b"alignment", "free_voxels", b"free_voxels", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_seen_ns", b"last_seen_ns", "last_update_seq", b"last_update_seq", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "targets", b"targets", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "alignment", b"alignment", "gaussians", b"gaussians", "handover_bytes", b"handover_bytes", "joined", b"joined", "kappa_sum", b"kappa_sum", "keyframes", b"keyframes", "last_seen_ns", b"last_seen_ns", "last_update_seq", b"last_update_seq", "roi_bytes", b"roi_bytes", "subsets_accepted", b"subsets_accepted", "subsets_rejected", b"subsets_rejected", "subsets_stale", b"subsets_stale", "targets", b"targets", "voxels", b"voxels", "won_voxels", b"won_voxels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -938,14 +940,16 @@ class FrameAlignment(_message.Message):
     MESSAGE_FIELD_NUMBER: _builtins.int
     state: Global___AlignmentState.ValueType
     residual_before_m: _builtins.float
-    """Median distance to the other agents' surfaces and median colour difference, 0 to 1, before and after correction."""
+    """Mean distance to the other agents' surfaces, up to 0.1, and mean luminance difference, up to 0.25, where both have
+    surfaces: as used until the latest comparison, and after the motion that it found.
+    """
     residual_after_m: _builtins.float
     colour_before: _builtins.float
     colour_after: _builtins.float
     compared: _builtins.int
     """Number of Gaussians compared."""
     message: _builtins.str
-    """Why the contribution is quarantined, or empty."""
+    """Why the contribution is corrected, quarantined, or about to be; empty otherwise."""
     @_builtins.property
     def t_fused_agent(self) -> _geometry_pb2.RigidTransform:
         """Correction in use for the agent's latest updates."""
@@ -1058,49 +1062,6 @@ class QueryObjectsResponse(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___QueryObjectsResponse: _TypeAlias = QueryObjectsResponse  # noqa: Y015
-
-@_typing.final
-class ContributeFreeSpaceRequest(_message.Message):
-    DESCRIPTOR: _descriptor.Descriptor
-
-    SESSION_ID_FIELD_NUMBER: _builtins.int
-    FREE_SPACE_FIELD_NUMBER: _builtins.int
-    session_id: _builtins.str
-    free_space: _builtins.bytes
-    """Encoded by the free-space codec: the number of views that observed each voxel of some blocks as free."""
-    def __init__(
-        self,
-        *,
-        session_id: _builtins.str = ...,
-        free_space: _builtins.bytes = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["free_space", b"free_space", "session_id", b"session_id"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___ContributeFreeSpaceRequest: _TypeAlias = ContributeFreeSpaceRequest  # noqa: Y015
-
-@_typing.final
-class ContributeFreeSpaceResponse(_message.Message):
-    DESCRIPTOR: _descriptor.Descriptor
-
-    FREE_VOXELS_FIELD_NUMBER: _builtins.int
-    free_voxels: _builtins.int
-    """Voxels that the server now stores as observed free by this agent."""
-    def __init__(
-        self,
-        *,
-        free_voxels: _builtins.int = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["free_voxels", b"free_voxels"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___ContributeFreeSpaceResponse: _TypeAlias = ContributeFreeSpaceResponse  # noqa: Y015
 
 @_typing.final
 class RenderFusedViewRequest(_message.Message):

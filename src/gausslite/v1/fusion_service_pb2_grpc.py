@@ -79,11 +79,6 @@ class FusionServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsResponse.FromString,
                 _registered_method=True)
-        self.ContributeFreeSpace = channel.unary_unary(
-                '/gausslite.v1.FusionService/ContributeFreeSpace',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceResponse.FromString,
-                _registered_method=True)
         self.RenderView = channel.unary_unary(
                 '/gausslite.v1.FusionService/RenderView',
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.RenderFusedViewRequest.SerializeToString,
@@ -194,13 +189,6 @@ class FusionServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
-    def ContributeFreeSpace(self, request, context):
-        """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others.
-        """
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
     def RenderView(self, request, context):
         """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders.
         """
@@ -296,11 +284,6 @@ def add_FusionServiceServicer_to_server(servicer, server):
                     servicer.QueryObjects,
                     request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsResponse.SerializeToString,
-            ),
-            'ContributeFreeSpace': grpc.unary_unary_rpc_method_handler(
-                    servicer.ContributeFreeSpace,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceResponse.SerializeToString,
             ),
             'RenderView': grpc.unary_unary_rpc_method_handler(
                     servicer.RenderView,
@@ -581,33 +564,6 @@ class FusionService(object):
             '/gausslite.v1.FusionService/QueryObjects',
             gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsRequest.SerializeToString,
             gausslite_dot_v1_dot_fusion__service__pb2.QueryObjectsResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def ContributeFreeSpace(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/gausslite.v1.FusionService/ContributeFreeSpace',
-            gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.ContributeFreeSpaceResponse.FromString,
             options,
             channel_credentials,
             insecure,

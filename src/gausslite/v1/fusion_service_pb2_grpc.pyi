@@ -63,8 +63,6 @@ class FusionServiceStub:
     """Replace the agent's task graph and object landmarks; both are as durable as the server's store."""
     QueryObjects: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.QueryObjectsRequest, _fusion_service_pb2.QueryObjectsResponse]
     """The team's objects, each merged over the agents that observed it, or those that a noun names."""
-    ContributeFreeSpace: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.ContributeFreeSpaceRequest, _fusion_service_pb2.ContributeFreeSpaceResponse]
-    """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others."""
     RenderView: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
@@ -112,8 +110,6 @@ class FusionServiceAsyncStub(FusionServiceStub):
     """Replace the agent's task graph and object landmarks; both are as durable as the server's store."""
     QueryObjects: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.QueryObjectsRequest, _fusion_service_pb2.QueryObjectsResponse]  # type: ignore[assignment]
     """The team's objects, each merged over the agents that observed it, or those that a noun names."""
-    ContributeFreeSpace: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.ContributeFreeSpaceRequest, _fusion_service_pb2.ContributeFreeSpaceResponse]  # type: ignore[assignment]
-    """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others."""
     RenderView: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.RenderFusedViewRequest, _fusion_service_pb2.RenderFusedViewResponse]  # type: ignore[assignment]
     """Render a layer of the map from a camera pose. RESOURCE_EXHAUSTED for more pixels than the server renders."""
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
@@ -212,14 +208,6 @@ class FusionServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_fusion_service_pb2.QueryObjectsResponse, _abc.Awaitable[_fusion_service_pb2.QueryObjectsResponse]]:
         """The team's objects, each merged over the agents that observed it, or those that a noun names."""
-
-    @_abc_1.abstractmethod
-    def ContributeFreeSpace(
-        self,
-        request: _fusion_service_pb2.ContributeFreeSpaceRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.ContributeFreeSpaceResponse, _abc.Awaitable[_fusion_service_pb2.ContributeFreeSpaceResponse]]:
-        """Replace what the agent has observed as free in some blocks of voxels: evidence about the frames of the others."""
 
     @_abc_1.abstractmethod
     def RenderView(

@@ -16,12 +16,10 @@ from google.protobuf.message import Message
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
-from gausslite.codec.stored import encode_free_space
 from gausslite.codec.subset_codec import CodecLimits
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
@@ -331,15 +329,6 @@ class FusionClient(ServiceChannel):
         response = self._call(self._stub.RenderView, request)
         size = camera.width_px, camera.height_px
         return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
-
-    def contribute_free_space(self, session_id: str, free: FreeSpace, grid: VoxelGrid) -> int:
-        """Replace what this agent observed as free in these blocks; returns the bytes sent. Raises QuotaError."""
-        data = encode_free_space(free, grid)
-        self._call(
-            self._stub.ContributeFreeSpace,
-            fusion_service_pb2.ContributeFreeSpaceRequest(session_id=session_id, free_space=data),
-        )
-        return len(data)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> int:
         """Replace the agent's task graph and objects; returns the bytes sent. Raises SessionUnknownError."""

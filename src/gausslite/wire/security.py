@@ -149,7 +149,6 @@ ROLES_OF_METHOD: Final = {
     _FUSION + "JoinSession": _ROBOT,
     _FUSION + "ContributeSubsets": _ROBOT,
     _FUSION + "ContributeKeyframes": _ROBOT,
-    _FUSION + "ContributeFreeSpace": _ROBOT,
     _FUSION + "ReportObjects": _ROBOT,
     _FUSION + "KeepSession": _ROBOT,
     _FUSION + "GetUpdateDigests": _ROBOT,

@@ -27,7 +27,6 @@ from gausslite.domain.errors import (
     SessionUnknownError,
     StorageError,
 )
-from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.v1 import geometry_pb2
@@ -35,7 +34,7 @@ from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.security import TokenBucket
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch, SpooledKeyframe
-from gausslite.wire.update_sender import FreeSpaceOutbox, ObjectOutbox, UpdateSender, UplinkCounters, UplinkSettings
+from gausslite.wire.update_sender import ObjectOutbox, UpdateSender, UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
 _MIN_INTERVAL_S = 0.02
@@ -70,7 +69,7 @@ class Uplink:
         self._drain_limit_s = math.inf
         self._sent_keyframes: set[int] = set()
         self._objects = ObjectOutbox()
-        self._free_space = FreeSpaceOutbox()
+        self._frame_message = ""
         # guards the counters and flags; waited on by the thread and by drain
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="uplink", daemon=True)
@@ -93,13 +92,6 @@ class Uplink:
     def report_objects(self, report: ObjectReport) -> None:
         """Send the agent's task and objects with the next round; a newer report replaces one that waits."""
         if self._objects.put(report):
-            with self._changed:
-                self._changed.notify_all()
-
-    def enqueue_free_space(self, blocks: FreeSpace) -> None:
-        """Send these blocks of free space with the next round; newer ones replace those that wait."""
-        if len(blocks.keys):
-            self._free_space.put(blocks)
             with self._changed:
                 self._changed.notify_all()
 
@@ -167,8 +159,7 @@ class Uplink:
         return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
 
     def _has_pending(self) -> bool:
-        has_others = self._objects.pending is not None or self._free_space.has_pending
-        return has_others or self._spool.pending_voxels + self._spool.pending_keyframes > 0
+        return self._objects.pending is not None or self._spool.pending_voxels + self._spool.pending_keyframes > 0
 
     def _run(self) -> None:
         try:
@@ -209,7 +200,7 @@ class Uplink:
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
         due = self._spool.next_round(max_bytes, resend_threshold)
-        if due is None and self._objects.pending is None and not self._free_space.has_pending:
+        if due is None and self._objects.pending is None:
             return False
         is_new_session = self._session is None
         session = self._join_if_needed()
@@ -217,7 +208,6 @@ class Uplink:
             # the comparison of digests may have added updates
             due = self._spool.next_round(max_bytes, resend_threshold)
         self._token_bucket.spend(self._objects.send(self._client, session.session_id))
-        self._token_bucket.spend(self._free_space.send(self._client, session.session_id, self._grid))
         if due is None:
             return True
         if due.voxels is not None:
@@ -234,15 +224,17 @@ class Uplink:
             return
         kept = self._client.keep_session(self._session.session_id)
         self._next_check_s = time.monotonic() + self._settings.check_interval_s
+        if kept.alignment.message != self._frame_message:
+            self._frame_message = kept.alignment.message
+            _log.warning("uplink: %s", self._frame_message or "frame: nothing contradicts it any more")
         if not self._spool.is_stored_by(kept.incarnation_id, kept.highest_update_seq):
             self._forget_session()
             self._join_if_needed()
 
     def _forget_session(self) -> None:
-        """Join again with the next round, and send objects and free space again; digests find the other updates."""
+        """Join again with the next round, and send objects again; digests find the other updates."""
         self._session = None
         self._objects.mark_unsent()
-        self._free_space.mark_unsent()
 
     def _resend_missing(self, session: Session) -> None:
         """If the server may have lost updates, compare digests and mark as unsent what differs."""

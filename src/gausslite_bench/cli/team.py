@@ -16,6 +16,8 @@ from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.voxels import group_by_voxel
+from gausslite.fusion.alignment import SurfaceSamples
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import as_text, prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
@@ -23,7 +25,9 @@ from gausslite_bench.cli.argument_types import read_image_size, read_seeds
 from gausslite_bench.cli.study_options import add_real_sequence, real_sequence_plans
 from gausslite_bench.team.bench import TeamResult, TeamTrial, run_trial
 from gausslite_bench.team.frame_errors import FrameError
+from gausslite_bench.team.frame_pairs import judge_pairs, pairs_table
 from gausslite_bench.team.late_joiner import late_joiner_table, run_late_joiner
+from gausslite_bench.team.missions import map_agent
 from gausslite_bench.team.object_positions import PositionScore, measure_positions, positions_table
 from gausslite_bench.team.scenes import HomeTeamPlan, RecordingTeamPlan, TeamPlan
 from gausslite_bench.team.tables import team_table
@@ -81,6 +85,12 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="only measure where perception places the objects of the first agent's task",
     )
+    parser.add_argument(
+        "--frame-pairs",
+        metavar="N",
+        type=int,
+        help="only judge N pairs of parts of the agents' maps, half of them in wrong frames, as the server does",
+    )
     add(
         "--detector",
         metavar="FILE.onnx",
@@ -94,8 +104,10 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
 
 def run_team(options: argparse.Namespace) -> int:
     """Run the trials; the files are rewritten after each, so that an interrupt loses one trial at most."""
-    if options.late_joiner and options.positions:
-        raise InvalidInputError("--late-joiner and --positions: expected one of them, got both")
+    if sum((options.late_joiner, options.positions, options.frame_pairs is not None)) > 1:
+        raise InvalidInputError("--late-joiner, --positions and --frame-pairs: expected one of them, got several")
+    if options.frame_pairs is not None and options.frame_pairs < 1:
+        raise InvalidInputError(f"--frame-pairs: expected at least 1, got {options.frame_pairs}")
     if options.detector is not None and not options.positions:
         raise InvalidInputError("--detector: expected --positions, which uses it; other trials have exact masks")
     plans, size = _plans(options)
@@ -105,6 +117,8 @@ def run_team(options: argparse.Namespace) -> int:
     prepare_folder(options.out)
     if options.late_joiner:
         return _run_late_joiner(options, trials)
+    if options.frame_pairs is not None:
+        return _run_frame_pairs(options, trials)
     results: list[TeamResult] = []
     with progress_bar(0, "team", "frame") as bar:
         for plan, plan_trials in trials:
@@ -133,6 +147,25 @@ def _run_late_joiner(options: argparse.Namespace, trials: Sequence[tuple[TeamPla
         results.append(run_late_joiner(trial.plan, trial.settings, trial.size, trial.grid))
         print_above_bar(results[-1].row)
     _write_table(options, "late-joiner", late_joiner_table(results), [asdict(result) for result in results])
+    return 0
+
+
+def _run_frame_pairs(options: argparse.Namespace, trials: Sequence[tuple[TeamPlan, Sequence[TeamTrial]]]) -> int:
+    """Map every scene once, judge pairs of parts of its first two maps; write frame-pairs.md and .json."""
+    maps = []
+    with progress_bar(0, "maps", "frame") as bar:
+        for plan, (trial, *_) in trials:
+            agents = plan.load(trial.size).agents[:2]
+            _expect(bar, sum(len(agent.frames) for agent in agents))
+            batches = [
+                group_by_voxel(
+                    map_agent(agent, trial.settings, trial.grid, lambda _: _count(bar)).gaussians, trial.grid
+                )
+                for agent in agents
+            ]
+            maps.append((SurfaceSamples.of(batches[0]), SurfaceSamples.of(batches[1])))
+    pairs = judge_pairs(maps, options.frame_pairs, options.seeds[0])
+    _write_table(options, "frame-pairs", pairs_table(pairs), [asdict(pair) for pair in pairs])
     return 0
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from gausslite.codec.json import decode_object_report
 from gausslite.codec.ply import gaussians_from_ply, world_frame_from_ply
-from gausslite.codec.stored import CODES, decode_free_space, from_bytes, from_stored
+from gausslite.codec.stored import CODES, from_bytes, from_stored
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.convert import decode_frame
@@ -32,7 +32,6 @@ def _decode_stored_voxel(data: bytes) -> None:
 
 DECODERS: Mapping[str, Callable[[bytes], object]] = {
     "subset": decode_subset,
-    "free-space": decode_free_space,
     "keyframe": decode_frame,
     "object-report": decode_object_report,
     "records": from_bytes,
@@ -40,8 +39,7 @@ DECODERS: Mapping[str, Callable[[bytes], object]] = {
     "ply": _decode_ply,
 }
 _SHARES = {
-    "subset": 0.45,
-    "free-space": 0.15,
+    "subset": 0.6,
     "keyframe": 0.1,
     "object-report": 0.1,
     "records": 0.05,

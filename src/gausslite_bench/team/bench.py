@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_voxels
 from gausslite.evaluation.compare import MapScores, score_team
 from gausslite.evaluation.views import MapViewer
 from gausslite.fusion.engine import FusionEngine
@@ -115,12 +116,11 @@ def _fuse(trial: TeamTrial, maps: Sequence[AgentMap], align: bool) -> tuple[dict
     """Return the fused map of each strategy, and the engine that has received the whole maps."""
     grid = trial.grid
     whole = {agent_map.agent_id: whole_map(agent_map, grid) for agent_map in maps}
-    free = {agent_map.agent_id: agent_map.free_space for agent_map in maps}
-    engine = fuse_messages(whole, grid, align, free)
+    engine = fuse_messages(whole, grid, align)
     fused = {CONCATENATION: engine.maps.union_map().gaussians, VOTE: engine.maps.voted_map().gaussians}
     first, *others = maps
     shared = {first.agent_id: whole_map(first, grid), **{other.agent_id: other.messages for other in others}}
-    fused[SHARED_VOTE] = fuse_messages(shared, grid, align, free).maps.voted_map().gaussians
+    fused[SHARED_VOTE] = fuse_messages(shared, grid, align).maps.voted_map().gaussians
     if trial.refine_iterations > 0:
         keyframes = engine.in_fused_frame([keyframe for agent_map in maps for keyframe in agent_map.keyframes])
         fused[REFINED] = _refine(trial, fused[VOTE], keyframes)
@@ -128,24 +128,25 @@ def _fuse(trial: TeamTrial, maps: Sequence[AgentMap], align: bool) -> tuple[dict
 
 
 def whole_map(agent_map: AgentMap, grid: VoxelGrid) -> tuple[RoiSubset, ...]:
-    """Return the agent's complete map as one message, numbered after those that it sent."""
-    number = len(agent_map.messages) + 1
-    return (RoiSubset(agent_map.agent_id, "", number, number, group_by_voxel(agent_map.gaussians, grid)),)
+    """Return the agent's complete map as two messages of alternate voxels, numbered after those that it sent."""
+    batch, first = group_by_voxel(agent_map.gaussians, grid), len(agent_map.messages) + 1
+    return tuple(
+        RoiSubset(agent_map.agent_id, "", number, number, select_voxels(batch, np.arange(len(batch)) % 2 == number % 2))
+        for number in (first, first + 1)
+    )
 
 
 def fuse_messages(
     messages: Mapping[str, Sequence[RoiSubset]],
     grid: VoxelGrid,
     align: bool,
-    free_space: Mapping[str, FreeSpace],
 ) -> FusionEngine:
-    """Return a fusion engine that has received each agent's free space and messages, agent by agent."""
+    """Return a fusion engine that has received each agent's messages, agent by agent."""
     quotas = Quotas(voxels_per_agent=10_000_000, gaussians_per_agent=100_000_000)
     settings = FusionSettings(grid, quotas=quotas, alignment=AlignmentSettings() if align else None)
     engine = FusionEngine(MemoryStore(), settings)
     for agent_id, subsets in messages.items():
         session_id = engine.join(agent_id, MissionConfig("", "", grid.size_m)).session.session_id
-        engine.contribute_free_space(session_id, free_space[agent_id], grid)
         for subset in subsets:
             engine.contribute(session_id, subset, grid)
             engine.align_due()

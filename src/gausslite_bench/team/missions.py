@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.frame import Frame
-from gausslite.domain.free_space import FreeSpace
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel
 from gausslite.fusion.keyframes import AgentKeyframe
-from gausslite.mapping.free_space import FreeSpaceMap
 from gausslite.mapping.keyframe_selection import KeyframeSelection
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
@@ -27,7 +25,6 @@ from gausslite_bench.team.scenes import AgentScene
 
 _RESEND_THRESHOLD = 0.25
 _ROUND_FRAMES = 4
-_FREE_SPACE_FRAMES = 5
 _SUBSET_BYTES = 1 << 20
 _MAX_KEYFRAMES = 64
 
@@ -36,7 +33,6 @@ _MAX_KEYFRAMES = 64
 class AgentMap:
     """One agent's map, its keyframes, and what it sent: bytes of all messages and Gaussians, resends included.
     bytes_whole: size of its whole map as messages.
-    free_space: what every fifth frame observed as free.
 
     messages: the subsets in the order of sending, as the fusion server would receive them.
     """
@@ -48,7 +44,6 @@ class AgentMap:
     bytes_sent: int
     gaussians_sent: int
     bytes_whole: int
-    free_space: FreeSpace
 
 
 class _SentMessages:
@@ -116,7 +111,6 @@ def map_agent(
         bytes_sent=sent.byte_count,
         gaussians_sent=gaussians_sent,
         bytes_whole=bytes_whole,
-        free_space=_observe_free_space(agent, grid),
     )
 
 
@@ -130,10 +124,3 @@ def _select_keyframes(keyframes: Sequence[Keyframe], grid: VoxelGrid) -> list[Fr
             frames[keyframe.frame.index] = keyframe.frame
             frames.pop(selected.replaced, None)
     return list(frames.values())
-
-
-def _observe_free_space(agent: AgentScene, grid: VoxelGrid) -> FreeSpace:
-    free = FreeSpaceMap(grid)
-    for frame in agent.frames[::_FREE_SPACE_FRAMES]:
-        free.observe(frame)
-    return free.free_space

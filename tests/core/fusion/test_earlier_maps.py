@@ -10,7 +10,7 @@ from fusion_running import GRID, keys, make_subset
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.voxels import RoiSubset, group_by_voxel
+from gausslite.domain.voxels import RoiSubset, group_by_voxel, select_voxels
 from gausslite.fusion.agent_data import earlier_map_of
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentSettings, AlignmentState
@@ -134,8 +134,11 @@ def corner_subset(seed: int, shift_m: float = 0.0) -> RoiSubset:
 def test_an_earlier_map_in_another_frame_is_corrected_or_deleted(shift_m: float, is_kept: bool) -> None:
     engine = engine_on(alignment=AlignmentSettings())
     engine.contribute(reboot(engine), corner_subset(0), GRID)
-    engine.contribute(reboot(engine), corner_subset(1, shift_m), GRID)
-    engine.align_due()
+    session, whole = reboot(engine), corner_subset(1, shift_m)
+    for seq in (1, 2):
+        part = select_voxels(whole.batch, np.arange(len(whole.batch)) % 2 == seq % 2)
+        engine.contribute(session, RoiSubset("ant", "", seq, seq, part), GRID)
+        engine.align_due()
     status = {each.agent_id: each for each in engine.status().agents}
     assert (EARLIER in status) == is_kept
     assert status["ant"].alignment.state is not AlignmentState.QUARANTINED

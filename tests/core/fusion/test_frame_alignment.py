@@ -1,7 +1,8 @@
-"""Frames of a team: a misfit is measured and corrected, a gross one is quarantined with a message."""
+"""Frames of a team: a misfit is measured and corrected, a gross one that others repeat is quarantined."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,12 @@ from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.free_space import FreeSpace, split_indices
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
-from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
-from gausslite.fusion.alignment import SurfaceSamples, fit_frame
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
+from gausslite.fusion.alignment import FrameFit, SurfaceSamples, fit_frame
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import AlignmentSettings, AlignmentState
+from gausslite.fusion.frames import AlignmentSettings, AlignmentState, FrameAlignment
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
@@ -58,8 +58,12 @@ def team(T_agent_fused: np.ndarray, store: FusionStore | None = None) -> FusionE
     return engine
 
 
+def alignment_of(engine: FusionEngine, agent_id: str) -> FrameAlignment:
+    return next(status.alignment for status in engine.status().agents if status.agent_id == agent_id)
+
+
 def state_of(engine: FusionEngine, agent_id: str) -> AlignmentState:
-    return next(each.alignment.state for each in engine.status().agents if each.agent_id == agent_id)
+    return alignment_of(engine, agent_id).state
 
 
 def surface_error_m(points_m: np.ndarray) -> float:
@@ -67,23 +71,45 @@ def surface_error_m(points_m: np.ndarray) -> float:
     return float(np.median(np.abs(points_m).min(axis=1)))
 
 
+def samples(gaussians: Gaussians) -> SurfaceSamples:
+    return SurfaceSamples(gaussians.means_m.astype(np.float64), gaussians.rgb[:, 0].astype(np.float64))
+
+
 @pytest.mark.parametrize(
-    ("shift_m", "angle_deg"), [((0.0, 0.0, 0.0), 0.0), ((0.03, -0.03, 0.025), 2.0), ((0.1, 0.0, 0.1), 3.0)]
+    ("shift_m", "angle_deg"), [((0.03, -0.03, 0.025), 2.0), ((0.1, 0.0, 0.1), 3.0), ((0.3, 0.4, 0.2), 20.0)]
 )
 def test_the_fit_recovers_a_misfit(shift_m: tuple[float, float, float], angle_deg: float) -> None:
     T_agent_fused = wrong_frame(shift_m, angle_deg)
-    fit = fit_frame(move_gaussians(corner(1), T_agent_fused), SurfaceSamples.of(corner(0)), np.eye(4))
+    fit = fit_frame(samples(move_gaussians(corner(1), T_agent_fused)), samples(corner(0)))
     assert fit is not None
-    error = fit.T_fused_agent @ T_agent_fused
+    error = fit.motion @ T_agent_fused
     assert np.linalg.norm(transform_points(error, np.ones((1, 3))) - 1.0) < 0.01
     assert rotation_angle_deg(error, np.eye(4)) < 0.3
-    assert fit.after.distance_m < 0.005
+    assert fit.is_better
+    assert fit.after.distance_m < 0.01 < fit.before.distance_m
+    assert fit.after.colour < fit.before.colour
 
 
-def test_too_few_samples_give_no_fit() -> None:
-    assert fit_frame(corner(1, count=30), SurfaceSamples.of(corner(0)), np.eye(4)) is None
+def test_the_same_frame_has_no_better_motion() -> None:
+    fit = fit_frame(samples(corner(1)), samples(corner(0)))
+    assert fit is not None
+    assert not fit.is_better
+
+
+def test_a_better_distance_with_a_worse_colour_is_no_better_fit() -> None:
+    """A striped wall that slid by half a period: planes cannot show it, and a corner alone would."""
+    first, second = samples(corner(0)), samples(move_gaussians(corner(1), wrong_frame((0.05, 0.05, 0.05))))
+    grey = SurfaceSamples(second.points_m, np.random.default_rng(0).permutation(second.luminance))
+    fit = fit_frame(grey, first)
+    assert fit is not None
+    assert fit.after.distance_m < fit.before.distance_m
+    assert not fit.is_better
+
+
+def test_too_little_shared_surface_gives_no_fit() -> None:
+    assert fit_frame(samples(corner(1, count=30)), samples(corner(0))) is None
     far = move_gaussians(corner(1), wrong_frame((50.0, 0.0, 0.0)))
-    assert fit_frame(far, SurfaceSamples.of(corner(0)), np.eye(4)) is None
+    assert fit_frame(samples(far), samples(corner(0))) is None
 
 
 def test_a_frame_within_the_noise_changes_no_bit() -> None:
@@ -147,80 +173,166 @@ def test_correct_frames_of_regions_that_hardly_overlap_stay_as_they_are(points: 
         assert state_of(engine, "bee") in (AlignmentState.UNKNOWN, AlignmentState.ALIGNED)
 
 
-def test_a_gross_misfit_is_quarantined_with_a_message_and_returns_when_it_is_mended() -> None:
-    engine = team(wrong_frame((0.25, 0.25, 0.2)))
-    assert len(engine.maps.voted_map("bee")) > 0
+WRONG = wrong_frame((0.25, 0.25, 0.2))
+
+
+def halves(gaussians: Gaussians) -> list[Gaussians]:
+    return [gaussians.take(np.arange(start, len(gaussians), 2)) for start in (0, 1)]
+
+
+def send_twice(engine: FusionEngine, agent_id: str, gaussians: Gaussians) -> None:
+    for seq, half in enumerate(halves(gaussians), start=1):
+        send(engine, agent_id, half, seq)
+        engine.align_due()
+
+
+def test_a_gross_misfit_is_quarantined_if_newer_data_repeat_it_and_returns_when_it_is_mended() -> None:
+    engine = FusionEngine(MemoryStore(), SETTINGS)
+    send(engine, "ant", corner(0))
+    first, second = halves(move_gaussians(corner(1, kappa=9), WRONG))
+    send(engine, "bee", first)
+    assert not engine.align_due()
+    assert state_of(engine, "bee") is AlignmentState.UNKNOWN
+    assert "contradicts ant" in alignment_of(engine, "bee").message
+    send(engine, "bee", second, 2)
     assert engine.align_due()
-    [bee] = [each for each in engine.status().agents if each.agent_id == "bee"]
+    [bee] = [status for status in engine.status().agents if status.agent_id == "bee"]
     assert bee.alignment.state is AlignmentState.QUARANTINED
+    assert "contradicts ant: 0." in bee.alignment.message
     assert "check the agent's localisation" in bee.alignment.message
     assert bee.gaussians > 0
     assert bee.won_voxels == 0
-    assert {each.agent_id for each in engine.status().agents if each.won_voxels} == {"ant"}
+    assert {status.agent_id for status in engine.status().agents if status.won_voxels} == {"ant"}
     seen = Frame(0, 0, np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), Camera(8, 8, 4, 4, 8, 8), np.eye(4))
     kept = engine.in_fused_frame([AgentKeyframe("ant", seen), AgentKeyframe("bee", seen)])
-    assert [each.agent_id for each in kept] == ["ant"]
-    send(engine, "bee", corner(1, kappa=9), seq=2)
+    assert [keyframe.agent_id for keyframe in kept] == ["ant"]
+    # the agent's localisation is mended, and it sends the same voxels again
+    send(engine, "bee", corner(1, kappa=9), seq=3)
     engine.align_due()
     assert state_of(engine, "bee") is not AlignmentState.QUARANTINED
-
-
-def observe_free(engine: FusionEngine, agent_id: str, low: int, high: int, views: int = 2) -> None:
-    """This many views of the agent have seen every voxel of the cube low <= i, j, k < high as free."""
-    indices = np.stack(np.meshgrid(*[np.arange(low, high)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    blocks, cells = split_indices(indices, GRID)
-    keys, rows = np.unique(blocks, return_inverse=True)
-    counts = np.zeros((len(keys), 512), np.uint8)
-    counts[rows, cells] = views
-    session = engine.join(agent_id, ANYTHING).session.session_id
-    engine.contribute_free_space(session, FreeSpace(keys, counts), GRID)
-
-
-def small_object(centre_m: tuple[float, float, float]) -> Gaussians:
-    return plain_gaussians(np.random.default_rng(3).uniform(-0.1, 0.1, (80, 3)) + centre_m, kappa=9)
-
-
-@pytest.mark.parametrize("free_space_comes_first", [True, False])
-def test_a_region_without_overlap_in_free_space_is_quarantined_and_returns(free_space_comes_first: bool) -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
-    send(engine, "ant", small_object((0.0, 0.0, 0.0)))
-    if free_space_comes_first:
-        observe_free(engine, "ant", 5, 15)
-    send(engine, "bee", small_object((1.0, 1.0, 1.0)))
-    if not free_space_comes_first:
-        engine.align_due()
-        assert state_of(engine, "bee") is AlignmentState.UNKNOWN
-        observe_free(engine, "ant", 5, 15)
-    assert engine.align_due()
-    [bee] = [each for each in engine.status().agents if each.agent_id == "bee"]
-    assert bee.alignment.state is AlignmentState.QUARANTINED
-    assert "observed free space" in bee.alignment.message
-    assert bee.won_voxels == 0
-    # the same voxels without an observation
-    observe_free(engine, "ant", 5, 15, views=0)
-    assert engine.align_due()
-    assert state_of(engine, "bee") is AlignmentState.UNKNOWN
     assert len(engine.maps.voted_map("bee")) > 0
 
 
-def test_stray_gaussians_in_free_space_do_not_quarantine_a_correct_frame() -> None:
+def test_a_lone_agent_that_two_others_contradict_is_quarantined_even_if_it_came_first() -> None:
     engine = FusionEngine(MemoryStore(), SETTINGS)
-    send(engine, "ant", small_object((0.0, 0.0, 0.0)))
-    observe_free(engine, "ant", 5, 15)
-    # a large surface that ant has not seen, and stray Gaussians that have many voxels of free space to themselves
-    strays = plain_gaussians(np.random.default_rng(4).uniform(0.5, 1.5, (60, 3)))
-    send(engine, "bee", Gaussians.concatenate([corner(1, kappa=9, count=3000), strays]))
-    engine.align_due()
-    assert state_of(engine, "bee") is not AlignmentState.QUARANTINED
+    send(engine, "ant", move_gaussians(corner(0, kappa=9), WRONG))
+    for seed, name in enumerate(("bee", "cat"), start=1):
+        send(engine, name, corner(seed))
+        engine.align_due()
+    states = {name: state_of(engine, name) for name in ("ant", "bee", "cat")}
+    assert states["ant"] is AlignmentState.QUARANTINED
+    assert states["bee"] is AlignmentState.REFERENCE
+    assert states["cat"] is AlignmentState.ALIGNED
+    assert {status.agent_id for status in engine.status().agents if status.won_voxels} == {"bee", "cat"}
 
 
-def test_an_agents_own_free_space_is_no_evidence_against_it() -> None:
+def test_who_contradicts_an_evicted_agent_is_released_also_after_a_restart(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    for restarts in (False, True):
+        path.unlink(missing_ok=True)
+        store = SqliteStore(path)
+        engine = FusionEngine(store, SETTINGS)
+        send(engine, "ant", move_gaussians(corner(0), WRONG))
+        send_twice(engine, "bee", corner(1))
+        assert state_of(engine, "bee") is AlignmentState.QUARANTINED
+        if restarts:
+            store.close()
+            store = SqliteStore(path)
+            engine = FusionEngine(store, SETTINGS)
+            engine.align_due()
+            assert state_of(engine, "bee") is AlignmentState.QUARANTINED
+        engine.evict("ant", ban=True)
+        assert engine.align_due()
+        assert state_of(engine, "bee") is AlignmentState.REFERENCE
+        won = {status.agent_id: status.won_voxels for status in engine.status().agents}
+        assert won["bee"] > 0
+        store.close()
+
+
+def test_one_early_voxel_harms_nobody() -> None:
     engine = FusionEngine(MemoryStore(), SETTINGS)
-    send(engine, "ant", small_object((0.0, 0.0, 0.0)))
-    send(engine, "bee", small_object((1.0, 1.0, 1.0)))
-    observe_free(engine, "bee", 5, 15)
+    rng = np.random.default_rng(0)
+    send(engine, "eve", plain_gaussians(rng.uniform(0.0, 0.1, (400, 3)), kappa=9))
+    send_twice(engine, "ant", corner(0))
+    send_twice(engine, "bee", corner(1))
+    assert not engine.status().agents[0].alignment.message
+    assert all(status.alignment.is_used for status in engine.status().agents)
+    assert engine.maps.won_voxels("ant") + engine.maps.won_voxels("bee") > 100
+
+
+class CountingStore(MemoryStore):
+    """Records how many voxels each read asks for; -1 for all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reads: list[int] = []
+
+    def batch(self, agent_id: str, keys: np.ndarray | None = None) -> VoxelBatch:
+        self.reads.append(-1 if keys is None else len(keys))
+        return super().batch(agent_id, keys)
+
+
+def test_comparing_and_correcting_read_slices_and_never_a_whole_map() -> None:
+    store = CountingStore()
+    engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0), store)
+    store.reads.clear()
+    assert engine.align_due()
+    assert state_of(engine, "bee") is AlignmentState.CORRECTED
+    assert len(store.reads) > 10
+    assert 0 <= min(store.reads) <= max(store.reads) <= 128
+
+
+def test_a_message_of_an_agent_in_another_frame_reads_its_own_voxels() -> None:
+    for shift_m in ((5.0, 0.02, 0.0), (0.0, 0.0, 0.0)):
+        store = CountingStore()
+        engine = FusionEngine(store, SETTINGS)
+        engine.join("bee", ANYTHING)
+        engine.declare_frame("bee", wrong_frame(shift_m, 40.0))
+        send(engine, "bee", corner(1))
+        store.reads.clear()
+        send(engine, "bee", plain_gaussians(np.full((1, 3), 0.05), kappa=99), 2)
+        assert sum(store.reads) <= 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_moved_voxels_are_those_of_a_new_engine_whatever_the_order_of_messages(seed: int) -> None:
+    rng, store = np.random.default_rng(seed), MemoryStore()
+    engine = FusionEngine(store, SETTINGS)
+    send(engine, "ant", corner(0))
+    engine.join("bee", ANYTHING)
+    for seq in range(1, 9):
+        if rng.random() < 0.4:
+            engine.declare_frame("bee", wrong_frame(tuple(rng.uniform(-0.5, 0.5, 3)), rng.uniform(0, 90)))
+        points = rng.uniform(0, rng.choice([0.3, 1.0]), (int(rng.integers(1, 80)), 3))
+        batch = group_by_voxel(plain_gaussians(points, kappa=int(rng.integers(1, 12))), GRID)
+        gone = tombstones(np.setdiff1d(store.batch("bee").keys, batch.keys)[: int(rng.integers(0, 4))])
+        session = engine.join("bee", ANYTHING).session.session_id
+        engine.contribute(session, RoiSubset("bee", "", seq, seq, merge_batches(batch, gone)), GRID)
+    again = FusionEngine(store, SETTINGS)
+    for read in (lambda e: e.maps.voted_map(), lambda e: e.maps.union_map(), lambda e: e.maps.changes().won.batch):
+        ours, theirs = read(engine), read(again)
+        assert np.array_equal(ours.keys, theirs.keys)
+        assert np.array_equal(ours.kappa_sums, theirs.kappa_sums)
+        assert np.array_equal(np.sort(ours.gaussians.means_m, axis=0), np.sort(theirs.gaussians.means_m, axis=0))
+    assert engine.maps.size() == again.maps.size()
+
+
+def test_messages_are_stored_during_a_comparison_and_its_result_is_dropped_with_the_agents_data(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0))
+
+    def fit_while_others_work(*arguments: SurfaceSamples) -> FrameFit | None:
+        with ThreadPoolExecutor(1) as executor:
+            executor.submit(send, engine, "ant", corner(2), 2).result(timeout=60)
+            if any(status.agent_id == "bee" for status in engine.status().agents):
+                executor.submit(engine.evict, "bee").result(timeout=60)
+        return fit_frame(*arguments)
+
+    monkeypatch.setattr("gausslite.fusion.frame_aligner.fit_frame", fit_while_others_work)
     engine.align_due()
-    assert state_of(engine, "bee") is AlignmentState.UNKNOWN
+    assert [status.agent_id for status in engine.status().agents] == ["ant"]
+    assert state_of(engine, "ant") is AlignmentState.REFERENCE
 
 
 def test_later_updates_of_a_drifting_agent_get_their_own_correction() -> None:
@@ -229,10 +341,10 @@ def test_later_updates_of_a_drifting_agent_get_their_own_correction() -> None:
     scene = corner(1, kappa=9)
     order = np.argsort(scene.means_m[:, 0], kind="stable")
     for seq, rows in enumerate(np.array_split(order, 4), start=1):
-        drift = wrong_frame((0.0, 0.02 * seq, 0.02 * seq), 0.5 * seq)
+        drift = wrong_frame((0.0, 0.04 * seq, 0.04 * seq), 0.5 * seq)
         send(engine, "bee", move_gaussians(scene.take(rows), drift), seq)
         engine.align_due()
-    [bee] = [each for each in engine.status().agents if each.agent_id == "bee"]
+    [bee] = [status for status in engine.status().agents if status.agent_id == "bee"]
     assert bee.alignment.state is AlignmentState.CORRECTED
     assert len(bee.alignment.segments) > 1
     assert surface_error_m(engine.maps.voted_map("bee").gaussians.means_m) < 0.01
@@ -243,7 +355,7 @@ def test_a_declared_frame_is_used_and_can_be_refined() -> None:
     engine = FusionEngine(MemoryStore(), SETTINGS)
     send(engine, "ant", corner(0))
     engine.join("bee", ANYTHING)
-    engine.declare_frame("bee", wrong_frame((0.02, 0.02, 0.0)) @ inverse(T_agent_fused))
+    engine.declare_frame("bee", wrong_frame((0.05, 0.03, 0.0)) @ inverse(T_agent_fused))
     send(engine, "bee", move_gaussians(corner(1, kappa=9), T_agent_fused))
     engine.align_due()
     assert state_of(engine, "bee") is AlignmentState.CORRECTED

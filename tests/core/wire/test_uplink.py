@@ -16,7 +16,6 @@ from gausslite.domain.errors import (
     MismatchError,
     StorageError,
 )
-from gausslite.domain.free_space import FreeSpace, block_grid
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
@@ -130,15 +129,6 @@ def test_the_spool_of_another_agent_is_refused(tmp_path: Path) -> None:
 def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InvalidInputError, match="uplink"):
         UplinkSettings(**wrong)  # type: ignore[arg-type]
-
-
-def test_free_space_is_sent_and_newer_blocks_replace_older_ones() -> None:
-    keys = block_grid(GRID).keys(np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 1.0]], np.float32))
-    with fusion_server() as server, uplink(server.client.address) as link:
-        link.enqueue_free_space(FreeSpace(keys, np.zeros((2, 512), np.uint8)))
-        link.enqueue_free_space(FreeSpace(keys[:1], np.full((1, 512), 3, np.uint8)))
-        assert link.drain(20)
-        assert server.client.status().agents[0].free_voxels == 512
 
 
 def test_the_latest_report_of_objects_is_sent_also_without_voxels() -> None:

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
 
-from gausslite.codec.stored import encode_free_space
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import InvalidInputError, MismatchError, PoseError, QuotaError
-from gausslite.domain.free_space import FreeSpace, block_grid
+from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError
 from gausslite.domain.pose import transform_of
-from gausslite.domain.voxels import VoxelGrid, empty_batch
+from gausslite.domain.voxels import empty_batch
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
 
@@ -113,23 +111,3 @@ def test_a_declared_frame_moves_the_agents_map() -> None:
             assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
         [agent] = server.client.status().agents
         assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
-
-
-def test_free_space_is_stored_and_hostile_bytes_are_refused() -> None:
-    keys = block_grid(GRID).keys(np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 1.0]], np.float32))
-    free = FreeSpace(keys, np.full((2, 512), 2, np.uint8))
-    outside = FreeSpace(np.array([5, 9], np.int64), free.counts)
-    with fusion_server() as server:
-        session = server.client.join("ant", GRID).session_id
-        assert server.client.contribute_free_space(session, free, GRID) < 300
-        [agent] = server.client.status().agents
-        assert agent.free_voxels == 1024
-        for session_id, data in (("nobody", encode_free_space(free, GRID)), (session, b"\xff" * 1000)):
-            with pytest.raises(grpc.RpcError) as refused:
-                server.stub.ContributeFreeSpace(pb.ContributeFreeSpaceRequest(session_id=session_id, free_space=data))
-            assert refused.value.code() in (grpc.StatusCode.NOT_FOUND, grpc.StatusCode.INVALID_ARGUMENT)
-        with pytest.raises(InvalidInputError, match="coordinates within"):
-            server.client.contribute_free_space(session, outside, GRID)
-        with pytest.raises(MismatchError):
-            server.client.contribute_free_space(session, free, VoxelGrid(0.2))
-        assert server.client.status().agents[0].free_voxels == 1024

@@ -1,0 +1,316 @@
+"""Compare the agents' maps in the background, and decide whose frame is corrected and who is quarantined.
+
+All work is on bounded samples of the maps: the engine's lock is held for a slice of voxels at most.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field, replace
+from threading import RLock
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt64
+from numpy import ndarray
+
+from gausslite.domain.checks import quote_name
+from gausslite.domain.voxel_changes import hash_columns
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid
+from gausslite.fusion.alignment import MIN_SAMPLES, FrameFit, SurfaceSamples, fit_frame, opaque_rows
+from gausslite.fusion.frames import (
+    AlignmentSettings,
+    Comparison,
+    FrameAlignment,
+    FrameAlignments,
+    find_quarantined,
+)
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.vote_input import SLICE_VOXELS
+
+_log = logging.getLogger(__name__)
+_MAX_VOXELS = 4096
+_SAMPLE_BLOCK = 8
+"""Voxels on a side of the blocks that are sampled completely or not at all, so that surfaces stay dense."""
+_MAX_WITNESSES = 4
+_PLACE_GRID = VoxelGrid(0.5)
+_MIN_RECENT = 200
+Apply = Callable[[str], None]
+"""Moves an agent's map to the frame and state that it has now."""
+
+
+@dataclass(slots=True)
+class _AgentMap:
+    """What is known of one agent's map: samples of at most 4096 voxels, and the voxels that have to be read again.
+
+    epoch: a number that no other map has had. first_seq: of the updates since the last correction.
+    """
+
+    epoch: int
+    unread: set[int] = field(default_factory=set)
+    changed: int = 0
+    first_seq: int = 0
+    samples: dict[int, tuple[int, ndarray]] = field(default_factory=dict)
+    limit: int = int(np.iinfo(np.uint64).max)
+
+    def select(self, keys: Int64[ndarray, " k"], grid: VoxelGrid) -> Int64[ndarray, " s"]:
+        """Return those of the voxels that are sampled; all maps prefer the same blocks, so that samples overlap."""
+        known = np.array(list(self.samples), np.int64)
+        every = np.union1d(keys, known)
+        ranks = _block_hashes(every, grid)
+        if np.count_nonzero(ranks <= self.limit) > _MAX_VOXELS:
+            self.limit = int(np.sort(ranks)[_MAX_VOXELS])
+            for key in every[ranks >= self.limit].tolist():
+                self.samples.pop(key, None)
+            self.limit -= 1
+        return keys[_block_hashes(keys, grid) <= self.limit]
+
+    def put(self, keys: Int64[ndarray, " k"], batch: VoxelBatch, update_seqs: Int64[ndarray, " v"]) -> None:
+        """Replace the samples of these voxels by the most opaque Gaussians of the batch."""
+        for key in keys.tolist():
+            self.samples.pop(key, None)
+        sampled = SurfaceSamples.of(batch)
+        values = np.column_stack([sampled.points_m, sampled.luminance])
+        ends = np.searchsorted(opaque_rows(batch), batch.offsets)
+        for i, (key, seq) in enumerate(zip(batch.keys.tolist(), update_seqs.tolist(), strict=True)):
+            if ends[i + 1] > ends[i]:
+                self.samples[key] = seq, values[ends[i] : ends[i + 1]]
+
+    def in_frame(self, alignment: FrameAlignment, first_seq: int = 0) -> SurfaceSamples:
+        """Return the samples of the updates from first_seq on in the fused frame; all if these are few."""
+        parts = [(seq, values) for seq, values in self.samples.values() if seq >= first_seq]
+        if sum(len(values) for _, values in parts) < _MIN_RECENT:
+            parts = list(self.samples.values())
+        if not parts:
+            return SurfaceSamples(np.zeros((0, 3)), np.zeros(0))
+        values = np.concatenate([values for _, values in parts]).astype(np.float64)
+        seqs = np.repeat([seq for seq, _ in parts], [len(values) for _, values in parts])
+        segments = alignment.segment_of(seqs)
+        moved = [
+            SurfaceSamples(values[segments == segment, :3], values[segments == segment, 3]).moved(
+                alignment.transform(int(segment))
+            )
+            for segment in np.unique(segments)
+        ]
+        return SurfaceSamples.concatenate(moved)
+
+
+class FrameAligner:
+    """Compares the maps, one agent after the other. Call `run` from one thread at a time; the rest is thread-safe."""
+
+    def __init__(
+        self,
+        store: FusionStore,
+        alignments: FrameAlignments,
+        lock: RLock,
+        grid: VoxelGrid,
+        settings: AlignmentSettings | None,
+    ) -> None:
+        """Without settings, frames are used as declared and nothing is compared."""
+        self._store, self._alignments, self._lock, self._grid = store, alignments, lock, grid
+        self._settings = settings
+        self._maps: dict[str, _AgentMap] = {}
+        self._comparisons: dict[frozenset[str], Comparison] = {}
+        self._epochs = 0
+        self._is_undecided = True
+        if settings is not None:
+            self._restore()
+
+    def record(self, agent_id: str, accepted: Int64[ndarray, " a"]) -> None:
+        """Note that these voxels of an agent changed; its first update fixes its rank."""
+        if agent_id not in self._alignments:
+            alignment = self._alignments.get(agent_id)
+            is_first = not any(self._alignments.get(name).is_used for name in self._alignments.names())
+            self._alignments.put(agent_id, alignment.in_state({}, is_quarantined=False, is_first=is_first))
+        if self._settings is not None and len(accepted):
+            own = self._map_of(agent_id)
+            own.unread.update(accepted.tolist())
+            own.changed += len(accepted)
+
+    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> bool:
+        """Set the motion that the agent declares; if it changed, estimates from before are dropped."""
+        current = self._alignments.get(agent_id)
+        if np.array_equal(current.declared, T_fused_agent):
+            return False
+        self._alignments.put(agent_id, FrameAlignment(current.order, declared=T_fused_agent))
+        self._forget_comparisons(agent_id)
+        if agent_id in self._maps:
+            own = self._maps[agent_id]
+            own.epoch, own.first_seq, own.changed = self._next_epoch(), 0, max(own.changed, len(own.samples))
+        return True
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Forget the agent. Those that contradicted it are decided again with the next run."""
+        self._maps.pop(agent_id, None)
+        self._forget_comparisons(agent_id)
+
+    def run(self, apply: Apply, drop_earlier: Callable[[str], bool]) -> None:
+        """Compare the maps of the agents with enough new data, then decide. Raises StorageError.
+
+        drop_earlier: deletes the earlier map of an agent, if that is the only one that it contradicts.
+        """
+        if self._settings is None:
+            return
+        with self._lock:
+            due = [name for name, own in self._maps.items() if self._is_due(name, own)]
+        for agent_id in due:
+            self._compare(agent_id, self._settings, apply)
+        if due or self._is_undecided:
+            self._decide(apply, drop_earlier)
+
+    def _compare(self, agent_id: str, settings: AlignmentSettings, apply: Apply) -> None:
+        """Compare the agent with its witnesses, and correct its frame if that fits the earlier ones better."""
+        with self._lock:
+            own = self._maps.get(agent_id)
+            alignment = self._alignments.get(agent_id)
+            if own is None:
+                return
+            own.changed = 0
+            epoch, first_seq = own.epoch, own.first_seq
+            highest_seq = self._store.totals(agent_id).highest_update_seq
+        self._read(agent_id, own)
+        source = own.in_frame(alignment, first_seq)
+        if len(source) < MIN_SAMPLES:
+            return
+        witnesses = list(self._witnesses(agent_id, source))
+        fits = [(name, witness_epoch, fit_frame(source, samples)) for name, witness_epoch, samples in witnesses]
+        earlier = [
+            samples
+            for (name, _, samples), (_, _, fit) in zip(witnesses, fits, strict=True)
+            if self._alignments.get(name).is_used
+            and self._alignments.get(name).order < alignment.order
+            and not (fit is not None and settings.contradicts(fit))
+        ]
+        joint = fit_frame(source, SurfaceSamples.concatenate(earlier)) if earlier else None
+        with self._lock:
+            if self._alignments.get(agent_id) is not alignment or self._epoch(agent_id) != epoch:
+                return
+            for name, witness_epoch, fit in fits:
+                if self._epoch(name) == witness_epoch:
+                    self._note(agent_id, name, fit, settings)
+            own.first_seq = highest_seq + 1
+            if joint is None:
+                return
+            corrected = settings.corrects(joint)
+            after = alignment.corrected(joint, first_seq) if corrected else replace(alignment, fit=joint, against=())
+            self._alignments.put(agent_id, after)
+        if corrected:
+            apply(agent_id)
+
+    def _note(self, agent_id: str, name: str, fit: FrameFit | None, settings: AlignmentSettings) -> None:
+        pair = frozenset((agent_id, name))
+        if fit is None:
+            # too little in common says nothing, also of what was found before
+            return
+        before = self._comparisons.get(pair)
+        parts: dict[str, int] = {}
+        if settings.contradicts(fit):
+            parts = dict(before.contradicting) if before is not None else {}
+            parts[agent_id] = parts.get(agent_id, 0) + 1
+        self._comparisons[pair] = Comparison(fit, parts)
+
+    def _decide(self, apply: Apply, drop_earlier: Callable[[str], bool]) -> None:
+        with self._lock:
+            self._is_undecided = False
+            names = [name for name in self._alignments.names() if name in self._maps]
+            quarantined = find_quarantined({name: i for i, name in enumerate(names)}, self._comparisons)
+        for name, against in quarantined.items():
+            if set(against) == {f"{name}:earlier"} and drop_earlier(name):
+                self._is_undecided = True
+                return self._decide(apply, drop_earlier)
+        has_reference = False
+        for name in names:
+            with self._lock:
+                if name not in self._alignments:
+                    continue
+                before = self._alignments.get(name)
+                after = before.in_state(self._contradictions(name, quarantined), name in quarantined, not has_reference)
+                has_reference |= after.is_used
+                if (after.state, after.message, after.against) == (before.state, before.message, before.against):
+                    continue
+                self._alignments.put(name, after)
+                _log_change(name, before, after)
+            if after.is_used != before.is_used:
+                apply(name)
+        return None
+
+    def _contradictions(self, agent_id: str, quarantined: Collection[str]) -> dict[str, FrameFit]:
+        """Return the fits of the used agents that this one contradicts."""
+        return {
+            name: comparison.fit
+            for pair, comparison in self._comparisons.items()
+            for name in pair - {agent_id}
+            if agent_id in pair and comparison.contradicting and name not in quarantined
+        }
+
+    def _witnesses(self, agent_id: str, source: SurfaceSamples) -> Iterator[tuple[str, int, SurfaceSamples]]:
+        """Yield the agents to compare with: those that share most with it, and those that it contradicts."""
+        places = np.unique(_PLACE_GRID.keys(source.points_m.astype(np.float32)))
+        with self._lock:
+            others = [(name, own, self._alignments.get(name)) for name, own in self._maps.items() if name != agent_id]
+        found = []
+        for name, own, alignment in others:
+            self._read(name, own)
+            samples = own.in_frame(alignment)
+            shared = int(np.isin(places, _PLACE_GRID.keys(samples.points_m.astype(np.float32))).sum())
+            if shared:
+                is_doubted = frozenset((agent_id, name)) in self._comparisons
+                found.append((not is_doubted, -shared, name, own.epoch, samples))
+        for _, _, name, epoch, samples in sorted(found, key=lambda candidate: candidate[:3])[:_MAX_WITNESSES]:
+            yield name, epoch, samples
+
+    def _read(self, agent_id: str, own: _AgentMap) -> None:
+        """Read the voxels that changed since the last time, as far as they are sampled, in slices."""
+        with self._lock:
+            unread, own.unread = own.unread, set()
+        keys = own.select(np.array(sorted(unread), np.int64), self._grid)
+        for start in range(0, len(keys), SLICE_VOXELS):
+            part = keys[start : start + SLICE_VOXELS]
+            batch = self._store.batch(agent_id, part)
+            own.put(part, batch, self._store.stored(agent_id, batch.keys).update_seqs)
+
+    def _is_due(self, agent_id: str, own: _AgentMap) -> bool:
+        assert self._settings is not None
+        voxels = self._store.totals(agent_id).voxels
+        return len(self._maps) > 1 and own.changed > 0 and own.changed >= self._settings.refit_share * voxels
+
+    def _restore(self) -> None:
+        """Read every agent's map with the next run; who was quarantined is tested again, and stays so until then."""
+        table = self._store.scores()
+        for index, agent_id in enumerate(table.agents):
+            keys = table.keys[table.agent_index == index].tolist()
+            own = self._map_of(agent_id)
+            own.unread, own.changed = set(keys), len(keys)
+            own.first_seq = self._store.totals(agent_id).highest_update_seq + 1
+        for name in self._alignments.quarantined:
+            alignment = self._alignments.get(name)
+            for other in alignment.against:
+                if other in self._alignments and alignment.fit is not None:
+                    self._comparisons[frozenset((name, other))] = Comparison(alignment.fit, {name: 2})
+
+    def _forget_comparisons(self, agent_id: str) -> None:
+        self._comparisons = {pair: found for pair, found in self._comparisons.items() if agent_id not in pair}
+        self._is_undecided = True
+
+    def _map_of(self, agent_id: str) -> _AgentMap:
+        if agent_id not in self._maps:
+            self._maps[agent_id] = _AgentMap(self._next_epoch())
+        return self._maps[agent_id]
+
+    def _epoch(self, agent_id: str) -> int:
+        return self._maps[agent_id].epoch if agent_id in self._maps else 0
+
+    def _next_epoch(self) -> int:
+        self._epochs += 1
+        return self._epochs
+
+
+def _log_change(agent_id: str, before: FrameAlignment, after: FrameAlignment) -> None:
+    if after.state is not before.state or after.message != before.message:
+        level = logging.WARNING if after.against else logging.INFO
+        reason = f": {after.message}" if after.message else ""
+        _log.log(level, "agent %s is %s%s", quote_name(agent_id), after.state, reason)
+
+
+def _block_hashes(keys: Int64[ndarray, " k"], grid: VoxelGrid) -> UInt64[ndarray, " k"]:
+    return hash_columns(*(grid.indices(keys) // _SAMPLE_BLOCK).T)
