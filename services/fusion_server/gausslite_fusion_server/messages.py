@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.subset_codec import decode_subset
+from gausslite.codec.subset_codec import decode_stored
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -79,7 +79,7 @@ def enqueue_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, c
     traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
     put: Future[PutOutcome] = Future()
     try:
-        subset, grid = decode_subset(request.subset)
+        subset, grid = decode_stored(request.subset)
         put = engine.enqueue_update(request.session_id, subset, grid)
     except GaussLiteError as error:
         put.set_exception(error)

@@ -70,14 +70,16 @@ def decode_voxels(raw: list[NDArray[Any]], layout: BodyLayout) -> tuple[Int64[nd
         raise CodecError(f"subset: voxel counts sum to {total}, expected {layout.gaussians}")
     if (keys < 0).any():
         raise CodecError("subset: expected voxel keys of at least 0, got a negative one")
+    if (keys[1:] <= keys[:-1]).any():
+        raise CodecError("subset: expected strictly ascending voxel keys, got others")
     return keys, np.concatenate([np.zeros(1, np.int64), np.cumsum(raw[2], dtype=np.int64)])
 
 
 def decode_kappa_sums(
-    raw: list[NDArray[Any]], gaussians: Gaussians, offsets: Int64[ndarray, " v1"]
+    raw: list[NDArray[Any]], kappa: NDArray[np.uint32], offsets: Int64[ndarray, " v1"]
 ) -> NDArray[np.uint64]:
     """Return Σkappa of each voxel."""
-    sums: NDArray[np.uint64] = raw[1].astype(np.uint64) + _sums(gaussians.kappa, offsets)
+    sums: NDArray[np.uint64] = raw[1].astype(np.uint64) + _sums(kappa, offsets)
     return sums
 
 

@@ -186,10 +186,8 @@ def encode_quats(
 def decode_quats(
     largest: UInt8[ndarray, " n"], others: UInt8[ndarray, "n 3"], steps: Int64[ndarray, " n"]
 ) -> Float32[ndarray, "n 4"]:
-    """Decode unit quaternions w x y z. Raises CodecError for codes out of range."""
+    """Decode unit quaternions w x y z."""
     offsets = others.astype(np.int64) - QUAT_ZERO
-    if (largest > 3).any() or (np.abs(offsets) > steps[:, None]).any():
-        raise CodecError("subset quats: expected an index of 0 to 3 and components up to the largest, got others")
     full = np.empty((len(steps), 4))
     rows = np.arange(len(steps))
     # a round Gaussian has no steps and no rotation
@@ -199,15 +197,26 @@ def decode_quats(
     return quats_wxyz
 
 
+def require_codes(
+    largest: UInt8[ndarray, " n"], others: UInt8[ndarray, "n 3"], steps: Int64[ndarray, " n"],
+    opacities: UInt8[ndarray, " n"], rgb: UInt8[ndarray, "n 3"],
+) -> None:  # fmt: skip
+    """Raise CodecError for codes out of range."""
+    if (largest > 3).any() or (np.abs(others.astype(np.int64) - QUAT_ZERO) > steps[:, None]).any():
+        raise CodecError("subset quats: expected an index of 0 to 3 and components up to the largest, got others")
+    if (opacities >= OPACITY_BINS).any():
+        raise CodecError(f"subset opacities: expected codes below {OPACITY_BINS}, got a larger one")
+    if (rgb > _MAX_COLOUR_CODE).any():
+        raise CodecError(f"subset rgb: expected codes up to {_MAX_COLOUR_CODE}, got a larger one")
+
+
 def encode_opacities(opacities: Float32[ndarray, " n"]) -> UInt8[ndarray, " n"]:
     """Encode opacities in equal bins."""
     return np.clip(np.floor(opacities.astype(np.float64) * OPACITY_BINS), 0, OPACITY_BINS - 1).astype(np.uint8)
 
 
 def decode_opacities(codes: UInt8[ndarray, " n"]) -> Float32[ndarray, " n"]:
-    """Decode opacities as the centres of the bins. Raises CodecError for codes out of range."""
-    if (codes >= OPACITY_BINS).any():
-        raise CodecError(f"subset opacities: expected codes below {OPACITY_BINS}, got a larger one")
+    """Decode opacities as the centres of the bins."""
     return ((codes.astype(np.float64) + 0.5) / OPACITY_BINS).astype(np.float32)
 
 
@@ -231,9 +240,7 @@ def encode_rgb(rgb: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
 
 
 def decode_rgb(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
-    """Decode colours. Raises CodecError for codes out of range."""
-    if (codes > _MAX_COLOUR_CODE).any():
-        raise CodecError(f"subset rgb: expected codes up to {_MAX_COLOUR_CODE}, got a larger one")
+    """Decode colours."""
     luma = _LUMA_MIN + codes[:, 0] / _LUMA_STEPS
     orange, lime = (_CHROMA_MIN + codes[:, i] / _CHROMA_STEPS for i in (1, 2))
     middle = luma - lime / 2
@@ -289,21 +296,9 @@ def cells_of(
     return clipped
 
 
-def centres_of(
-    cells: Int64[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"], grid: VoxelGrid
-) -> Float32[ndarray, "n 3"]:
-    """Return the float32 points inside the voxels that are nearest to the cells' centres."""
-    return points_of((2 * cells + 1) << (MAX_FINE_BITS - bits)[:, None], voxel, grid)
-
-
-def fractions_of(
-    means_m: Float32[ndarray, "n 3"], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
-) -> Int64[ndarray, "n 3"]:
-    """Return the place of each mean in its voxel in 65536ths of the voxel's size; every cell's centre has one."""
-    offsets_m = means_m.astype(np.float64) - voxel * grid.size_m
-    fractions: Int64[ndarray, "n 3"] = np.clip(
-        np.rint(offsets_m * (_FRACTIONS / grid.size_m)), 0, _FRACTIONS - 1
-    ).astype(np.int64)
+def cell_centres(cells: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"]) -> Int64[ndarray, "n 3"]:
+    """Return the centre of each cell in its voxel, in 65536ths of the voxel's size."""
+    fractions: Int64[ndarray, "n 3"] = (2 * cells + 1) << (MAX_FINE_BITS - bits)[:, None]
     return fractions
 
 

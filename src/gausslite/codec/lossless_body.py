@@ -16,6 +16,7 @@ from gausslite.codec.body_layout import (
     require_encodable,
 )
 from gausslite.codec.columns import Column, compress_columns, decompress_columns
+from gausslite.codec.stored_voxels import StoredVoxels
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
@@ -35,7 +36,7 @@ def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
     return compress_columns([*encode_voxels(batch), *values, *encode_labels(batch.gaussians, layout)], _columns(layout))
 
 
-def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
+def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int) -> StoredVoxels:
     """Return the voxels of a body. Raises CodecError, InvalidInputError."""
     raw = decompress_columns(body, _columns(layout))
     keys, offsets = decode_voxels(raw[:3], layout)
@@ -52,10 +53,10 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
         target=target,
     )
     require_encodable(gaussians)
-    batch = VoxelBatch(keys, decode_kappa_sums(raw[:3], gaussians, offsets), raw[2].astype(np.uint32), gaussians)
+    batch = VoxelBatch(keys, decode_kappa_sums(raw[:3], kappa, offsets), raw[2].astype(np.uint32), gaussians)
     if not _are_inside(batch, grid):
         raise CodecError("subset means_m: expected every mean inside its voxel, got one outside")
-    return batch
+    return StoredVoxels.exact(batch, update_seq)
 
 
 def _columns(layout: BodyLayout) -> list[Column]:

@@ -9,6 +9,7 @@ differences to the first. All differences wrap at the range of their type.
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,8 @@ from gausslite.codec.body_layout import (
     encode_voxels,
 )
 from gausslite.codec.columns import Column, compress_columns, decompress_columns
+from gausslite.codec.stored_voxels import CODES, MAX_TARGET, OPACITY_BITS, TARGET_BITS, StoredVoxels, voxel_table
 from gausslite.domain.errors import CodecError
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 
 __all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
@@ -70,29 +71,30 @@ def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
     return _FRAME_SIZE.pack(len(frame)) + frame + packed
 
 
-def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout) -> VoxelBatch:
-    """Return the voxels of a body. Raises CodecError, InvalidInputError."""
+def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int) -> StoredVoxels:
+    """Return the voxels of a body, with its codes. Raises CodecError, InvalidInputError."""
     frame, packed = _split(body)
     raw = decompress_columns(frame, _columns(layout))
     of_voxels, (lengths, first, second, third, largest, *rest), labels = raw[:3], raw[3:-3], raw[-3:]
     keys, offsets = decode_voxels(of_voxels, layout)
-    counts = np.diff(offsets)
-    scales = _scale_codes(first, second, third)
-    bits, steps = layout.precision.bits(scales), columns.quat_steps(scales)
-    starts = offsets[:-1][counts > 0]
+    scales, quats = _scale_codes(first, second, third), np.stack(rest[:3], axis=1)
+    bits, rgb = layout.precision.bits(scales), decode_differences(np.stack(rest[4:], axis=1))
+    columns.require_codes(largest, quats, columns.quat_steps(scales), rest[3], rgb)
+    starts = offsets[:-1][raw[2] > 0]
     cells = columns.decode_positions(lengths, packed, bits, starts, layout.precision.coarse_bits)
     active, kappa, target = decode_labels(labels)
-    gaussians = Gaussians(
-        means_m=columns.centres_of(cells, np.repeat(grid.indices(keys), counts, axis=0), bits, grid),
-        quats_wxyz=columns.decode_quats(largest, np.stack(rest[:3], axis=1), steps),
-        scales_m=columns.decode_scales(scales),
-        opacities=columns.decode_opacities(rest[3]),
-        rgb=columns.decode_rgb(decode_differences(np.stack(rest[4:], axis=1))),
-        active=active,
-        kappa=kappa,
-        target=target,
-    )
-    return VoxelBatch(keys, decode_kappa_sums(of_voxels, gaussians, offsets), raw[2].astype(np.uint32), gaussians)
+    codes = np.empty(layout.gaussians, CODES)
+    codes["fractions"] = columns.cell_centres(cells, bits)
+    codes["scales"], codes["quats"], codes["rgb"], codes["kappa"] = scales, quats, rgb, kappa
+    codes["largest_and_opacity"] = largest << OPACITY_BITS | rest[3]
+    label = np.clip(target, -1, MAX_TARGET) + 1
+    codes["active_and_target"] = active.astype(np.uint8) << TARGET_BITS | label.astype(np.uint8)
+    table = voxel_table(keys, update_seq, decode_kappa_sums(of_voxels, kappa, offsets), raw[2])
+    voxels = StoredVoxels(table, codes, grid.size_m)
+    if (label != target + 1).any():
+        batch = voxels.batch()
+        return StoredVoxels.exact(replace(batch, gaussians=replace(batch.gaussians, target=target)), update_seq)
+    return voxels
 
 
 def _columns(layout: BodyLayout) -> list[Column]:

@@ -14,6 +14,8 @@ memory is allocated.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -24,6 +26,7 @@ from numpy.typing import NDArray
 from gausslite.codec import lossless_body, quantised_body
 from gausslite.codec.body_layout import BodyLayout, require_encodable
 from gausslite.codec.columns import MAX_COARSE_BITS, PositionPrecision
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 
@@ -93,13 +96,32 @@ def decode_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[Ro
 
     Raises CodecError if the bytes are not a valid message or exceed the limits, ChecksumError if they are damaged.
     """
+    stored, session_id, grid = _decode(data, limits)
+    with _codec_errors():
+        batch = stored.voxels.batch()
+        return RoiSubset(stored.agent_id, session_id, stored.message_seq, stored.update_seq, batch), grid
+
+
+def decode_stored(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[StoredSubset, VoxelGrid]:
+    """Check a message and return it as a store keeps it, without decoding its Gaussians. Raises as decode_subset."""
+    stored, _, grid = _decode(data, limits)
+    return stored, grid
+
+
+def _decode(data: bytes, limits: CodecLimits) -> tuple[StoredSubset, str, VoxelGrid]:
     envelope, body = _open_envelope(data, limits)
-    try:
+    with _codec_errors():
         grid = VoxelGrid(envelope.size_m)
         coder = lossless_body if envelope.coding is SubsetCoding.LOSSLESS else quantised_body
-        batch = coder.decode(body, grid, envelope.layout)
-        names = envelope.agent.decode(), envelope.session.decode()
-        return RoiSubset(*names, envelope.message_seq, envelope.update_seq, batch), grid
+        voxels = coder.decode(body, grid, envelope.layout, envelope.update_seq)
+        agent_id, session_id = envelope.agent.decode(), envelope.session.decode()
+        return StoredSubset(agent_id, envelope.message_seq, envelope.update_seq, voxels), session_id, grid
+
+
+@contextmanager
+def _codec_errors() -> Iterator[None]:
+    try:
+        yield
     except CodecError:
         raise
     except (GaussLiteError, UnicodeDecodeError) as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Int64
@@ -115,25 +115,26 @@ class ChangeLog:
         if len(keys):
             self._advance(keys.tolist(), [])
 
-    def record(self, agent_id: str, keys: Int64[ndarray, " k"], vote: VoteResult) -> Int64[ndarray, " c"]:
-        """Record that this agent's updates of `keys` changed; `vote` is the new result on these voxels.
+    def record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]], vote: VoteResult) -> Int64[ndarray, " c"]:
+        """Record which voxels changed by agent, as one revision; `vote` is the new result on these voxels.
 
-        Returns the voxels where the fused map changed: those that the agent wins now or won before.
+        Returns the voxels where the fused map changed: those that such an agent wins now or won before.
         """
         counts = vote.counts[vote.offsets[:-1]].tolist()
         winners = zip((vote.agents[index] for index in vote.winner_index.tolist()), counts, strict=True)
         new_winner = dict(zip(vote.keys.tolist(), winners, strict=True))
-        changed: list[int] = []
-        removed: list[int] = []
-        for key in keys.tolist():
-            new, old = new_winner.get(key), self._winner.get(key)
-            if agent_id not in (new and new[0], old and old[0]):
-                continue
-            self._set(key, new)
-            (removed if new is None else changed).append(key)
+        changed: dict[int, None] = {}
+        removed: dict[int, None] = {}
+        for agent_id, keys in changed_keys.items():
+            for key in keys.tolist():
+                new, old = new_winner.get(key), self._winner.get(key)
+                # after another agent has replaced the old winner, `old` is the new one
+                if agent_id in (new and new[0], old and old[0]):
+                    self._set(key, new)
+                    (removed if new is None else changed)[key] = None
         if changed or removed:
-            self._advance(changed, removed)
-        return np.array(sorted(changed + removed), np.int64)
+            self._advance(list(changed), list(removed))
+        return np.array(sorted([*changed, *removed]), np.int64)
 
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the voxels that changed or became empty after this revision, ascending. Raises RevisionGoneError."""

@@ -8,9 +8,10 @@ from concurrent.futures import Future
 from threading import RLock
 from typing import NamedTuple
 
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import MismatchError, NotPermittedError
 from gausslite.domain.gaussians import Gaussians
@@ -102,7 +103,7 @@ class FusionEngine:
         if first_revision is None:
             first_revision = time.time_ns() // 1000
         self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe)
-        self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_update)
+        self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_updates)
 
     @property
     def grid(self) -> VoxelGrid:
@@ -185,12 +186,12 @@ class FusionEngine:
         Raises SessionUnknownError, MismatchError (another grid), NotPermittedError (another agent's name),
         InvalidInputError, QuotaError, StorageError, UnavailableError; see UpdateCommitter for what is stored then.
         """
-        future = self.enqueue_update(session_id, subset, grid)
+        future = self.enqueue_update(session_id, StoredSubset.exact(subset), grid)
         self._committer.commit()
         # another thread may be committing it
         return future.result()
 
-    def enqueue_update(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> Future[PutOutcome]:
+    def enqueue_update(self, session_id: str, subset: StoredSubset, grid: VoxelGrid) -> Future[PutOutcome]:
         """Queue an agent's voxel updates; the future has what `contribute` returns or raises, after a commit.
 
         Raises NotPermittedError for another agent's name, so that no agent waits in another one's queue.
@@ -346,7 +347,7 @@ class FusionEngine:
         with self._committer.committing, self._lock:
             return self._mission.agents.drop_contradicted(agent_id)
 
-    def _check_update(self, update: PendingUpdate) -> RoiSubset:
+    def _check_update(self, update: PendingUpdate) -> StoredSubset:
         """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
         self._mission.members.session(update.session_id)
         if update.outcomes:
@@ -356,10 +357,14 @@ class FusionEngine:
         require_within_quotas(subset, self._store, self._settings.quotas)
         return subset
 
-    def _record_update(self, subset: RoiSubset, outcome: PutOutcome) -> None:
-        """Update the fused map after a commit."""
-        self._mission.aligner.record(subset.agent_id, outcome.accepted)
-        if len(outcome.accepted):
-            self._mission.maps.record(subset.agent_id, self._mission.votes.move(subset.agent_id, outcome.accepted))
-            self._mission.agents.drop_outgrown(subset.agent_id)
+    def _record_updates(self, stored: Sequence[tuple[str, Int64[ndarray, " _"]]]) -> None:
+        """Update the fused map after a commit of these accepted voxels of different agents."""
+        changed = {}
+        for agent_id, accepted in stored:
+            self._mission.aligner.record(agent_id, accepted)
+            if len(accepted):
+                changed[agent_id] = self._mission.votes.move(agent_id, accepted)
+        self._mission.maps.record_all(changed)
+        for agent_id in changed:
+            self._mission.agents.drop_outgrown(agent_id)
         self._mission.traffic.save_if_due()

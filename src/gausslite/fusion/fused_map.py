@@ -198,8 +198,13 @@ class FusedMapLayers:
 
     def record(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
         """Record that what the vote reads of this agent changed in these voxels."""
-        with self._lock:
-            self._record(agent_id, keys)
+        self.record_all({agent_id: keys})
+
+    def record_all(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
+        """Record that what the vote reads changed in these voxels of each agent, with one vote on all of them."""
+        if changed_keys:
+            with self._lock:
+                self._record(changed_keys)
 
     def changes(self, since_revision: int = 0, layer: MapLayer = MapLayer.VOTE) -> FusedMapChanges:
         """Return the changes of a layer since a revision; the whole map for 0. Raises RevisionGoneError."""
@@ -295,9 +300,9 @@ class FusedMapLayers:
         winners = self._change_log.winners(batch.keys.tolist())
         return WonVoxels(batch, winners)
 
-    def _record(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
-        vote = rank_voxels(self._votes.scores(keys))
-        fused_changes = self._change_log.record(agent_id, keys, vote)
+    def _record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
+        vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
+        fused_changes = self._change_log.record(changed_keys, vote)
         present = set(vote.keys.tolist())
         changed = [key for key in fused_changes.tolist() if key in present]
         removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_tiles]

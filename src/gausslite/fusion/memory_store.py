@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 import secrets
 from collections.abc import Iterable, Sequence
 from threading import RLock
 
-import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored import from_stored, to_stored
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
-from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
+from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.store import (
     AgentTotals,
     MissionConfig,
@@ -24,19 +21,19 @@ from gausslite.fusion.store import (
     VoxelScoreTable,
     require_storable,
 )
+from gausslite.fusion.store_rows import UpdateLog, read_batches
 
 
 class MemoryStore:
-    """A FusionStore in dictionaries; 19 bytes per quantised Gaussian (codec.stored_voxels) and about 400 per voxel."""
+    """A FusionStore in dictionaries; 21 bytes per quantised Gaussian (codec.stored_voxels) and about 300 per voxel."""
 
     def __init__(self) -> None:
         self._lock = RLock()
         self._incarnation_id = secrets.token_hex(16)
-        self._index = ScoreIndex()
-        self._updates: dict[str, dict[int, bytes]] = {}
+        self._log = UpdateLog()
+        self._rows: dict[int, bytes] = {}
         self._sessions: dict[str, SessionRecord] = {}
         self._mission_config: MissionConfig | None = None
-        self._grid: VoxelGrid | None = None
         self._keyframes: dict[str, dict[int, bytes]] = {}
         self._records: dict[str, dict[str, bytes]] = {}
 
@@ -47,14 +44,19 @@ class MemoryStore:
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message completely, or nothing of it on an error. Raises InvalidInputError."""
-        return self.put_all([subset])[0]
+        return self.put_all([StoredSubset.exact(subset)])[0]
 
-    def put_all(self, subsets: Sequence[RoiSubset]) -> list[PutOutcome]:
+    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
         """Store messages of different agents: all, or none on an error. Raises InvalidInputError."""
-        for subset in subsets:
-            require_storable(subset)
+        for update in updates:
+            require_storable(update)
         with self._lock:
-            return [self._put(subset) for subset in subsets]
+            change = self._log.plan(updates, self._read)
+            for number in change.deleted:
+                del self._rows[number]
+            self._rows.update((number, data) for number, _, _, data in change.rows)
+            self._log.apply(change)
+            return change.outcomes
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
@@ -62,43 +64,39 @@ class MemoryStore:
             self._keyframes.pop(agent_id, None)
             for records in self._records.values():
                 records.pop(agent_id, None)
-            self._updates.pop(agent_id, None)
-            return self._index.remove_agent(agent_id)
+            for number in self._log.rows_of(agent_id):
+                del self._rows[number]
+            return self._log.remove_agent(agent_id)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
         with self._lock:
-            return self._index.agents
+            return self._log.index.agents
 
     def totals(self, agent_id: str) -> AgentTotals:
         """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
         with self._lock:
-            return self._index.totals(agent_id)
+            return self._log.index.totals(agent_id)
 
     def digests(self, agent_id: str) -> TileDigests:
         """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
         with self._lock:
-            return self._index.digests(agent_id)
+            return self._log.index.digests(agent_id)
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
         """Return the agent's totals on these voxels, in their order."""
         with self._lock:
-            return self._index.stored(agent_id, keys)
+            return self._log.index.stored(agent_id, keys)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         with self._lock:
-            return self._index.scores(keys)
+            return self._log.index.scores(keys)
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
         with self._lock:
-            stored = self._updates.get(agent_id, {})
-            wanted = stored if keys is None else (key for key in set(keys.tolist()) if key in stored)
-            found = np.array(sorted(wanted), np.int64)
-            scores = self._index.stored(agent_id, found)
-            rows = [stored[key] for key in found.tolist()]
-        return VoxelBatch(found, scores.kappa_sums, scores.counts, from_stored(found, scores.counts, rows))
+            return read_batches(lambda: {agent_id: self._log.places(agent_id, keys)}, self._read)[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
@@ -113,7 +111,7 @@ class MemoryStore:
     def set_mission_config(self, mission_config: MissionConfig) -> None:
         """Store the mission's configuration."""
         with self._lock:
-            self._mission_config, self._grid = mission_config, VoxelGrid(mission_config.voxel_size_m)
+            self._mission_config = mission_config
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""
@@ -171,12 +169,5 @@ class MemoryStore:
     def close(self) -> None:
         """Do nothing; there are no files to close."""
 
-    def _put(self, subset: RoiSubset) -> PutOutcome:
-        batch = subset.batch
-        accepted = newer_voxels(self._index, subset, self.batch)
-        keys = batch.keys[accepted]
-        if len(keys):
-            stored = self._updates.setdefault(subset.agent_id, {})
-            stored.update(zip(keys.tolist(), itertools.compress(to_stored(batch, self._grid), accepted), strict=True))
-            self._index.put(subset.agent_id, keys, scores_of(subset, accepted))
-        return PutOutcome(keys, batch.keys[~accepted])
+    def _read(self, numbers: Sequence[int]) -> dict[int, bytes]:
+        return {number: self._rows[number] for number in numbers}

@@ -8,17 +8,15 @@ from contextlib import ExitStack
 from threading import RLock
 from typing import Any
 
-import numpy as np
 import psycopg
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored import to_stored
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError
 from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batch
+from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
-from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
 from gausslite.fusion.store import (
     AgentTotals,
     MissionConfig,
@@ -28,17 +26,20 @@ from gausslite.fusion.store import (
     VoxelScoreTable,
     require_storable,
 )
-from gausslite.fusion.store_rows import UpdateRow, batch_of_rows, data_checksum, index_rows, is_intact, update_rows
+from gausslite.fusion.store_migration import rows_of_voxels
+from gausslite.fusion.store_rows import Places, UpdateLog, data_checksum, read_batches, require_intact
 
-SCHEMA_VERSION = 1
-_LOADED_ROWS = 10_000
+SCHEMA_VERSION = 2
+_VOXEL_ROWS_VERSION = 1
+"""Had one row a voxel; such a database is converted when a server opens it."""
 _LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
+_UPDATES_SCHEMA = """
+CREATE TABLE gausslite.voxel_updates (
+    number BIGINT PRIMARY KEY, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL, voxels BYTEA NOT NULL);
+ALTER TABLE gausslite.voxel_updates ALTER COLUMN voxels SET STORAGE EXTERNAL;
+"""
 _SCHEMA = """
 CREATE SCHEMA gausslite;
-CREATE TABLE gausslite.voxel_updates (
-    agent_id TEXT NOT NULL, voxel BIGINT NOT NULL, update_seq BIGINT NOT NULL,
-    kappa_sum BIGINT NOT NULL, count BIGINT NOT NULL, checksum BIGINT NOT NULL, gaussians BYTEA NOT NULL,
-    PRIMARY KEY (agent_id, voxel));
 CREATE TABLE gausslite.sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
 CREATE TABLE gausslite.keyframes (
     agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
@@ -50,23 +51,15 @@ CREATE TABLE gausslite.properties (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE gausslite.mission_config (
     number INTEGER PRIMARY KEY CHECK (number = 1),
     mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m DOUBLE PRECISION NOT NULL);
-ALTER TABLE gausslite.voxel_updates ALTER COLUMN gaussians SET STORAGE EXTERNAL;
 ALTER TABLE gausslite.keyframes ALTER COLUMN data SET STORAGE EXTERNAL;
 """
-# one statement a message, with its rows as arrays: a statement a row takes 1.5 to 2 times as long
-_UPSERT = """
-INSERT INTO gausslite.voxel_updates
-SELECT * FROM unnest(
-    %s::text[], %s::bigint[], %s::bigint[], %s::bigint[], %s::bigint[], %s::bigint[], %b::bytea[])
-ON CONFLICT (agent_id, voxel) DO UPDATE SET
-    update_seq = excluded.update_seq, kappa_sum = excluded.kappa_sum, count = excluded.count,
-    checksum = excluded.checksum, gaussians = excluded.gaussians
+# one statement a transaction, with its rows as arrays: a statement a row takes 1.5 to 2 times as long
+_INSERT = """
+INSERT INTO gausslite.voxel_updates SELECT * FROM unnest(%s::bigint[], %s::text[], %s::bigint[], %b::bytea[])
 """
-_SELECT_UPDATES = (
-    "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, gaussians FROM gausslite.voxel_updates"
-)
-_SELECT_AGENT = f"{_SELECT_UPDATES} WHERE agent_id = %s ORDER BY voxel"
-_SELECT_VOXELS = f"{_SELECT_UPDATES} WHERE agent_id = %s AND voxel = ANY(%s::bigint[]) ORDER BY voxel"
+_DELETE = "DELETE FROM gausslite.voxel_updates WHERE number = ANY(%s::bigint[])"
+_SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM gausslite.voxel_updates"
+_SELECT_ROWS = f"{_SELECT_UPDATES} WHERE number = ANY(%s::bigint[])"
 _SET_PROPERTY = """
 INSERT INTO gausslite.properties VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SET value = excluded.value
 """
@@ -87,7 +80,7 @@ class PostgresStore:
     def __init__(self, url: str) -> None:
         self._name = database_name(url)
         self._write_lock, self._index_lock = RLock(), RLock()
-        self._index = ScoreIndex()
+        self._log = UpdateLog()
         # identify the content of the database: this opening, and the number of transactions since
         self._opening, self._commits = "", 0
         with ExitStack() as opened:
@@ -96,8 +89,6 @@ class PostgresStore:
             self._reader = PostgresConnection(url, lambda _: None)
             opened.callback(self._reader.close)
             self._reader.run(self._load)
-            mission_config = self.mission_config()
-            self._grid = None if mission_config is None else VoxelGrid(mission_config.voxel_size_m)
             self._opened = opened.pop_all()
 
     @property
@@ -107,85 +98,71 @@ class PostgresStore:
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
-        return self.put_all([subset])[0]
+        return self.put_all([StoredSubset.exact(subset)])[0]
 
-    def put_all(self, subsets: Sequence[RoiSubset]) -> list[PutOutcome]:
+    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
-        for subset in subsets:
-            require_storable(subset)
-        encoded = [to_stored(subset.batch, self._grid) for subset in subsets]
+        for update in updates:
+            require_storable(update)
         with self._write_lock:
-            masks = [newer_voxels(self._index, subset, self.batch) for subset in subsets]
-            columns = [
-                list(map(list, zip(*update_rows(subset, own, mask), strict=True)))
-                for subset, own, mask in zip(subsets, encoded, masks, strict=True)
-                if mask.any()
-            ]
-            if columns:
-                self._write(lambda db: db.cursor().executemany(_UPSERT, columns))
-            with self._index_lock:
-                for subset, mask in zip(subsets, masks, strict=True):
-                    self._index.put(subset.agent_id, subset.batch.keys[mask], scores_of(subset, mask))
-        return [
-            PutOutcome(subset.batch.keys[mask], subset.batch.keys[~mask])
-            for subset, mask in zip(subsets, masks, strict=True)
-        ]
+            change = self._log.plan(updates, self._read_rows)
+            if change.rows:
+                columns = list(map(list, zip(*change.rows, strict=True)))
+
+                def write(db: Database) -> None:
+                    if change.deleted:
+                        db.execute(_DELETE, (change.deleted,))
+                    db.execute(_INSERT, columns)
+
+                self._write(write)
+                with self._index_lock:
+                    self._log.apply(change)
+        return change.outcomes
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
 
         def delete(db: Database) -> None:
-            for table in ("voxel_updates", "keyframes", "records"):
+            db.execute(_DELETE, (self._log.rows_of(agent_id),))
+            for table in ("keyframes", "records"):
                 db.execute(f"DELETE FROM gausslite.{table} WHERE agent_id = %s", (agent_id,))  # noqa: S608 - constants
 
         with self._write_lock:
             self._write(delete)
             with self._index_lock:
-                return self._index.remove_agent(agent_id)
+                return self._log.remove_agent(agent_id)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
-        return self._index.agents
+        return self._log.index.agents
 
     def totals(self, agent_id: str) -> AgentTotals:
         """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
         with self._index_lock:
-            return self._index.totals(agent_id)
+            return self._log.index.totals(agent_id)
 
     def digests(self, agent_id: str) -> TileDigests:
         """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
         with self._index_lock:
-            return self._index.digests(agent_id)
+            return self._log.index.digests(agent_id)
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
         """Return the agent's totals on these voxels, in their order."""
         with self._index_lock:
-            return self._index.stored(agent_id, keys)
+            return self._log.index.stored(agent_id, keys)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         with self._index_lock:
-            return self._index.scores(keys)
+            return self._log.index.scores(keys)
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        return self._reader.run(lambda db: self._batch(db, agent_id, keys))
+        return self._batches(lambda: (agent_id,), keys)[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
-        scores = None if keys is None else self.scores(keys)
-        agents = self.agents() if scores is None else scores.agents
-        present = set(range(len(agents)) if scores is None else np.unique(scores.agent_index).tolist())
-
-        def read(db: Database) -> dict[str, VoxelBatch]:
-            with db.transaction():
-                db.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY")
-                return {
-                    agent_id: self._batch(db, agent_id, keys) if index in present else empty_batch()
-                    for index, agent_id in enumerate(agents)
-                }
-
-        return self._reader.run(read)
+        return self._batches(lambda: self._log.index.agents, keys)
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
@@ -196,7 +173,6 @@ class PostgresStore:
         """Store the mission's configuration."""
         values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
         self._write_row("mission_config", "number", ("mission_id", "world_frame", "voxel_size_m"), (1, *values))
-        self._grid = VoxelGrid(mission_config.voxel_size_m)
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""
@@ -290,8 +266,11 @@ class PostgresStore:
     def _create_or_check(self, db: Database) -> None:
         if db.execute("SELECT to_regclass('gausslite.properties')").fetchone() == (None,):
             db.execute(_SCHEMA)
+            db.execute(_UPDATES_SCHEMA)
             db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
             db.execute(_SET_PROPERTY, ("incarnation_id", secrets.token_hex(16)))
+        if _property(db, "schema_version") == str(_VOXEL_ROWS_VERSION):
+            self._convert(db)
         version = _property(db, "schema_version")
         if version != str(SCHEMA_VERSION):
             raise StorageError(
@@ -299,28 +278,38 @@ class PostgresStore:
                 "that release, or another database, and the agents send their updates again"
             )
 
+    def _convert(self, db: Database) -> None:
+        """Write the rows of a database with one row a voxel as those of this version."""
+        db.execute("ALTER TABLE gausslite.voxel_updates RENAME TO voxel_rows")
+        db.execute("ALTER INDEX gausslite.voxel_updates_pkey RENAME TO voxel_rows_pkey")
+        db.execute(_UPDATES_SCHEMA)
+        with db.cursor("convert", binary=True) as cursor:
+            cursor.execute('SELECT * FROM gausslite.voxel_rows ORDER BY agent_id COLLATE "C", voxel')
+            for row in rows_of_voxels(cursor, self._damaged):
+                db.execute("INSERT INTO gausslite.voxel_updates VALUES (%s, %s, %s, %s)", row)
+        db.execute("DROP TABLE gausslite.voxel_rows")
+        db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
+
     def _load(self, db: Database) -> None:
         """Check every row of updates and fill the index; read the id of the content."""
         with db.transaction(), db.cursor("load", binary=True) as cursor:
-            cursor.execute(f"{_SELECT_UPDATES} ORDER BY agent_id, voxel")
-            while rows := cursor.fetchmany(_LOADED_ROWS):
-                self._require_intact(rows)
-                index_rows(self._index, rows)
+            cursor.execute(f"{_SELECT_UPDATES} ORDER BY number")
+            self._log.load(require_intact(cursor, self._damaged))
         timeline = db.execute(_SELECT_TIMELINE).fetchone()
         self._incarnation_id = f"{_property(db, 'incarnation_id')}-{'' if timeline is None else timeline[0]}"
 
-    def _batch(self, db: Database, agent_id: str, keys: Int64[ndarray, " k"] | None) -> VoxelBatch:
-        if keys is None:
-            rows = db.execute(_SELECT_AGENT, (agent_id,), binary=True).fetchall()
-        else:
-            rows = db.execute(_SELECT_VOXELS, (agent_id, keys.tolist()), binary=True).fetchall()
-        self._require_intact(rows)
-        return batch_of_rows(rows)
+    def _batches(
+        self, agents: Callable[[], tuple[str, ...]], keys: Int64[ndarray, " k"] | None
+    ) -> dict[str, VoxelBatch]:
+        def locate() -> dict[str, Places]:
+            with self._index_lock:
+                return {agent_id: self._log.places(agent_id, keys) for agent_id in agents()}
 
-    def _require_intact(self, rows: Sequence[UpdateRow]) -> None:
-        for row in rows:
-            if not is_intact(row):
-                raise self._damaged(f"voxel {row[1]} of agent {row[0]!r}")
+        return read_batches(locate, self._read_rows)
+
+    def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
+        rows = self._read(_SELECT_ROWS, (numbers,))
+        return {row[0]: row[3] for row in require_intact(rows, self._damaged)}
 
     def _damaged(self, what: str) -> StorageError:
         return StorageError(

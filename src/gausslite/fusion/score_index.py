@@ -6,7 +6,7 @@ The index is derived from the rows of a store. The store owns it, and changes it
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import reduce
 from itertools import repeat
 from operator import or_
@@ -18,17 +18,20 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec.stored import RECORD, to_records
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, select_voxels
+from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
 
 _FIRST_CAPACITY = 64
+_DTYPES = (np.int64, np.int64, np.uint64, np.uint32, np.int64)
+_NO_COLUMNS: tuple[NDArray[Any], ...] = tuple(np.zeros(0, dtype) for dtype in _DTYPES)
 ReadBatch = Callable[[str, Int64[ndarray, " k"]], VoxelBatch]
 """Returns an agent's stored updates of some voxels."""
 
 
 class ScoreIndex:
-    """Totals by agent and voxel: 28 bytes a row and two dictionary entries. Not thread-safe; the store holds a lock."""
+    """Totals by agent and voxel: 36 bytes a row and two dictionary entries. Not thread-safe; the store holds a lock."""
 
     def __init__(self) -> None:
         self._rows: dict[str, _AgentRows] = {}
@@ -74,18 +77,23 @@ class ScoreIndex:
             np.concatenate([np.zeros(0, np.uint32), *(part[3] for part in parts)]),
         )
 
-    def put(self, agent_id: str, keys: Int64[ndarray, " k"], scores: StoredScores) -> None:
-        """Replace the agent's totals on these voxels."""
-        if len(keys) == 0:
-            return
+    def columns(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> tuple[NDArray[Any], ...]:
+        """Return keys, update_seqs, kappa_sums, counts and rows of an agent's voxels (ascending keys), or of all."""
+        rows = self._rows.get(agent_id)
+        return _NO_COLUMNS if rows is None else rows.sorted_columns(keys)
+
+    def put(self, agent_id: str, keys: Int64[ndarray, " k"], scores: StoredScores) -> StoredScores:
+        """Replace the agent's totals on these voxels; returns those from before."""
         if agent_id not in self._rows:
             self._rows[agent_id] = _AgentRows()
             self._agents = tuple(sorted(self._rows))
             used = reduce(or_, self._bits.values(), 0)
             self._bits[agent_id] = ~used & (used + 1)
         bit = self._bits[agent_id]
-        for key in self._rows[agent_id].put(keys, scores):
+        new_keys, before = self._rows[agent_id].put(keys, scores)
+        for key in new_keys:
             self._holders[key] = self._holders.get(key, 0) | bit
+        return before
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's rows; returns the keys of its voxels, ascending."""
@@ -103,49 +111,30 @@ class ScoreIndex:
                 del self._holders[key]
         return keys
 
-    def remove_voxels(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Int64[ndarray, " r"]:
-        """Delete the agent's rows of these voxels, at the cost of all its rows; returns the keys that had one."""
-        if agent_id not in self._rows:
-            return np.zeros(0, np.int64)
-        own_keys, *columns = self._rows[agent_id].sorted_columns(None)
-        removed = np.isin(own_keys, keys)
-        self.remove_agent(agent_id)
-        self.put(agent_id, own_keys[~removed], select_scores(StoredScores(*columns), ~removed))
-        return own_keys[removed]
-
     def _holders_of(self, keys: Int64[ndarray, " k"]) -> int:
         return reduce(or_, map(self._holders.get, keys.tolist(), repeat(0)), 0)
 
 
-def newer_voxels(index: ScoreIndex, subset: RoiSubset, read: ReadBatch) -> Bool[ndarray, " v"]:
+def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadBatch) -> Bool[ndarray, " v"]:
     """Return a mask of the message's voxels that replace the stored ones.
 
     The higher sequence number wins; between equal ones the larger (Σkappa, count, records) does, so that the outcome
     does not depend on the order of arrival.
     """
-    batch = subset.batch
-    every = np.ones(len(batch), np.bool_)
-    newer, same = compare_scores(scores_of(subset, every), index.stored(subset.agent_id, batch.keys))
-    same_totals = same & (batch.counts > 0)
-    if same_totals.any():
-        received = voxel_records(select_voxels(batch, same_totals))
-        stored_records = voxel_records(read(subset.agent_id, batch.keys[same_totals]))
-        newer[same_totals] = [own > other for own, other in zip(received, stored_records, strict=True)]
+    keys, table = update.voxels.keys, update.voxels.voxels
+    stored = index.stored(update.agent_id, keys)
+    newer: Bool[ndarray, " v"] = stored.update_seqs < update.update_seq
+    same_seq = stored.update_seqs == update.update_seq
+    if same_seq.any():
+        sums, counts = table["kappa_sums"], table["counts"]
+        same_sum = stored.kappa_sums == sums
+        newer |= same_seq & ((sums > stored.kappa_sums) | (same_sum & (counts > stored.counts)))
+        equal = np.flatnonzero(same_seq & same_sum & (counts == stored.counts) & (counts > 0))
+        if len(equal):
+            received = voxel_records(update.voxels.take(equal).batch())
+            stored_records = voxel_records(read(update.agent_id, keys[equal]))
+            newer[equal] = [own > other for own, other in zip(received, stored_records, strict=True)]
     return newer
-
-
-def compare_scores(scores: StoredScores, stored: StoredScores) -> tuple[Bool[ndarray, " v"], Bool[ndarray, " v"]]:
-    """Return where the totals are those of a newer update than the stored ones, and where they are equal."""
-    same_seq = scores.update_seqs == stored.update_seqs
-    same_sum = scores.kappa_sums == stored.kappa_sums
-    larger = (scores.kappa_sums > stored.kappa_sums) | (same_sum & (scores.counts > stored.counts))
-    newer = (scores.update_seqs > stored.update_seqs) | (same_seq & larger)
-    return newer, same_seq & same_sum & (scores.counts == stored.counts)
-
-
-def select_scores(scores: StoredScores, selected: Bool[ndarray, " v"]) -> StoredScores:
-    """Return the totals of the selected voxels."""
-    return StoredScores(scores.update_seqs[selected], scores.kappa_sums[selected], scores.counts[selected])
 
 
 def voxel_records(batch: VoxelBatch) -> list[bytes]:
@@ -155,22 +144,13 @@ def voxel_records(batch: VoxelBatch) -> list[bytes]:
     return [data[start:end] for start, end in itertools.pairwise(ends)]
 
 
-def scores_of(subset: RoiSubset, selected: Bool[ndarray, " v"]) -> StoredScores:
-    """Return the totals of the message's selected voxels."""
-    batch = subset.batch
-    sums, counts = batch.kappa_sums[selected], batch.counts[selected]
-    return StoredScores(np.full(len(sums), subset.update_seq, np.int64), sums, counts)
-
-
 class _AgentRows:
     """Columns of one agent's totals, in the order of arrival, and the row of each voxel."""
 
     def __init__(self) -> None:
         self.totals = AgentTotals()
         self._row_of: dict[int, int] = {}
-        self._columns: tuple[NDArray[Any], ...] = tuple(
-            np.zeros(_FIRST_CAPACITY, dtype) for dtype in (np.int64, np.int64, np.uint64, np.uint32)
-        )
+        self._columns: tuple[NDArray[Any], ...] = tuple(np.zeros(_FIRST_CAPACITY, dtype) for dtype in _DTYPES)
 
     def find(self, keys: Int64[ndarray, " k"]) -> Int64[ndarray, " k"]:
         """Return the row of each voxel, -1 where there is none."""
@@ -178,16 +158,17 @@ class _AgentRows:
 
     def stored(self, rows: Int64[ndarray, " k"]) -> StoredScores:
         """Return the totals in these rows."""
-        _, update_seqs, kappa_sums, counts = self._columns
+        _, update_seqs, kappa_sums, counts, numbers = self._columns
         is_stored = rows >= 0
         return StoredScores(
             np.where(is_stored, update_seqs[rows], -1),
             np.where(is_stored, kappa_sums[rows], np.uint64(0)),
             np.where(is_stored, counts[rows], np.uint32(0)),
+            np.where(is_stored, numbers[rows], -1),
         )
 
     def sorted_columns(self, wanted: Int64[ndarray, " k"] | None) -> tuple[NDArray[Any], ...]:
-        """Return keys, update_seqs, kappa_sums and counts of the wanted voxels (ascending keys), or of all."""
+        """Return keys, update_seqs, kappa_sums, counts and rows of the wanted voxels (ascending keys), or of all."""
         if wanted is None:
             rows = np.argsort(self._columns[0][: len(self._row_of)])
         else:
@@ -195,8 +176,8 @@ class _AgentRows:
             rows = rows[rows >= 0]
         return tuple(column[rows] for column in self._columns)
 
-    def put(self, keys: Int64[ndarray, " k"], scores: StoredScores) -> Iterable[int]:
-        """Replace the totals of these voxels; returns the keys that had no row."""
+    def put(self, keys: Int64[ndarray, " k"], scores: StoredScores) -> tuple[list[int], StoredScores]:
+        """Replace the totals of these voxels; returns the keys that had none, and the totals from before."""
         rows = self.find(keys)
         before = self.stored(rows)
         is_new = rows < 0
@@ -205,11 +186,11 @@ class _AgentRows:
         rows[is_new] = np.arange(used, used + len(new_keys))
         self._reserve(used + len(new_keys))
         self._row_of.update(zip(new_keys, range(used, used + len(new_keys)), strict=True))
-        values = keys, scores.update_seqs, scores.kappa_sums, scores.counts
+        values = keys, scores.update_seqs, scores.kappa_sums, scores.counts, scores.rows
         for column, value in zip(self._columns, values, strict=True):
             column[rows] = value
         self.totals = self.totals.replace_part(before, scores)
-        return new_keys
+        return new_keys, before
 
     def _reserve(self, size: int) -> None:
         capacity = len(self._columns[0])

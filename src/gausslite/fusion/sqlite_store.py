@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import fcntl
+import functools
 import json
+import logging
 import os
 import secrets
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import RLock
 from typing import Any
 
-import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored import to_stored
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError
 from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batch
-from gausslite.fusion.score_index import ScoreIndex, newer_voxels, scores_of
+from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.store import (
     AgentTotals,
     MissionConfig,
@@ -31,9 +31,13 @@ from gausslite.fusion.store import (
     VoxelScoreTable,
     require_storable,
 )
-from gausslite.fusion.store_rows import UpdateRow, batch_of_rows, data_checksum, index_rows, is_intact, update_rows
+from gausslite.fusion.store_migration import rows_of_voxels
+from gausslite.fusion.store_rows import Places, UpdateLog, data_checksum, read_batches, require_intact
 
-SCHEMA_VERSION = 6
+_log = logging.getLogger(__name__)
+SCHEMA_VERSION = 7
+_VOXEL_ROWS_VERSION = 6
+"""Had one row a voxel; such a store is converted when a server opens it."""
 PAGE_BYTES = 4096
 RESTORE_ADVICE = (
     "restore a backup (gausslite-fusion-server restore BACKUP STORE), or delete the damaged rows "
@@ -42,11 +46,11 @@ RESTORE_ADVICE = (
 _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
 # 32 MiB: smaller logs are copied into the file so often that acknowledgements wait
 _CHECKPOINT_PAGES = 8192
-_SCHEMA = """
+_UPDATES_SCHEMA = """
 CREATE TABLE voxel_updates (
-    agent_id TEXT NOT NULL, voxel INTEGER NOT NULL, update_seq INTEGER NOT NULL,
-    kappa_sum INTEGER NOT NULL, count INTEGER NOT NULL, checksum INTEGER NOT NULL, gaussians BLOB NOT NULL,
-    PRIMARY KEY (agent_id, voxel));
+    number INTEGER PRIMARY KEY, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, voxels BLOB NOT NULL);
+"""
+_SCHEMA = """
 CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
 CREATE TABLE keyframes (
     agent_id TEXT NOT NULL, frame_index INTEGER NOT NULL, checksum INTEGER NOT NULL, data BLOB NOT NULL,
@@ -83,8 +87,8 @@ class StoreLock:
         os.close(self._file)
 
 
-def open_existing(path: Path) -> sqlite3.Connection:
-    """Connect to a store and check its header and its schema; rows are not read. Raises StorageError."""
+def open_existing(path: Path, versions: Sequence[int] = (SCHEMA_VERSION,)) -> sqlite3.Connection:
+    """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError."""
     if not path.is_file():
         raise StorageError(f"store {path}: expected a GaussLite store, got no file")
     if path.stat().st_size == 0:
@@ -98,10 +102,15 @@ def open_existing(path: Path) -> sqlite3.Connection:
             if db.execute("PRAGMA application_id").fetchone()[0] != _APPLICATION_ID:
                 raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
             version = db.execute("PRAGMA user_version").fetchone()[0]
-            if version != SCHEMA_VERSION:
+            if version not in versions:
+                advice = (
+                    "a server converts it when it opens it"
+                    if version == _VOXEL_ROWS_VERSION
+                    else "use that release, or another file, and the agents send their updates again"
+                )
                 raise StorageError(
-                    f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use "
-                    "that release, or another file, and the agents send their updates again"
+                    f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; "
+                    f"{advice}"
                 )
     except BaseException:
         db.close()
@@ -112,20 +121,45 @@ def open_existing(path: Path) -> sqlite3.Connection:
 def open_or_create(path: Path) -> sqlite3.Connection:
     """Connect to a store for writing; a missing file is created. Raises StorageError."""
     is_new = not path.exists()
-    db = connect(path) if is_new else open_existing(path)
+    db = connect(path) if is_new else open_existing(path, (SCHEMA_VERSION, _VOXEL_ROWS_VERSION))
     try:
         with storage_errors(path):
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = FULL")
+            # freed pages are overwritten only where that costs no additional write
+            db.execute("PRAGMA secure_delete = FAST")
             db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
             if is_new:
                 header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
-                db.executescript(f"BEGIN IMMEDIATE; {header} {_SCHEMA} COMMIT;")
+                db.executescript(f"BEGIN IMMEDIATE; {header} {_UPDATES_SCHEMA} {_SCHEMA} COMMIT;")
                 renew_incarnation(db)
+            elif db.execute("PRAGMA user_version").fetchone()[0] == _VOXEL_ROWS_VERSION:
+                _convert(db, path)
     except BaseException:
         db.close()
         raise
     return db
+
+
+def _convert(db: sqlite3.Connection, path: Path) -> None:
+    """Write the rows of a store with one row a voxel as those of this version, in one transaction."""
+    _log.info("store %s: converted from schema version %d", path, _VOXEL_ROWS_VERSION)
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        db.execute("ALTER TABLE voxel_updates RENAME TO voxel_rows")
+        db.execute(_UPDATES_SCHEMA)
+        old = db.execute("SELECT * FROM voxel_rows ORDER BY agent_id, voxel")
+        db.executemany(_INSERT, rows_of_voxels(old, lambda what: _damaged(path, what)))
+        db.execute("DROP TABLE voxel_rows")
+        db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        db.execute("COMMIT")
+    except BaseException:
+        db.execute("ROLLBACK")
+        raise
+
+
+def _damaged(path: Path, what: str) -> StorageError:
+    return StorageError(f"store {path}: {what} is damaged (its checksum does not match); {RESTORE_ADVICE}")
 
 
 def renew_incarnation(db: sqlite3.Connection) -> None:
@@ -167,16 +201,11 @@ def _explain(error: sqlite3.Error) -> str:
     return f"refused ({text})"
 
 
-_LOADED_ROWS = 10_000
-_UPSERT = """
-INSERT INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (agent_id, voxel) DO UPDATE SET
-    update_seq = excluded.update_seq, kappa_sum = excluded.kappa_sum, count = excluded.count,
-    checksum = excluded.checksum, gaussians = excluded.gaussians
-"""
-SELECT_UPDATES = "SELECT agent_id, voxel, update_seq, kappa_sum, count, checksum, gaussians FROM voxel_updates"
+_DELETE = "DELETE FROM voxel_updates WHERE number = ?"
+_INSERT = "INSERT INTO voxel_updates VALUES (?, ?, ?, ?)"
+SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM voxel_updates"
 """UpdateRows."""
-_SELECT_AGENT = f"{SELECT_UPDATES} WHERE agent_id = ? ORDER BY voxel"
-_SELECT_VOXELS = f"{SELECT_UPDATES} WHERE agent_id = ? AND voxel IN (SELECT value FROM json_each(?)) ORDER BY voxel"  # noqa: S608
+_SELECT_ROWS = f"{SELECT_UPDATES} WHERE number IN (SELECT value FROM json_each(?))"  # noqa: S608
 
 
 class SqliteStore:
@@ -191,7 +220,7 @@ class SqliteStore:
     def __init__(self, path: Path, max_bytes: int | None = None) -> None:
         self._path = path
         self._write_lock, self._read_lock, self._index_lock = RLock(), RLock(), RLock()
-        self._index = ScoreIndex()
+        self._log = UpdateLog()
         with ExitStack() as opened:
             lock = StoreLock(path)
             opened.callback(lock.release)
@@ -203,7 +232,6 @@ class SqliteStore:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
             self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
-            self._grid = _grid_of(self.mission_config())
             self._opened = opened.pop_all()
 
     @property
@@ -213,87 +241,63 @@ class SqliteStore:
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
-        return self.put_all([subset])[0]
+        return self.put_all([StoredSubset.exact(subset)])[0]
 
-    def put_all(self, subsets: Sequence[RoiSubset]) -> list[PutOutcome]:
+    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
-        for subset in subsets:
-            require_storable(subset)
-        encoded = [to_stored(subset.batch, self._grid) for subset in subsets]
+        for update in updates:
+            require_storable(update)
         with self._write_lock:
-            masks = [newer_voxels(self._index, subset, self.batch) for subset in subsets]
-            if any(mask.any() for mask in masks):
+            change = self._log.plan(updates, self._read_rows)
+            if change.rows:
                 with self._transaction() as db:
-                    for subset, own, mask in zip(subsets, encoded, masks, strict=True):
-                        db.executemany(_UPSERT, update_rows(subset, own, mask))
-            with self._index_lock:
-                for subset, mask in zip(subsets, masks, strict=True):
-                    self._index.put(subset.agent_id, subset.batch.keys[mask], scores_of(subset, mask))
-        return [
-            PutOutcome(subset.batch.keys[mask], subset.batch.keys[~mask])
-            for subset, mask in zip(subsets, masks, strict=True)
-        ]
+                    db.executemany(_DELETE, ((number,) for number in change.deleted))
+                    db.executemany(_INSERT, change.rows)
+                with self._index_lock:
+                    self._log.apply(change)
+        return change.outcomes
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
         with self._write_lock:
             with self._transaction() as db:
-                for table in ("voxel_updates", "keyframes", "records"):
-                    db.execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - the names are constants
+                db.executemany(_DELETE, ((number,) for number in self._log.rows_of(agent_id)))
+                for table in ("keyframes", "records"):
+                    db.execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - constant names
             with self._index_lock:
-                return self._index.remove_agent(agent_id)
+                return self._log.remove_agent(agent_id)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
-        return self._index.agents
+        return self._log.index.agents
 
     def totals(self, agent_id: str) -> AgentTotals:
         """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
         with self._index_lock:
-            return self._index.totals(agent_id)
+            return self._log.index.totals(agent_id)
 
     def digests(self, agent_id: str) -> TileDigests:
         """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
         with self._index_lock:
-            return self._index.digests(agent_id)
+            return self._log.index.digests(agent_id)
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
         """Return the agent's totals on these voxels, in their order."""
         with self._index_lock:
-            return self._index.stored(agent_id, keys)
+            return self._log.index.stored(agent_id, keys)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         with self._index_lock:
-            return self._index.scores(keys)
+            return self._log.index.scores(keys)
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        rows: list[UpdateRow] = (
-            self._read(_SELECT_AGENT, (agent_id,))
-            if keys is None
-            else self._read(_SELECT_VOXELS, (agent_id, _as_json(keys)))
-        )
-        for row in rows:
-            self._require_intact(row)
-        return batch_of_rows(rows)
+        return self._batches(lambda: (agent_id,), keys)[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
-        scores = None if keys is None else self.scores(keys)
-        with self._read_lock, storage_errors(self._path):
-            # a read transaction: all queries see the same commit
-            self._reader.execute("BEGIN")
-            try:
-                if scores is None:
-                    return {agent_id: self.batch(agent_id) for agent_id in self.agents()}
-                present = set(np.unique(scores.agent_index).tolist())
-                return {
-                    agent_id: self.batch(agent_id, keys) if index in present else empty_batch()
-                    for index, agent_id in enumerate(scores.agents)
-                }
-            finally:
-                self._reader.execute("COMMIT")
+        return self._batches(lambda: self._log.index.agents, keys)
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
@@ -305,7 +309,6 @@ class SqliteStore:
         values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
         with self._transaction() as db:
             db.execute("INSERT OR REPLACE INTO mission_config VALUES (1, ?, ?, ?)", values)
-        self._grid = _grid_of(mission_config)
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return all open sessions, sorted by session id."""
@@ -346,7 +349,7 @@ class SqliteStore:
         query = "SELECT data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ?"
         for data, checksum in self._read(query, (agent_id, index)):
             if data_checksum(agent_id, index, data) != checksum:
-                raise self._damaged(f"keyframe {index} of agent {agent_id!r}")
+                raise _damaged(self._path, f"keyframe {index} of agent {agent_id!r}")
             return bytes(data)
         return b""
 
@@ -361,7 +364,7 @@ class SqliteStore:
         rows = self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,))
         for agent_id, data, checksum in rows:
             if data_checksum(agent_id, name, data) != checksum:
-                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
+                raise _damaged(self._path, f"record {name!r} of agent {agent_id!r}")
         return {agent_id: data for agent_id, data, _ in rows}
 
     def close(self) -> None:
@@ -375,18 +378,21 @@ class SqliteStore:
             check = self._reader.execute("PRAGMA quick_check(1)").fetchone()[0]
             if check != "ok":
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
-            cursor = self._reader.execute(f"{SELECT_UPDATES} ORDER BY agent_id, voxel")
-            while rows := cursor.fetchmany(_LOADED_ROWS):
-                for row in rows:
-                    self._require_intact(row)
-                index_rows(self._index, rows)
+            rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
+            self._log.load(require_intact(rows, functools.partial(_damaged, self._path)))
 
-    def _require_intact(self, row: UpdateRow) -> None:
-        if not is_intact(row):
-            raise self._damaged(f"voxel {row[1]} of agent {row[0]!r}")
+    def _batches(
+        self, agents: Callable[[], tuple[str, ...]], keys: Int64[ndarray, " k"] | None
+    ) -> dict[str, VoxelBatch]:
+        def locate() -> dict[str, Places]:
+            with self._index_lock:
+                return {agent_id: self._log.places(agent_id, keys) for agent_id in agents()}
 
-    def _damaged(self, what: str) -> StorageError:
-        return StorageError(f"store {self._path}: {what} is damaged (its checksum does not match); {RESTORE_ADVICE}")
+        return read_batches(locate, self._read_rows)
+
+    def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
+        rows = self._read(_SELECT_ROWS, (json.dumps(numbers),))
+        return {row[0]: row[3] for row in require_intact(rows, functools.partial(_damaged, self._path))}
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._read_lock, storage_errors(self._path):
@@ -403,11 +409,3 @@ class SqliteStore:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
                 raise
-
-
-def _grid_of(mission_config: MissionConfig | None) -> VoxelGrid | None:
-    return None if mission_config is None else VoxelGrid(mission_config.voxel_size_m)
-
-
-def _as_json(keys: Int64[ndarray, " k"]) -> str:
-    return json.dumps(keys.tolist())

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Int32, Int64, UInt32, UInt64
 from numpy import ndarray
 
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.checks import quote_name, require_identifier, require_name
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.voxel_changes import TileDigests
@@ -99,16 +100,18 @@ class VoxelScoreTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredScores:
-    """The totals of an agent's updates of some voxels; update_seq is -1 where it has no update."""
+    """The totals of an agent's updates of some voxels, and the store's row of each; -1 where it has no update."""
 
     update_seqs: Int64[ndarray, " k"]
     kappa_sums: UInt64[ndarray, " k"]
     counts: UInt32[ndarray, " k"]
+    rows: Int64[ndarray, " k"]
 
     @classmethod
     def missing(cls, voxels: int) -> StoredScores:
         """Return the totals of an agent without updates."""
-        return cls(np.full(voxels, -1, np.int64), np.zeros(voxels, np.uint64), np.zeros(voxels, np.uint32))
+        none = np.full(voxels, -1, np.int64)
+        return cls(none, np.zeros(voxels, np.uint64), np.zeros(voxels, np.uint32), none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +160,7 @@ class FusionStore(Protocol):
         """Store one message completely, or nothing of it on an error. Raises InvalidInputError."""
         ...
 
-    def put_all(self, subsets: Sequence[RoiSubset]) -> list[PutOutcome]:
+    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
         """Store messages of different agents in one transaction: all, or none on an error. Raises InvalidInputError."""
         ...
 
@@ -242,11 +245,11 @@ class FusionStore(Protocol):
         ...
 
 
-def require_storable(subset: RoiSubset) -> None:
+def require_storable(update: StoredSubset) -> None:
     """Raise InvalidInputError if a number of the message does not fit the store's signed 64-bit columns."""
-    largest_sum = int(subset.batch.kappa_sums.max(initial=0))
+    largest_sum = int(update.voxels.voxels["kappa_sums"].max(initial=0))
     limit = int(np.iinfo(np.int64).max)
-    numbers = (("update_seq", subset.update_seq), ("message_seq", subset.message_seq), ("kappa_sum", largest_sum))
+    numbers = (("update_seq", update.update_seq), ("message_seq", update.message_seq), ("kappa_sum", largest_sum))
     for name, value in numbers:
         if value > limit:
             raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")

@@ -18,7 +18,7 @@ from gausslite.fusion.sqlite_store import (
     renew_incarnation,
     storage_errors,
 )
-from gausslite.fusion.store_rows import data_checksum, is_intact
+from gausslite.fusion.store_rows import UpdateLog, UpdateRow, data_checksum, is_intact
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,16 +104,20 @@ def _check(db: sqlite3.Connection, path: Path) -> tuple[StoreReport, list[tuple[
     found = db.execute("PRAGMA quick_check(1)").fetchone()[0]
     if found != "ok":
         raise StorageError(f"store {path}: expected an undamaged file, got {found!r}; restore a backup")
-    agents, voxels, gaussians, damaged = set(), 0, 0, list(_damaged_data(db))
-    for rowid, *row in db.execute(SELECT_UPDATES.replace("SELECT", "SELECT rowid,", 1)):
-        if is_intact(tuple(row)):
-            agents.add(row[0])
-            voxels += 1
-            gaussians += row[4]
-        else:
-            damaged.append(("voxel_updates", rowid))
+    damaged, log = list(_damaged_data(db)), UpdateLog()
+
+    def intact() -> Iterator[UpdateRow]:
+        for row in db.execute(f"{SELECT_UPDATES} ORDER BY number"):
+            if is_intact(row):
+                yield row
+            else:
+                damaged.append(("voxel_updates", row[0]))
+
+    log.load(intact())
+    totals = [log.index.totals(agent_id) for agent_id in log.index.agents]
+    voxels, gaussians = (sum(getattr(own, name) for own in totals) for name in ("voxels", "gaussians"))
     keyframes = db.execute("SELECT count(*) FROM keyframes").fetchone()[0]
-    return StoreReport(len(agents), voxels, gaussians, keyframes, len(damaged)), damaged
+    return StoreReport(len(totals), voxels, gaussians, keyframes, len(damaged)), damaged
 
 
 def _damaged_data(db: sqlite3.Connection) -> Iterator[tuple[str, int]]:

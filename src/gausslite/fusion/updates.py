@@ -6,16 +6,18 @@ import heapq
 import struct
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from threading import Lock, RLock
 
 import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
 
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, slice_voxels
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.store import FusionStore, PutOutcome
 
@@ -42,7 +44,7 @@ class UpdateChecks:
             self._store.save_record(agent_id, RECORD, _JOINED.pack(now_s))
             self._first_joined_s[agent_id] = now_s
 
-    def check(self, subset: RoiSubset) -> RoiSubset:
+    def check(self, subset: StoredSubset) -> StoredSubset:
         """Return the message with Σkappa computed from its Gaussians, whatever it declares.
 
         Raises InvalidInputError for a sequence number too far above the stored ones, QuotaError for a kappa that no
@@ -53,13 +55,13 @@ class UpdateChecks:
             raise InvalidInputError(
                 f"agent {name}: expected an update_seq of at most {highest + MAX_SEQ_STEP}, got {subset.update_seq}"
             )
-        batch = subset.batch
-        largest, bound = int(batch.gaussians.kappa.max(initial=0)), self._kappa_bound(subset.agent_id)
+        voxels = subset.voxels
+        largest, bound = int(voxels.gaussians["kappa"].max(initial=0)), self._kappa_bound(subset.agent_id)
         if largest > bound:
             raise QuotaError(
                 f"agent {name}: expected a kappa of at most {bound} this long after its first join, got {largest}"
             )
-        return replace(subset, batch=with_computed_sums(batch))
+        return replace(subset, voxels=voxels.with_computed_sums())
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete what is known of the agent; the store deletes its records."""
@@ -70,13 +72,6 @@ class UpdateChecks:
         now_s = self._clock_s()
         elapsed_s = max(0.0, now_s - self._first_joined_s.get(agent_id, now_s))
         return self._quotas.kappa_at_join + int(self._quotas.kappa_per_second * elapsed_s)
-
-
-def with_computed_sums(batch: VoxelBatch) -> VoxelBatch:
-    """Return the batch with the Σkappa of its own Gaussians (Sec. III-E)."""
-    totals = np.concatenate([np.zeros(1, np.uint64), np.cumsum(batch.gaussians.kappa, dtype=np.uint64)])
-    offsets = batch.offsets
-    return replace(batch, kappa_sums=totals[offsets[1:]] - totals[offsets[:-1]])
 
 
 SLICE_VOXELS = 2048
@@ -92,7 +87,7 @@ class PendingUpdate:
     """A message that waits for its commit. It is stored in slices; `outcomes` has those of the stored slices."""
 
     session_id: str
-    subset: RoiSubset
+    subset: StoredSubset
     future: Future[PutOutcome] = field(default_factory=Future)
     next_voxel: int = 0
     outcomes: list[PutOutcome] = field(default_factory=list)
@@ -101,19 +96,18 @@ class PendingUpdate:
         # a client that disconnects cannot cancel it any more: the message is stored in any case
         self.future.set_running_or_notify_cancel()
 
-    def next_slice(self) -> RoiSubset:
+    def next_slice(self) -> StoredSubset:
         """Return the part of the message to store next."""
         subset, start = self.subset, self.next_voxel
-        if len(subset.batch) <= SLICE_VOXELS:
+        if len(subset.voxels) <= SLICE_VOXELS:
             return subset
-        part = slice_voxels(subset.batch, start, start + SLICE_VOXELS)
-        return RoiSubset(subset.agent_id, subset.session_id, subset.message_seq, subset.update_seq, part)
+        return replace(subset, voxels=subset.voxels.slice(start, start + SLICE_VOXELS))
 
     def add_outcome(self, outcome: PutOutcome) -> bool:
         """Note that the next slice is stored; returns whether it was the last one."""
         self.outcomes.append(outcome)
         self.next_voxel += SLICE_VOXELS
-        return self.next_voxel >= len(self.subset.batch)
+        return self.next_voxel >= len(self.subset.voxels)
 
     def outcome(self) -> PutOutcome:
         """Return the outcome of the whole message."""
@@ -166,7 +160,7 @@ class UpdateQueue:
                 start, _, agent_id = heapq.heappop(self._waiting)
                 self._now = start
                 update = self._pending[agent_id][0]
-                own_cost = _MESSAGE_COST + min(len(update.subset.batch) - update.next_voxel, SLICE_VOXELS)
+                own_cost = _MESSAGE_COST + min(len(update.subset.voxels) - update.next_voxel, SLICE_VOXELS)
                 self._finish[agent_id] = start + own_cost
                 cost += own_cost
                 taken.append(update)
@@ -195,10 +189,10 @@ class UpdateQueue:
 
 
 _GROUP_VOXELS = 4096
-Check = Callable[[PendingUpdate], RoiSubset]
+Check = Callable[[PendingUpdate], StoredSubset]
 """Returns the message as it is stored. Raises GaussLiteError to refuse it."""
-Record = Callable[[RoiSubset, PutOutcome], None]
-"""Notes what a commit has stored."""
+Record = Callable[[Sequence[tuple[str, Int64[ndarray, " _"]]]], None]
+"""Notes the voxels of each agent that a commit has stored."""
 
 
 class UpdateCommitter:
@@ -236,7 +230,7 @@ class UpdateCommitter:
                         self._queue.put_back(update, update.future.done())
 
     def _commit(self, group: list[PendingUpdate]) -> None:
-        checked: list[tuple[PendingUpdate, RoiSubset]] = []
+        checked: list[tuple[PendingUpdate, StoredSubset]] = []
         with self._lock:
             for update in group:
                 try:
@@ -246,23 +240,27 @@ class UpdateCommitter:
                     _fail(update, error)
         outcomes = self._put(checked)
         with self._lock:
-            for (_, part), outcome in zip(checked, outcomes, strict=True):
-                if outcome is not None:
-                    self._record(part, outcome)
+            self._record(
+                [
+                    (part.agent_id, outcome.accepted)
+                    for (_, part), outcome in zip(checked, outcomes, strict=True)
+                    if outcome is not None
+                ]
+            )
         for (update, _), outcome in zip(checked, outcomes, strict=True):
             if outcome is not None and update.add_outcome(outcome):
                 update.future.set_result(update.outcome())
 
-    def _put(self, checked: list[tuple[PendingUpdate, RoiSubset]]) -> list[PutOutcome | None]:
+    def _put(self, checked: list[tuple[PendingUpdate, StoredSubset]]) -> list[PutOutcome | None]:
         """Store the messages; if the group fails, each alone, so that one too large for the disk fails alone."""
         try:
             return list(self._store.put_all([part for _, part in checked]))
         except GaussLiteError:
             return [self._put_alone(update, part) for update, part in checked]
 
-    def _put_alone(self, update: PendingUpdate, part: RoiSubset) -> PutOutcome | None:
+    def _put_alone(self, update: PendingUpdate, part: StoredSubset) -> PutOutcome | None:
         try:
-            return self._store.put(part)
+            return self._store.put_all([part])[0]
         except GaussLiteError as error:
             _fail(update, error)
             return None
@@ -273,12 +271,12 @@ def _fail(update: PendingUpdate, error: BaseException) -> None:
         update.future.set_exception(error)
 
 
-def require_within_quotas(subset: RoiSubset, store: FusionStore, quotas: Quotas) -> None:
+def require_within_quotas(subset: StoredSubset, store: FusionStore, quotas: Quotas) -> None:
     """Raise QuotaError if the agent would have too many voxels (with tombstones) or Gaussians."""
-    stored, totals = store.stored(subset.agent_id, subset.batch.keys), store.totals(subset.agent_id)
+    stored, totals = store.stored(subset.agent_id, subset.voxels.keys), store.totals(subset.agent_id)
     # equal numbers count as newer: a larger content replaces the stored one, and a duplicate adds nothing
     newer = stored.update_seqs <= subset.update_seq
-    added = subset.batch.counts[newer].sum(dtype=np.int64) - stored.counts[newer].sum(dtype=np.int64)
+    added = subset.voxels.counts[newer].sum(dtype=np.int64) - stored.counts[newer].sum(dtype=np.int64)
     for name, value, limit in (
         ("voxels", totals.voxels + int(np.count_nonzero(stored.update_seqs < 0)), quotas.voxels_per_agent),
         ("Gaussians", totals.gaussians + int(added), quotas.gaussians_per_agent),

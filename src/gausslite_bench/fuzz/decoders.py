@@ -7,11 +7,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from gausslite.codec.json import decode_object_report
 from gausslite.codec.ply import gaussians_from_ply, world_frame_from_ply
-from gausslite.codec.stored import CODES, from_bytes, from_stored
+from gausslite.codec.stored import from_bytes
+from gausslite.codec.stored_voxels import StoredVoxels
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.convert import decode_frame
@@ -25,9 +24,8 @@ def _decode_ply(data: bytes) -> None:
     gaussians_from_ply(data)
 
 
-def _decode_stored_voxel(data: bytes) -> None:
-    count = np.array([len(data) // CODES.itemsize], np.uint32)
-    from_stored(np.zeros(1, np.int64), count, [data])
+def _decode_stored_row(data: bytes) -> None:
+    StoredVoxels.from_row(data).batch()
 
 
 DECODERS: Mapping[str, Callable[[bytes], object]] = {
@@ -35,7 +33,7 @@ DECODERS: Mapping[str, Callable[[bytes], object]] = {
     "keyframe": decode_frame,
     "object-report": decode_object_report,
     "records": from_bytes,
-    "stored-voxel": _decode_stored_voxel,
+    "stored-row": _decode_stored_row,
     "ply": _decode_ply,
 }
 _SHARES = {
@@ -43,7 +41,7 @@ _SHARES = {
     "keyframe": 0.1,
     "object-report": 0.1,
     "records": 0.05,
-    "stored-voxel": 0.05,
+    "stored-row": 0.05,
     "ply": 0.1,
 }
 

@@ -1,4 +1,4 @@
-"""Rows of a store: every bit comes back, and Gaussians of quantised messages take 19 bytes."""
+"""Rows of a store: every bit comes back, and Gaussians of quantised messages take 21 bytes."""
 
 from __future__ import annotations
 
@@ -10,98 +10,96 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.sample_batches import make_batch
 
-from gausslite.codec.stored import CODES, RECORD, from_stored, is_stored, to_records, to_stored
-from gausslite.codec.subset_codec import decode_subset, encode_subset
-from gausslite.domain.errors import StorageError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
+from gausslite.codec.stored import RECORD, to_records
+from gausslite.codec.stored_voxels import CODES, VOXELS, StoredVoxels
+from gausslite.codec.subset_codec import SubsetCoding, decode_stored, decode_subset, encode_subset
+from gausslite.domain.errors import CodecError, StorageError
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, tiles_of
 
-SIZE_HEADER_BYTES = 8
+HEAD_BYTES = 12
 CASES = st.tuples(
     st.sampled_from([0.1, 0.05, 0.1 / 3, 65535 * 2.0**-20, 1.0]), st.sampled_from([0.0, -3.0, 16.0, 700.0]),
     st.integers(0, 2**32 - 1), st.integers(0, 60),
 )  # fmt: skip
 
 
-def received(batch: VoxelBatch, grid: VoxelGrid) -> VoxelBatch:
-    """Return the voxels as a receiver of the quantised message has them."""
-    return decode_subset(encode_subset(RoiSubset("ant", "s1", 1, 1, batch), grid))[0].batch
+def require_same(voxels: StoredVoxels, expected: VoxelBatch) -> None:
+    batch = voxels.batch()
+    assert to_records(batch.gaussians).tobytes() == to_records(expected.gaussians).tobytes()
+    for name in ("keys", "kappa_sums", "counts"):
+        assert getattr(batch, name).tolist() == getattr(expected, name).tolist()
 
 
-def with_small_labels(batch: VoxelBatch) -> VoxelBatch:
-    gaussians = batch.gaussians
-    small = replace(gaussians, kappa=gaussians.kappa & np.uint32(0xFFFF), target=gaussians.target % np.int16(127))
-    return VoxelBatch(batch.keys, batch.kappa_sums, batch.counts, small)
+def with_few_targets(batch: VoxelBatch) -> VoxelBatch:
+    return replace(batch, gaussians=replace(batch.gaussians, target=batch.gaussians.target % np.int16(127)))
 
 
-def require_same(batch: VoxelBatch, rows: list[bytes]) -> None:
-    back = from_stored(batch.keys, batch.counts, rows)
-    assert to_records(back).tobytes() == to_records(batch.gaussians).tobytes()
-    assert all(is_stored(row, count) for row, count in zip(rows, batch.counts.tolist(), strict=True))
+@given(CASES, st.sampled_from(SubsetCoding))
+def test_every_bit_of_a_message_comes_back_from_its_rows(case: tuple[float, float, int, int], coding) -> None:
+    size_m, centre_m, seed, n = case
+    grid = VoxelGrid(size_m)
+    message = encode_subset(RoiSubset("ant", "s", 7, 9, make_batch(seed, n, grid, centre_m=centre_m)), grid, coding)
+    expected, stored = decode_subset(message)[0].batch, decode_stored(message)[0]
+    assert (stored.agent_id, stored.message_seq, stored.update_seq) == ("ant", 7, 9)
+    require_same(stored.voxels, expected)
+    parts = [StoredVoxels.from_row(part.to_row()) for part in stored.voxels.by_tile()]
+    assert all(len(set(tiles_of(part.keys).tolist())) == 1 for part in parts)
+    if parts:
+        together = StoredVoxels.concatenate(parts)
+        assert set(together.voxels["update_seqs"].tolist()) == {9}
+        require_same(together.take(np.argsort(together.keys)), expected)
+
+
+@given(CASES, st.integers(1, 9))
+def test_slices_are_the_voxels_in_order(case: tuple[float, float, int, int], step: int) -> None:
+    size_m, centre_m, seed, n = case
+    whole = StoredVoxels.exact(make_batch(seed, n, VoxelGrid(size_m), centre_m=centre_m), 3)
+    slices = [whole.slice(start, start + step) for start in range(0, len(whole), step)]
+    if slices:
+        require_same(StoredVoxels.concatenate(slices), whole.batch())
 
 
 @given(CASES)
-def test_every_bit_of_any_gaussians_comes_back(case: tuple[float, float, int, int]) -> None:
+def test_received_gaussians_take_21_bytes(case: tuple[float, float, int, int]) -> None:
     size_m, centre_m, seed, n = case
     grid = VoxelGrid(size_m)
-    batch = make_batch(seed, n, grid, centre_m=centre_m)
-    require_same(batch, to_stored(batch, grid))
-    require_same(batch, to_stored(batch, None))
-    require_same(received(batch, grid), to_stored(received(batch, grid), grid))
+    batch = with_few_targets(make_batch(seed, n, grid, centre_m=centre_m))
+    voxels = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))[0].voxels
+    assert len(voxels.to_row()) == HEAD_BYTES + VOXELS.itemsize * len(batch) + 21 * n
 
 
-@given(CASES)
-def test_received_gaussians_take_19_bytes(case: tuple[float, float, int, int]) -> None:
-    size_m, centre_m, seed, n = case
-    grid = VoxelGrid(size_m)
-    batch = received(with_small_labels(make_batch(seed, n, grid, centre_m=centre_m)), grid)
-    rows = to_stored(batch, grid)
-    expected = [SIZE_HEADER_BYTES + count * CODES.itemsize if count else 0 for count in batch.counts.tolist()]
-    assert [len(row) for row in rows] == expected
-    require_same(batch, rows)
-
-
-@pytest.mark.parametrize("name", ["means_m", "quats_wxyz", "scales_m", "opacities", "rgb"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -0.0, 3e38, 1e-45])
-def test_a_voxel_with_a_value_that_has_no_code_is_stored_exactly_and_the_others_as_codes(
-    name: str, value: float
-) -> None:
+def test_sums_are_computed_from_the_codes() -> None:
     grid = VoxelGrid(0.1)
-    batch = received(with_small_labels(make_batch(3, 60, grid)), grid)
-    column = getattr(batch.gaussians, name).copy()
-    column[0] = value
-    batch = VoxelBatch(batch.keys, batch.kappa_sums, batch.counts, replace(batch.gaussians, **{name: column}))
-    rows = to_stored(batch, grid)
-    first = int(np.flatnonzero(batch.counts)[0])
-    assert len(rows[first]) == int(batch.counts[first]) * RECORD.itemsize
-    assert sum(map(len, rows)) < len(batch.gaussians) * RECORD.itemsize / 2
-    require_same(batch, rows)
+    voxels = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, make_batch(3, 60, grid)), grid))[0].voxels
+    batch, computed = voxels.batch(), voxels.with_computed_sums()
+    expected = [
+        int(batch.gaussians.kappa[start:stop].astype(np.uint64).sum())
+        for start, stop in zip(batch.offsets, batch.offsets[1:], strict=False)
+    ]
+    assert computed.voxels["kappa_sums"].tolist() == expected
+    assert voxels.voxels["kappa_sums"].tolist() != expected
 
 
-def test_a_wrong_voxel_size_costs_space_and_changes_nothing() -> None:
-    batch = received(make_batch(4, 40, VoxelGrid(0.1)), VoxelGrid(0.1))
-    require_same(batch, to_stored(batch, VoxelGrid(0.2)))
-
-
-def test_rows_of_several_voxel_sizes_are_read_together() -> None:
-    first, second = (received(make_batch(seed, 30, VoxelGrid(1.0)), VoxelGrid(1.0)) for seed in (1, 2))
-    rows = [*to_stored(first, VoxelGrid(1.0)), *to_stored(second, None)]
-    keys, counts = np.concatenate([first.keys, second.keys]), np.concatenate([first.counts, second.counts])
-    order = np.random.default_rng(0).permutation(len(keys))
-    back = from_stored(keys[order], counts[order], [rows[i] for i in order])
-    both = Gaussians.concatenate([first.gaussians, second.gaussians])
-    ends = np.cumsum(counts, dtype=np.int64)
-    shuffled = np.concatenate([np.arange(ends[i] - counts[i], ends[i]) for i in order])
-    assert to_records(back).tobytes() == to_records(both.take(shuffled)).tobytes()
+def test_voxels_that_do_not_ascend_are_refused() -> None:
+    grid = VoxelGrid(0.1)
+    batch = make_batch(3, 60, grid)
+    message = encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid)
+    keys = batch.keys.copy()
+    keys[1] = keys[0]
+    object.__setattr__(batch, "keys", keys)
+    moved = replace(batch.gaussians, means_m=np.repeat(grid.centres_m(keys), batch.counts, axis=0))
+    object.__setattr__(batch, "gaussians", moved)
+    decode_stored(message)
+    with pytest.raises(CodecError, match="ascending"):
+        decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))
 
 
 def test_a_damaged_row_is_named() -> None:
     grid = VoxelGrid(0.1)
-    batch = received(with_small_labels(make_batch(5, 20, grid)), grid)
-    rows = to_stored(batch, grid)
-    first = int(np.flatnonzero(batch.counts)[0])
-    for damaged in (rows[first][:-1], rows[first] + b"0", b"", bytes(8) + rows[first][8:], rows[first][:8] + b"\xff" * (
-        len(rows[first]) - 8
-    )):  # fmt: skip
-        with pytest.raises(StorageError, match="the store is damaged"):
-            from_stored(batch.keys, batch.counts, [*rows[:first], damaged, *rows[first + 1 :]])
+    batch = with_few_targets(make_batch(5, 20, grid))
+    row = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))[0].voxels.to_row()
+    whole = StoredVoxels.exact(batch, 1).to_row()
+    assert (len(row) - len(whole)) == len(batch.gaussians) * (CODES.itemsize - RECORD.itemsize)
+    for damaged in (row[:-1], row + b"0", row[:5], b"", row[:8] + b"\xff\xff\xff\xff" + row[12:], bytes(8) + row[8:]):
+        with pytest.raises(StorageError, match="damaged"):
+            StoredVoxels.from_row(damaged)

@@ -75,7 +75,7 @@ def assert_status_is_counted_from_the_map(engine: FusionEngine, fused: FusedMap)
 
 def record(change_log: ChangeLog, store: MemoryStore, subset: RoiSubset) -> list[int]:
     accepted = store.put(subset).accepted
-    return change_log.record(subset.agent_id, accepted, rank_voxels(store.scores(accepted))).tolist()
+    return change_log.record({subset.agent_id: accepted}, rank_voxels(store.scores(accepted))).tolist()
 
 
 def test_only_a_change_of_the_fused_map_is_recorded() -> None:

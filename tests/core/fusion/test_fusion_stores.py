@@ -16,6 +16,7 @@ import pytest
 from support.sample_batches import make_batch
 
 from gausslite.codec.stored import to_records
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
@@ -127,11 +128,11 @@ def test_of_equal_update_seqs_the_larger_content_wins_in_every_order(
 
 def test_messages_of_several_agents_are_stored_together(store: FusionStore) -> None:
     messages = [make_subset(name, 1, {11: 2, 22: index}) for index, name in enumerate(("ant", "bee"))]
-    assert [each.accepted.tolist() for each in store.put_all(messages)] == [[11, 22]] * 2
-    assert [each.stale.tolist() for each in store.put_all(messages)] == [[11, 22]] * 2
+    assert [each.accepted.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
+    assert [each.stale.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
     assert store.scores().counts.tolist() == [2, 0, 2, 1]
     with pytest.raises(InvalidInputError):
-        store.put_all([make_subset("ant", 2, {33: 1}), make_subset("bee", 2**63, {33: 1})])
+        store.put_all([StoredSubset.exact(make_subset(*own, {33: 1})) for own in (("ant", 2), ("bee", 2**63))])
     assert 33 not in store.scores().keys
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from fusion_running import GRID, make_subset
 
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
@@ -64,20 +65,23 @@ def test_a_declared_kappa_sum_wins_no_voxel(declared: int) -> None:
 
 
 def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -> None:
+    def update(kappas_by_cell: dict[int, list[int]]) -> StoredSubset:
+        return StoredSubset.exact(make_subset("ant", 1, kappas_by_cell))
+
     store, clock = MemoryStore(), Clock()
     quotas = Quotas(kappa_at_join=100, kappa_per_second=10)
     checks = UpdateChecks(store, quotas, clock)
     checks.record_join("ant")
-    assert checks.check(make_subset("ant", 1, {0: [100], 1: []})).batch.kappa_sums.tolist() == [100, 0]
+    assert checks.check(update({0: [100], 1: []})).voxels.voxels["kappa_sums"].tolist() == [100, 0]
     with pytest.raises(QuotaError, match="'ant': expected a kappa of at most 100 this long after its first join"):
-        checks.check(make_subset("ant", 1, {0: [101]}))
+        checks.check(update({0: [101]}))
     clock.now_s += 5
     checks.record_join("ant")
-    assert checks.check(make_subset("ant", 1, {0: [150]}))
+    assert checks.check(update({0: [150]}))
     # a restarted server does not start again
-    assert UpdateChecks(store, quotas, clock).check(make_subset("ant", 1, {0: [150]}))
+    assert UpdateChecks(store, quotas, clock).check(update({0: [150]}))
     clock.now_s -= 500
-    assert checks.check(make_subset("ant", 1, {0: [100]}))
+    assert checks.check(update({0: [100]}))
 
 
 def test_a_sequence_number_cannot_use_up_all_later_ones() -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from test_fusion_properties import assert_same_batch
 from test_fusion_stores import make_subset
 
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, tombstones
@@ -24,15 +25,15 @@ from gausslite.fusion.vote import fuse
 ANY = MissionConfig("", "", 0.10)
 
 
-def many_tombstones(agent_id: str, voxels: int) -> RoiSubset:
-    return RoiSubset(agent_id, "", 1, 1, tombstones(np.arange(voxels, dtype=np.int64)))
+def many_tombstones(agent_id: str, voxels: int) -> StoredSubset:
+    return StoredSubset.exact(RoiSubset(agent_id, "", 1, 1, tombstones(np.arange(voxels, dtype=np.int64))))
 
 
 def served(queue: UpdateQueue, max_voxels: int) -> list[str]:
     """Take one group, store nothing of it, and return its agents."""
     group = queue.take(max_voxels)
     for update in group:
-        part = update.next_slice().batch
+        part = update.next_slice().voxels
         queue.put_back(update, update.add_outcome(PutOutcome(part.keys, part.keys[:0])))
     return [update.subset.agent_id for update in group]
 
@@ -44,7 +45,7 @@ def test_a_large_message_does_not_delay_the_messages_of_other_agents() -> None:
     order = served(queue, 1)
     for _ in range(20):
         for agent_id in ("ant", "bee"):
-            queue.add(PendingUpdate("", make_subset(agent_id, 1, {11: 1})))
+            queue.add(PendingUpdate("", StoredSubset.exact(make_subset(agent_id, 1, {11: 1}))))
         order += served(queue, 1) + served(queue, 1) + served(queue, 1)
     assert order.count("ant") == order.count("bee") == 20
     # the small messages together cost less than one slice, so the hog gets the rest
@@ -63,13 +64,13 @@ def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tup
         taken = queue.take(group)
         assert len({update.subset.agent_id for update in taken}) == len(taken)
         for update in taken:
-            part = update.next_slice().batch
+            part = update.next_slice().voxels
             is_done = update.add_outcome(PutOutcome(part.keys, part.keys[:0]))
             done += [update] * is_done
             queue.put_back(update, is_done)
     for name in "abc":
         assert [u for u in done if u.subset.agent_id == name] == [u for u in updates if u.subset.agent_id == name]
-    assert all(u.outcome().accepted.tolist() == u.subset.batch.keys.tolist() for u in done)
+    assert all(u.outcome().accepted.tolist() == u.subset.voxels.keys.tolist() for u in done)
 
 
 def test_an_agent_that_does_not_wait_for_acknowledgements_is_refused() -> None:
@@ -88,7 +89,7 @@ class CountingStore(MemoryStore):
         self.groups: list[int] = []
         self._refused = refused
 
-    def put_all(self, subsets: list[RoiSubset]) -> list[PutOutcome]:
+    def put_all(self, subsets: list[StoredSubset]) -> list[PutOutcome]:
         self.groups.append(len(subsets))
         if any(subset.agent_id == self._refused for subset in subsets):
             raise StorageError("full")
@@ -101,7 +102,8 @@ def test_messages_of_many_agents_share_one_commit_and_a_refused_one_fails_alone(
     agents = ["ant", "bee", "cat", "dog"]
     sessions = {name: engine.join(name, ANY).session.session_id for name in agents}
     futures = {
-        name: engine.enqueue_update(sessions[name], make_subset(name, 1, {11: 2}), engine.grid) for name in agents
+        name: engine.enqueue_update(sessions[name], StoredSubset.exact(make_subset(name, 1, {11: 2})), engine.grid)
+        for name in agents
     }
     engine.commit_updates()
     assert store.groups[0] == 4
