@@ -113,7 +113,7 @@ def _errors(readings: Sequence[_Reading], pairs: Sequence[_Pair]) -> Float64[nda
     motions = np.array([reading.motions for reading in readings])
     by_pair = np.array([pair.errors(motions[:, i]) for i, pair in enumerate(pairs)])
     judged = np.isfinite(by_pair)
-    enough = judged.sum(axis=0) >= max(_MIN_PAIRS, len(pairs) // 2)
+    enough = judged.sum(axis=0) >= max(_MIN_PAIRS, len(pairs) // 3)
     errors = np.full(len(readings), np.inf)
     errors[enough] = np.nanmedian(by_pair[:, enough], axis=0)
     return errors
