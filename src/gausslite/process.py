@@ -47,11 +47,16 @@ class _QuietEnd:
         os._exit(128 + number)
 
 
+_ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
+"""Read when NumPy is loaded: products of many points and a small matrix would only wait for further threads."""
+
+
 def end_quietly_while_starting(program: str) -> None:
     """End the process with code 130 on SIGINT and 143 on SIGTERM, until `raise_interrupts` is called.
 
-    Call it on the main thread.
+    Call it on the main thread, before NumPy is loaded, which then has one thread for matrix products.
     """
+    os.environ.setdefault(*_ONE_BLAS_THREAD)
     for number in _SIGNALS:
         signal.signal(number, _QuietEnd(program))
 

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from gausslite.datasets.source import Source, select_frames
 from gausslite.domain.camera import Camera, FileIntrinsics, lift
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import transform_points
 from gausslite.domain.recording import DepthRegistration
 
 _JUMP_M, _JUMP_SHARE = 0.06, 0.05
@@ -197,15 +196,17 @@ def estimate_from_frames(frames: Sequence[Frame]) -> RegistrationEstimate:
     depth_camera, reference_m = frames[0].camera, float(np.median(depths_m))
     gradients: list[ColourGradients] = []
 
-    def score(candidate: Float64[ndarray, "6"], edges: Sequence[DepthEdges] = edges) -> float:
-        return _score(_registration_of(candidate, depth_camera, reference_m), edges, gradients)
+    all_points = _EdgePoints.of(edges)
+
+    def score(candidate: Float64[ndarray, "6"], points: _EdgePoints = all_points) -> float:
+        return _score(_registration_of(candidate, depth_camera, reference_m), points, gradients)
 
     best = _START
     for level, blur_px in enumerate(_BLURS_PX):
         gradients[:] = [relative_gradients(frame.rgb, blur_px) for frame in frames]
         steps = _FIRST_STEPS * _STEP_FACTOR**level
         if level == 0:
-            subset = [edge.thinned(max(1, len(depths_m) // _GRID_POINTS)) for edge in edges]
+            subset = _EdgePoints.of([edge.thinned(max(1, len(depths_m) // _GRID_POINTS)) for edge in edges])
             best = max(_grid(), key=lambda candidate: score(candidate, subset))
         best = _pattern_search(score, best, steps)
         if level == _OFFSET_SEARCH_BLUR:
@@ -274,36 +275,54 @@ def _search_along_offsets(
     return best
 
 
-def _score(registration: DepthRegistration, edges: Sequence[DepthEdges], gradients: Sequence[ColourGradients]) -> float:
+@dataclass(frozen=True, slots=True, eq=False)
+class _EdgePoints:
+    """The edge points of all frames as one plane for each axis: of each frame those along rows, then along columns.
+
+    ends: where each of these parts ends.
+    """
+
+    planes: Float64[ndarray, "3 n"]
+    ends: Int64[ndarray, " k"]
+
+    @classmethod
+    def of(cls, edges: Sequence[DepthEdges]) -> _EdgePoints:
+        parts = [points for edge in edges for points in (edge.along_rows, edge.along_columns)]
+        return cls(np.ascontiguousarray(np.concatenate(parts).T), np.cumsum([len(part) for part in parts]))
+
+    def transformed(self, T: Float64[ndarray, "4 4"]) -> list[Float64[ndarray, " n"]]:
+        """Return the planes of the transformed points; a matrix product of this shape waits for threads."""
+        x, y, z = self.planes
+        return [row[0] * x + row[1] * y + row[2] * z + row[3] for row in T[:3]]
+
+
+def _score(registration: DepthRegistration, edges: _EdgePoints, gradients: Sequence[ColourGradients]) -> float:
     """Return the mean relative colour gradient at the projected depth edges inside the image."""
-    sampled = []
-    for edge, gradient in zip(edges, gradients, strict=True):
-        sampled.append(_sample(gradient.along_rows, registration, edge.along_rows))
-        sampled.append(_sample(gradient.along_columns, registration, edge.along_columns))
+    images = [image for gradient in gradients for image in (gradient.along_rows, gradient.along_columns)]
+    height, width = images[0].shape
+    x_m, y_m, z_m = edges.transformed(registration.extrinsics())
+    pixels = registration.camera(width, height).pixels(x_m / z_m, y_m / z_m)
+    # pixel centres at integers, as in cv2.remap
+    columns, rows = ((axis - 0.5).astype(np.float32) for axis in pixels)
+    inside = (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
+    kept = np.concatenate([[0], np.cumsum(inside)])[np.concatenate([[0], edges.ends])]
+    columns, rows = columns[inside], rows[inside]
+    sampled = [
+        _bilinear(image, columns[first:end], rows[first:end])
+        for image, first, end in zip(images, kept[:-1], kept[1:], strict=True)
+    ]
     values = np.concatenate(sampled)
     return float(values.mean()) if len(values) else 0.0
-
-
-def _sample(
-    image: Float32[ndarray, "h w"], registration: DepthRegistration, points: Float64[ndarray, "n 3"]
-) -> Float32[ndarray, " k"]:
-    """Return bilinear values of the image at the projected points; points outside the image are dropped."""
-    points = transform_points(registration.extrinsics(), points)
-    camera, z_m = registration.camera(image.shape[1], image.shape[0]), points[:, 2]
-    # pixel centres at integers, as in cv2.remap
-    columns, rows = ((axis - 0.5).astype(np.float32) for axis in camera.pixels(points[:, 0] / z_m, points[:, 1] / z_m))
-    inside = (columns >= 0) & (columns <= image.shape[1] - 1) & (rows >= 0) & (rows <= image.shape[0] - 1)
-    return _bilinear(image, columns[inside], rows[inside])
 
 
 def _bilinear(
     image: Float32[ndarray, "h w"], columns: Float32[ndarray, " k"], rows: Float32[ndarray, " k"]
 ) -> Float32[ndarray, " k"]:
-    # cv2.remap rejects maps with a side of 32767 or more, so the points are arranged in rows
     count = len(columns)
-    padding = ((0, -count % _REMAP_COLUMNS),)
-    maps = [np.pad(values, padding).reshape(-1, _REMAP_COLUMNS) for values in (columns, rows)]
     if count == 0:
         return columns
+    # cv2.remap rejects maps with a side of 32767 or more, so the points are arranged in rows
+    maps = np.zeros((2, -(-count // _REMAP_COLUMNS), _REMAP_COLUMNS), np.float32)
+    maps[0].reshape(-1)[:count], maps[1].reshape(-1)[:count] = columns, rows
     sampled: Float32[ndarray, " k"] = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR).reshape(-1)[:count]
     return sampled

@@ -51,6 +51,8 @@ def open_model(path: Path, threads: int | None = None) -> OpenModel:
     runtime = _runtime()
     options = runtime.SessionOptions()
     options.log_severity_level = 4
+    # its threads sleep while they wait: busy waiting would take the time of the mapping's threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     if threads is not None:
         options.intra_op_num_threads = threads
     try:
