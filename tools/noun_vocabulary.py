@@ -11,8 +11,8 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-# lexicographer files of things that can be seen, in the order in which a task means them
-KINDS = {6: "artifact", 13: "food", 20: "plant", 5: "animal", 8: "body", 17: "object", 27: "substance", 18: "person"}
+# lexicographer files of things that can be seen
+KINDS = {5: "animal", 6: "artifact", 8: "body", 13: "food", 17: "object", 18: "person", 20: "plant", 27: "substance"}
 # all nouns of these kinds; of the others, those that occur in WordNet's tagged texts
 COMPLETE = (6, 13)
 MAX_WORDS = 3
@@ -58,13 +58,13 @@ def read_synsets(folder: Path) -> dict[str, tuple[int, list[str], list[str]]]:
 
 
 def sense_order(folder: Path, synsets: dict[str, tuple[int, list[str], list[str]]]) -> dict[str, list[str]]:
-    """Return the synsets of each word: things before persons, then the more frequent first."""
-    kinds, order = list(KINDS), {}
+    """Return the synsets of each word: the more frequent first, and persons and parts of the body last."""
+    order = {}
     for line in (folder / "index.noun").read_text().splitlines():
         if not line.startswith("  "):
             fields = line.split()
             senses = [at for at in fields[-int(fields[2]) :] if at in synsets and synsets[at][0] in KINDS]
-            order[fields[0]] = sorted(senses, key=lambda at: kinds.index(synsets[at][0]))
+            order[fields[0]] = sorted(senses, key=lambda at: KINDS[synsets[at][0]] in ("person", "body"))
     return order
 
 
@@ -77,7 +77,8 @@ def kept_words(folder: Path, synsets: dict[str, tuple[int, list[str], list[str]]
     kept: dict[str, list[str]] = {}
     for offset, (kind, words, _) in synsets.items():
         if kind in KINDS:
-            named = [word for word in words if word == word.lower() and word.count("_") < MAX_WORDS]
+            plain = [word.lower() for word in words if word in (word.lower(), word.upper())]  # no names
+            named = [word for word in plain if word.count("_") < MAX_WORDS]
             named = [word for word in named if kind in COMPLETE or frequency[word]]
             if named:
                 kept[offset] = named

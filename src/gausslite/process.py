@@ -13,9 +13,12 @@ import threading
 from enum import StrEnum
 from importlib import import_module
 from types import FrameType, TracebackType
-from typing import Any
+from typing import Any, Final
 
 from gausslite.domain.errors import InvalidInputError
+
+# exit code of a command that did its work, while nothing of its task was found
+TASK_NOT_FOUND: Final = 3
 
 
 def printable(text: str) -> str:

@@ -6,13 +6,15 @@ import logging
 import threading
 import time
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 
 from gausslite.codec.json import graph_as_json, noun_as_json, object_as_json
 from gausslite.domain.errors import GaussLiteError, MismatchError, StorageError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.objects import match_warnings
+from gausslite.domain.task import LIMITS, TaskGraph
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
@@ -143,9 +145,10 @@ class AgentMission:
         if self._worker.uplink is not None:
             self._worker.uplink.limit_drain(grace_s)
 
-    def assign(self, graph: TaskGraph) -> None:
-        """Assign a task; it begins the next mission if the last one has ended.
+    def assign(self, graph: TaskGraph) -> TaskGraph:
+        """Assign a task, which begins the next mission if the last one has ended; return it with further warnings.
 
+        The warnings name the nouns that the detector cannot find, with the nearest names that it can.
         Raises MismatchError while a mission ends, ModelFileError and the like.
         """
         self._state_machine.require_accepting("task")
@@ -153,6 +156,8 @@ class AgentMission:
             raise MismatchError(f"task: {NO_DETECTOR}")
         self._worker.assign(graph).result()
         self._begin()
+        unknown = match_warnings([noun.match for noun in self._worker.status().nouns])
+        return replace(graph, warnings=(*graph.warnings, *unknown)[: LIMITS.max_warnings])
 
     def assign_task(self) -> None:
         """Assign the task of the command line.

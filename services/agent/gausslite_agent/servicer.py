@@ -167,7 +167,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:  # noqa: N802
         """Assign a task, given as text or as a graph."""
         graph = await self._read_task(request)
-        await asyncio.to_thread(self._mission.assign, graph)
+        graph = await asyncio.to_thread(self._mission.assign, graph)
         return pb.AssignTaskResponse(graph=graph_to_message(graph))
 
     async def IngestFrames(  # noqa: N802

@@ -33,7 +33,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import found_text
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.compare import MapScores, score_training_views
 from gausslite.evaluation.metrics import trajectory_error
 from gausslite.evaluation.pictures import render_preview
@@ -64,7 +64,7 @@ from gausslite.mission.settings import (
     TaskSettings,
 )
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.process import DeferredInterrupt, Sibling, import_extra, print_message, sibling
+from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, Sibling, import_extra, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.channel import MAX_PORT
 
@@ -200,17 +200,18 @@ def _map(options: argparse.Namespace) -> int:
     estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
     roi = _first_roi(options, inputs, resumed_after)
     if saved is None:
-        # an estimate takes half a minute; first refuse what cannot be mapped
+        # an estimate takes half a minute; first refuse what cannot be mapped, and name what cannot be found
         choose_rasterizer(inputs.mission.backend, inputs.mission.threads)
         if isinstance(roi, TaskGraph):
             estimators.require_detector()
+    _report_search(options, inputs, estimators)
+    if saved is None:
         stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
         inputs = inputs.calibrated(replace(stated, force=options.force))
     mapper = build_task_mapper(inputs.mission, estimators, roi)
     if saved is not None:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
-    _report_search(options, inputs, estimators)
     mapping = _Run(options, inputs, mapper)
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
@@ -223,7 +224,7 @@ def _map(options: argparse.Namespace) -> int:
     if interrupt.pending_exception is not None:
         raise type(interrupt.pending_exception)(f"all frames are mapped, and all files are in {options.out}")
     mapping.print_results(result)
-    return 0
+    return 0 if mapping.has_found_task(result) else TASK_NOT_FOUND
 
 
 class _Run:
@@ -311,6 +312,13 @@ class _Run:
         """Raise the error of saving the state, after the other results were written."""
         if self._save_error is not None:
             raise self._save_error
+
+    def has_found_task(self, result: MissionResult) -> bool:
+        """Return False if a task was mapped, and no frame and no object of the map shows a target of it."""
+        graphs = self._inputs.schedule.graphs()
+        targets = {noun_of(target) for graph in graphs for target in graph.targets}
+        is_in_map = any(landmark.noun in targets for landmark in self._mapper.objects)
+        return not graphs or result.processed == 0 or result.totals.region_seen or is_in_map
 
     def print_results(self, result: MissionResult) -> None:
         """Print the figures and the notes of a complete run."""

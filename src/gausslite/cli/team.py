@@ -15,6 +15,7 @@ from gausslite.config.program import add_flags
 from gausslite.config.values import read_path
 from gausslite.domain.checks import require_identifier
 from gausslite.mission.results import MAP_FILE, prepare_file
+from gausslite.process import TASK_NOT_FOUND
 from gausslite.wire.channel import require_callable
 from gausslite.wire.clients import AgentClient, Export, FusionClient, query_status
 from gausslite.wire.security import TlsFiles
@@ -199,13 +200,15 @@ def configure_status(parser: CommandParser) -> None:
 
 
 def run_status(options: argparse.Namespace) -> int:
-    """Print the status. Returns the exit code. Raises UnavailableError, InvalidInputError."""
+    """Print the status. Returns 3 if an agent has not seen its task. Raises UnavailableError, InvalidInputError."""
     status = query_status(options.address, build(TlsFiles, options).read())
     if options.json:
         print(json.dumps(status.values))
     else:
         print("\n".join((_agent_lines if status.is_agent else _fusion_lines)(status.values)))
-    return 0
+    values = status.values
+    is_found = not (status.is_agent and "graph" in values and values["frames_mapped"]) or values["roi_share"] > 0
+    return 0 if is_found else TASK_NOT_FOUND
 
 
 def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:

@@ -9,8 +9,10 @@ from importlib import resources
 from typing import Final
 
 _MAX_STEPS: Final = 3
-# a class with more kinds than this is no other name of each of them: "container", "tool", "food"
-_MAX_KINDS: Final = 150
+# a class with more kinds than this is no other name of each of them: "container", "kitchen utensil", "tool"
+_MAX_KINDS: Final = 60
+# one class stands for a noun with at most this many kinds: "computer monitor" for a monitor, no sandal for a shoe
+_KINDS_PER_CLASS: Final = 10
 _COLLECTIVE_ENDINGS: Final = ("ry", "ware", "s")
 
 
@@ -75,50 +77,82 @@ def are_synonyms(noun: str, other: str) -> bool:
     return sense is not None and sense == known.main(other)
 
 
-def classes_of(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
-    """Return the lower-case class names that mean the noun: its synonyms, else its kinds, else what it is a kind of.
+def is_kind_of(noun: str, other: str) -> bool:
+    """Return True if a noun's hypernyms lead to any meaning of another noun: a "coffee mug" is a "mug"."""
+    known = vocabulary()
+    return any(known.steps(known.main(noun), sense) is not None for sense in known.senses.get(other, ()))
 
-    A compound is a kind of its head: "computer monitor" is a monitor, "waste container" is the class of a trash can.
+
+def are_one_kind(noun: str, other: str) -> bool:
+    """Return True for synonyms, and if one noun is a kind of the other and that has few kinds: "desk" and "table"."""
+    return (
+        noun == other
+        or are_synonyms(noun, other)
+        or bool(nearest_above(noun, (other,)) or nearest_above(other, (noun,)))
+    )
+
+
+def synonymous_classes(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
+    """Return the lower-case class names that are other words for the noun: "tap" for a faucet, "cabinetry".
+
+    A compound may also be the noun's words in general: "waste container" for a "trash can".
     """
-    names = tuple(class_names)
-    for matches in (_is_synonym, _is_kind, _is_above):
-        found = {name: steps for name in names if (steps := matches(noun, name)) is not None}
-        if found:
-            nearest = min(found.values()) if matches is _is_above else _MAX_STEPS
-            return tuple(name for name, steps in found.items() if steps <= nearest)
-    return ()
+    collective = tuple(noun + ending for ending in _COLLECTIVE_ENDINGS)
+    return tuple(
+        name for name in class_names if are_synonyms(noun, name) or name in collective or _same_compound(noun, name)
+    )
 
 
-def _is_synonym(noun: str, name: str) -> int | None:
-    same = are_synonyms(noun, name) or any(name == noun + ending for ending in _COLLECTIVE_ENDINGS)
-    return 0 if same or _same_compound(noun, name) else None
-
-
-def _is_kind(noun: str, name: str) -> int | None:
-    """Return the steps from the class up to the noun."""
+def kinds_among(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
+    """Return the lower-case class names that are kinds of the noun, unless they are few of its many kinds."""
     known = vocabulary()
-    if name.endswith(f" {noun}"):
-        return 1
-    steps = known.steps(known.main(name), known.main(noun))
-    return steps if steps and known.kinds[known.senses[noun][0]] <= _MAX_KINDS else None
+    ours = known.main(noun)
+    found = []
+    for name in class_names:
+        is_compound = name.endswith(f" {noun}") and not is_thing(name)
+        if is_compound or (ours is not None and known.steps(known.main(name), ours) is not None):
+            found.append(name)
+    return tuple(found) if ours is None or known.kinds[ours] <= _KINDS_PER_CLASS * len(found) else ()
 
 
-def _is_above(noun: str, name: str) -> int | None:
-    """Return the steps from the noun up to the class."""
+def nearest_above(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
+    """Return the lower-case class name that the noun is a kind of, the nearest; empty for classes of many kinds."""
     known = vocabulary()
-    steps = known.steps(known.main(noun), known.main(name))
-    return steps if steps and known.kinds[known.senses[name][0]] <= _MAX_KINDS else None
+    above = {}
+    for name in class_names:
+        sense = known.main(name)
+        steps = known.steps(known.main(noun), sense)
+        if sense is not None and steps is not None and known.kinds[sense] <= _MAX_KINDS:
+            above[name] = steps
+    nearest = min(above.values(), default=None)
+    return tuple(name for name, steps in above.items() if steps == nearest)
+
+
+@functools.cache
+def _other_words(noun: str) -> tuple[str, ...]:
+    """Return all words of a noun's main meaning."""
+    known = vocabulary()
+    sense = known.main(noun)
+    return tuple(word for word, senses in known.senses.items() if senses[0] == sense) or (noun,)
 
 
 def _same_compound(noun: str, name: str) -> bool:
-    """Return True if the class has two words, and each is the noun's or above it: "trash can", "waste container"."""
-    ours, theirs = noun.split(), name.split()
-    if len(ours) != 2 or len(theirs) != 2:
+    """Return True if the class has two words, and both words of the noun or of a synonym are kinds of them."""
+    if name.count(" ") != 1:
         return False
+    modifier, head = name.split()
+    return any(
+        word.count(" ") == 1 and is_kind_of(word, head) and _may_be_kind(word.split()[0], modifier)
+        for word in _other_words(noun)
+    )
+
+
+def _may_be_kind(noun: str, other: str) -> bool:
     known = vocabulary()
-    kind, made_of = known.main(noun), known.main(ours[0])
-    is_head = ours[1] == theirs[1] or known.steps(kind, known.main(theirs[1])) is not None
-    return is_head and (ours[0] == theirs[0] or known.steps(made_of, known.main(theirs[0])) is not None)
+    senses = known.senses.get(noun, ())
+    return noun == other or any(
+        known.steps(low, high) is not None for low in senses for high in known.senses.get(other, ())
+    )
 
 
 def nearest_names(noun: str, class_names: Sequence[str], count: int = 3) -> tuple[str, ...]:
@@ -130,7 +164,7 @@ def nearest_names(noun: str, class_names: Sequence[str], count: int = 3) -> tupl
         common = ours.keys() & _all_above(known, known.main(name.casefold())).keys()
         if common:
             shared.append((min(ours[at] + _all_above(known, known.main(name.casefold()))[at] for at in common), name))
-    return tuple(name for steps, name in sorted(shared)[:count] if steps <= 2 * _MAX_STEPS)
+    return tuple(name for steps, name in sorted(shared)[:count] if steps <= 1 + _MAX_STEPS)
 
 
 def _all_above(known: Vocabulary, sense: int | None) -> dict[int, int]:

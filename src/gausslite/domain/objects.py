@@ -17,6 +17,7 @@ from numpy import ndarray
 
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.nouns import are_one_kind
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 
@@ -26,6 +27,7 @@ class MatchBasis(StrEnum):
 
     NAME = "name"
     SYNONYM = "synonym"
+    KIND = "kind"
     TEXT_FEATURES = "text features"
     GENERIC = "generic noun"
     PHRASE = "any phrase"
@@ -39,8 +41,8 @@ class NounMatch:
     """The classes that a detector searches for one noun of a task.
 
     similarity: cosine of the noun's and the class's centred text features, None without a comparison. accepted: False
-    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched. known:
-    the ground truth's regions, for a message.
+    if the class is a different thing and only reported; then `classes` has its name, and nothing is searched. known,
+    for a message: the ground truth's regions, or the classes nearest to a noun without one.
     """
 
     noun: str
@@ -59,7 +61,8 @@ class NounMatch:
     def warning(self) -> str | None:
         """Return why the noun cannot be found or may be a different thing; None if it is searched as itself."""
         if self.basis is MatchBasis.NONE:
-            return f"no class of the detector matches {self.noun!r}"
+            nearest = f"; the nearest are {', '.join(map(repr, self.known))}" if self.known else ""
+            return f"no class of the detector matches {self.noun!r}{nearest}"
         if self.basis is MatchBasis.REGION and not self.classes:
             return f"no region matches {self.noun!r}; the regions are {', '.join(self.known) or 'none'}"
         if self.basis is not MatchBasis.SIMILAR:
@@ -159,6 +162,8 @@ def same_kind(phrase: str, name: str) -> bool:
         return not is_structure(name)
     noun, other = normalised_noun(phrase), normalised_noun(name)
     if noun == other or head_of(noun) == head_of(other):
+        return True
+    if are_one_kind(noun, other):
         return True
     canonical = synonyms().get(noun, synonyms().get(head_of(noun)))
     return canonical is not None and canonical == synonyms().get(other, synonyms().get(head_of(other)))

@@ -199,11 +199,14 @@ def _is_within(value: float, limits: Sequence[float]) -> bool:
     return limits[0] <= value <= limits[1]
 
 
+_OTHER_NAMES = (MatchBasis.SYNONYM, MatchBasis.KIND, MatchBasis.TEXT_FEATURES, MatchBasis.SIMILAR)
+
+
 def _is_found(match: NounMatch) -> bool:
     """Return True if the detector searches a noun as itself, or as something of the same height."""
     if not match.is_searched:
         return False
-    if not match.classes or match.basis not in (MatchBasis.SYNONYM, MatchBasis.TEXT_FEATURES, MatchBasis.SIMILAR):
+    if not match.classes or match.basis not in _OTHER_NAMES:
         return True
     heights_m = words()["heights_m"]
     low_m, high_m = heights_m[head_of(match.noun)]["usual"]

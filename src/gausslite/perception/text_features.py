@@ -13,6 +13,7 @@ from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import KernelError, ModelFileError
+from gausslite.domain.nouns import is_kind_of, is_thing, kinds_among, nearest_above, nearest_names, synonymous_classes
 from gausslite.domain.objects import MatchBasis, NounMatch, head_of, is_generic, is_structure, normalised_noun, synonyms
 from gausslite.perception.model_file import OpenModel, open_model, run_once
 from gausslite.perception.settings import require_plausible
@@ -98,30 +99,43 @@ def match_noun(
 ) -> NounMatch:
     """Return the detector's classes that a phrase means.
 
-    The first match counts: the phrase, its synonym, its head noun, the head noun's synonym, the embeddings. A generic
-    noun ("object", "obstacle") matches every class except building structure (walls, floors, doors). A class that is
-    only similar is not searched unless the settings accept it.
+    The first match counts: the phrase, its synonyms, its kinds or what it is a kind of, then the same of its head noun,
+    then the embeddings. A generic noun ("object", "obstacle") matches every class except building structure (walls,
+    floors, doors). A class that is only similar is not searched unless the settings accept it.
     """
     settings = settings or ClassMatchSettings()
     if is_generic(phrase):
         return NounMatch(phrase, MatchBasis.GENERIC, tuple(name for name in class_names if not is_structure(name)))
-    by_name = {normalised_noun(name): name for name in reversed(class_names)}
+    # "Drill (Tool)" is a drill
+    by_name = {normalised_noun(name.partition(" (")[0]): name for name in reversed(class_names)}
     noun, head = normalised_noun(phrase), head_of(phrase)
-    for name, basis in (
-        (noun, MatchBasis.NAME),
-        (synonyms().get(noun), MatchBasis.SYNONYM),
-        (head, MatchBasis.NAME),
-        (synonyms().get(head), MatchBasis.SYNONYM),
-    ):
-        if name is not None and name in by_name:
-            return NounMatch(phrase, basis, (by_name[name],))
+    # an unknown compound is a kind of its head, and a known one only if the vocabulary says so
+    nouns = dict.fromkeys((noun, head) if not is_thing(noun) or is_kind_of(noun, head) else (noun,))
+    for name in nouns:
+        is_whole = name == noun or not (is_thing(noun) or any(map(is_thing, noun.split()[:-1])))
+        for basis, classes in (
+            (MatchBasis.NAME, (name, *(known for known in by_name if _joined(known) == _joined(name)))),
+            (MatchBasis.SYNONYM, (synonyms().get(name, ""),)),
+            (MatchBasis.SYNONYM, synonymous_classes(name, by_name)),
+            (MatchBasis.KIND, kinds_among(name, by_name) if is_whole else ()),
+            (MatchBasis.KIND, nearest_above(name, by_name)),
+        ):
+            if found := tuple(by_name[known] for known in dict.fromkeys(classes) if known in by_name):
+                return NounMatch(phrase, basis, found)
+    row = {synonyms()[name] for name in nouns if name in synonyms()}
+    if found := tuple(by_name[known] for known in by_name if synonyms().get(known) in row):
+        return NounMatch(phrase, MatchBasis.SYNONYM, found)
     nearest = embeddings.nearest_class(phrase, class_names) if embeddings is not None else None
     if nearest is None or nearest[1] < settings.min_reported_similarity:
-        return NounMatch(phrase, MatchBasis.NONE)
+        return NounMatch(phrase, MatchBasis.NONE, known=nearest_names(noun, class_names))
     index, similarity, margin = nearest
     if similarity >= settings.min_similarity and margin >= settings.min_margin:
         return NounMatch(phrase, MatchBasis.TEXT_FEATURES, (class_names[index],), similarity)
     return NounMatch(phrase, MatchBasis.SIMILAR, (class_names[index],), similarity, settings.accept_similar)
+
+
+def _joined(name: str) -> str:
+    return name.replace(" ", "")
 
 
 def read_noun_vectors(folder: Path) -> tuple[dict[str, int], Float32[ndarray, "n d"]] | None:

@@ -53,7 +53,8 @@ def test_frames_without_depth_are_not_scored(tmp_path: Path, capsys: pytest.Capt
 def test_the_summary_reports_objects_not_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     small = ["--size", "64x48", "--max-gaussians", "200", "--iterations", "1"]
-    assert main(["map", "sim:home?frames=1", "--task", "Find the unicorn", *small, "--out", str(tmp_path)]) == 0
+    assert main(["map", "sim:home?frames=1", "--task", "Find the unicorn", *small, "--out", str(tmp_path)]) == 3
+    assert (tmp_path / "map.ply").is_file()
     output = capsys.readouterr().out
     assert "\n  no region matches 'unicorn'; the regions are " in output
     *_, note, outcome = output.splitlines()

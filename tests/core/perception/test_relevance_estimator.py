@@ -228,7 +228,7 @@ def test_nouns_match_classes_by_name_head_and_synonym():
         "cup": (("cup",), MatchBasis.NAME),
         "mug": (("cup",), MatchBasis.SYNONYM),
         "wooden chair": (("chair",), MatchBasis.NAME),
-        "lawn chair": (("chair",), MatchBasis.SYNONYM),
+        "lawn chair": (("chair",), MatchBasis.KIND),
         "wooden desk": (("dining table",), MatchBasis.SYNONYM),
         "sofa": (("couch",), MatchBasis.SYNONYM),
         "umbrella": ((), MatchBasis.NONE),
@@ -238,6 +238,33 @@ def test_nouns_match_classes_by_name_head_and_synonym():
         match = match_noun(noun, names, None)
         assert (match.classes, match.basis) == (classes, basis)
         assert match.is_searched == bool(classes)
+
+
+OPEN_IMAGES = (
+    "Cabinetry", "Computer monitor", "Waste container", "Tap", "Chest of drawers", "Couch", "Drill (Tool)", "Sandal",
+    "Coffeemaker", "Picnic basket", "Washing machine", "Spider", "Container", "Fox",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("noun", "name"),
+    [
+        ("cabinet", "Cabinetry"), ("monitor", "Computer monitor"), ("trash can", "Waste container"),
+        ("dustbin", "Waste container"), ("faucet", "Tap"), ("dresser", "Chest of drawers"), ("settee", "Couch"),
+        ("drill", "Drill (Tool)"), ("coffee maker", "Coffeemaker"), ("new monitor", "Computer monitor"),
+    ],
+)  # fmt: skip
+def test_the_vocabulary_finds_the_class_of_a_noun(noun, name):
+    assert match_noun(noun, OPEN_IMAGES, None).classes == (name,)
+
+
+@pytest.mark.parametrize("noun", ["shoe", "laundry basket", "coffee machine", "mattress", "unicorn", "crate", "pan"])
+def test_a_noun_without_a_class_is_refused_with_the_nearest_names(noun):
+    match = match_noun(noun, OPEN_IMAGES, None)
+    assert not match.is_searched
+    assert (match.basis, match.classes) == (MatchBasis.NONE, ())
+    assert f"no class of the detector matches {noun!r}" in match.warning
+    assert (noun != "shoe") or "the nearest are 'Sandal'" in match.warning
 
 
 @pytest.mark.parametrize("settings", [{"up_axis": (0.0, 0.0, 0.0)}, {"max_frames": 0}, {"max_rotation_deg": -1.0}])
