@@ -342,6 +342,8 @@ def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chu
     if noun.head in lexicon.BUILDINGS:
         return pending != "inside" or bool(noun.words[1:])
     if noun.head in lexicon.PLACES:
+        if pending == "to" and lexicon.is_space(noun.words):
+            return True  # "to the cold room"
         return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
     if noun.head in lexicon.ROUTES and not compound:
         return pending not in (None, "of", "for", "to")

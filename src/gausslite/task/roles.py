@@ -39,6 +39,7 @@ _DESTINATION_RELATIONS: Final = word_set(
 )
 # both objects of these verbs are targets
 _PAIRING_VERBS: Final = word_set("compare swap exchange")
+_PUSHED_TO: Final = word_set("near under behind in_front_of between left_of right_of")
 _ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
 # with a room: where the robot goes through
 _CROSSING_VERBS: Final = LEAVING_VERBS | (GO_VERBS - REACHING_VERBS - COVERING_VERBS)
@@ -193,6 +194,9 @@ class RoleAssigner:
             return True
         if clause.verb in PUSHING_VERBS and clause.objects and clause.preposition.startswith(("to the ", "on to")):
             return True  # "move the mug to the left of the plate"
+        pushed = any(self._draft.roles.get(phrase) is TargetRole.OBJECT for phrase in clause.objects)
+        if pushed and clause.verb in PUSHING_VERBS - {"pull"} and pending in _PUSHED_TO and not clause.current_place:
+            return self._is_final_place(pending, following)  # "push the ball between the cones"
         if clause.verb in ATTACHING_VERBS and not clause.current_place:
             return self._is_final_place(pending, following)
         return clause.verb in PLACE_VERBS and not clause.current_place and self._is_final_place(pending, following)

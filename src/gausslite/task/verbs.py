@@ -41,7 +41,7 @@ MOVING_VERBS: Final = word_set("move roll run advance return get land park dock 
 # "stop behind the car": the car is the target
 # a room that the robot leaves or crosses
 LEAVING_VERBS: Final = word_set("exit leave cross pass traverse")
-STOPPING_VERBS: Final = word_set("stop wait stand stay sit park halt pause hover")
+STOPPING_VERBS: Final = word_set("stop wait stand stay sit halt pause hover")
 # "hand the nurse the towel": the first noun is the recipient
 GIVING_VERBS: Final = word_set(
     "hand give bring pass fetch get send offer serve show throw feed find grab lend buy read toss"
@@ -62,7 +62,7 @@ HOLDING_VERBS: Final = word_set(
 ATTACHING_VERBS: Final = word_set(
     "connect attach mount fasten screw glue tape weld solder bolt nail clamp tie hook clip pin staple deliver"
 )
-PUSHING_VERBS: Final = word_set("move shift push slide drag pull roll nudge place put")
+PUSHING_VERBS: Final = word_set("move shift push slide drag pull roll nudge place put wheel cart tow")
 # "bring the box with the label": what the object has, not a tool
 FETCHING_VERBS: Final = word_set(
     "bring take get fetch pick grab give hand pass choose select want need carry show deliver collect retrieve lift"
@@ -146,7 +146,16 @@ _OTHER_VERBS: Final = word_set(
     "collapse tumble topple trip slump arrive forgive excuse pardon thank appreciate trouble bother surprise show "
     "appear seem look become weave bind sting deal meet swell"
 )
-VERBS: Final = GO_VERBS | DELIVERY_VERBS | CONTACT_VERBS | TOOL_VERBS | SEARCH_VERBS | INSPECTION_VERBS | _OTHER_VERBS
+VERBS: Final = (
+    GO_VERBS
+    | FILLING_VERBS
+    | DELIVERY_VERBS
+    | CONTACT_VERBS
+    | TOOL_VERBS
+    | SEARCH_VERBS
+    | INSPECTION_VERBS
+    | _OTHER_VERBS
+)
 
 
 # past forms and participles that do not end in -ed
