@@ -361,7 +361,7 @@ def read_json_camera(path: Path) -> FolderCamera:
     camera = FileIntrinsics(numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"]).camera(
         str(path), int(numbers["w"]), int(numbers["h"])
     )
-    return FolderCamera(camera, numbers["scale"], lens, registered)
+    return FolderCamera(camera, numbers["scale"], lens, depth_registered=registered)
 
 
 def read_camera_info(path: Path) -> FolderCamera:
