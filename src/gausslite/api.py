@@ -18,13 +18,13 @@ from gausslite.calibration.calibrate import StatedValues, calibrate
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel, Twist
+from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.checks import describe, require_instance, require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.pose import UpAxis, require_rigid
+from gausslite.domain.pose import Twist, UpAxis, require_rigid
 from gausslite.domain.recording import DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import BallRegion, Region
 from gausslite.domain.voxels import empty_batch

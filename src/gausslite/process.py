@@ -50,16 +50,21 @@ class _QuietEnd:
         os._exit(128 + number)
 
 
-_ONE_BLAS_THREAD = ("OPENBLAS_NUM_THREADS", "1")
-"""Read when NumPy is loaded: products of many points and a small matrix would only wait for further threads."""
+_OF_LIBRARIES = {"OPENBLAS_NUM_THREADS": "1", "GRPC_VERBOSITY": "NONE"}
+"""Variables that NumPy and gRPC read when they are loaded, unless the user sets them.
+
+Products of many points and a small matrix would only wait for further threads. Errors of connections are exceptions,
+which the programs report; gRPC would log them once more.
+"""
 
 
 def end_quietly_while_starting(program: str) -> None:
     """End the process with code 130 on SIGINT and 143 on SIGTERM, until `raise_interrupts` is called.
 
-    Call it on the main thread, before NumPy is loaded, which then has one thread for matrix products.
+    Call it on the main thread, before NumPy and gRPC are loaded: it sets their variables.
     """
-    os.environ.setdefault(*_ONE_BLAS_THREAD)
+    for name, value in _OF_LIBRARIES.items():
+        os.environ.setdefault(name, value)
     for number in _SIGNALS:
         signal.signal(number, _QuietEnd(program))
 
@@ -172,6 +177,14 @@ _SWITCHES = {"ORT_DISABLE_TELEMETRY": "1"}
 def disable_telemetry() -> None:
     """Set the variables for this process and its children."""
     os.environ.update(_SWITCHES)
+
+
+def size_text(count: float) -> str:
+    """Return a number of bytes with the unit that fits."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= factor:
+            return f"{count / factor:.3g} {unit}"
+    return f"{count:.0f} B"
 
 
 def import_extra(package: str, extra: str, purpose: str) -> Any:

@@ -17,7 +17,7 @@ from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
-from gausslite.process import print_message
+from gausslite.process import print_message, size_text
 from gausslite_view.contents import ViewContents
 from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
@@ -172,14 +172,6 @@ def as_count(value: float) -> str:
     return f"{value:,.0f}"
 
 
-def as_bytes(value: float) -> str:
-    """Return a size with the unit that fits."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if value >= factor:
-            return f"{value / factor:.3g} {unit}"
-    return f"{value:.0f} B"
-
-
 def as_percent(value: float) -> str:
     """Return a share in percent."""
     return f"{100 * value:.3g} %"
@@ -248,11 +240,11 @@ SCORES = (
 MAP_SIZE = (
     Figure("Gaussians", lambda run: float(len(run.contents.gaussians)), as_count),
     Figure("Gaussians of the region", lambda run: float(run.contents.gaussians.active.sum()), as_count),
-    Figure("map file", lambda run: float(run.map_bytes), as_bytes),
-    Figure("sent to the fusion server", _of_report("bytes_sent"), as_bytes),
+    Figure("map file", lambda run: float(run.map_bytes), size_text),
+    Figure("sent to the fusion server", _of_report("bytes_sent"), size_text),
     Figure("share of the map sent", _shared, as_percent),
-    Figure("rest of the map, sent at the end", _of_report("handover_bytes"), as_bytes),
-    Figure("keyframes sent", _of_report("keyframe_bytes"), as_bytes),
+    Figure("rest of the map, sent at the end", _of_report("handover_bytes"), size_text),
+    Figure("keyframes sent", _of_report("keyframe_bytes"), size_text),
 )
 TIMES = (
     Figure("frames mapped", _of_report("frames"), as_count),

@@ -48,7 +48,7 @@ from gausslite.mission.build import open_models
 from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
 from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
-from gausslite.process import Sibling, import_extra, print_message, sibling
+from gausslite.process import Sibling, import_extra, print_message, sibling, size_text
 from gausslite.wire.channel import MAX_PORT
 
 _AGENT_KEYS = ("frames", "hz", "gaussians", "roi_share", "bytes_sent", "map_shared_percent")
@@ -97,7 +97,7 @@ def report_tables(agents: Mapping[str, Mapping[str, object]], result: TeamScores
     """Return a table of the agents, a table of the maps' scores, and what each map is for, as text."""
     lines = ["", f"{'agent':<10}{'frames':>8}{'Hz':>8}{'Gaussians':>11}{'ROI':>8}{'sent':>11}{'shared':>9}  task"]
     for name, row in agents.items():
-        sent = f"{_number(row['bytes_sent']) / 1e6:.2f} MB"
+        sent = size_text(_number(row["bytes_sent"]))
         lines.append(
             f"{name:<10}{row['frames']:>8}{row['hz']:>8.1f}{row['gaussians']:>11}{row['roi_share']:>8.1%}"
             f"{sent:>11}{_number(row['map_shared_percent']):>8.1f}%  {row['task']}"

@@ -14,7 +14,7 @@ from gausslite.evaluation.views import view_map
 from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map
 from gausslite.export.occupancy import OccupancySettings
 from gausslite.mission.results import as_text, prepare_folder, read_report, require_absent
-from gausslite.process import print_message
+from gausslite.process import print_message, size_text
 
 _MESH_VOXEL_M, _OCCUPANCY_VOXEL_M, _MIN_OPACITY, _VIDEO_S = 0.01, 0.05, 0.3, 12.0
 _FORMATS_OF = {"voxel": ("octomap", "nav2", "mesh"), "min_opacity": ("octomap", "nav2"), "seconds": ("video",)}
@@ -88,7 +88,7 @@ def _report(options: argparse.Namespace, content: MapContent, out: Path, part: s
         counts = {"gaussians": len(content.chosen), "left_out": content.left_out, "bytes": size}
         print(as_text({"file": str(out), "format": options.to, **counts}))
     else:
-        print(f"{len(content.chosen)} Gaussians {part} → {out} ({chosen.summary}, {size / 1e6:.2f} MB)")
+        print(f"{len(content.chosen):,} Gaussians {part} → {out} ({chosen.summary}, {size_text(size)})")
 
 
 def _require_effect(options: argparse.Namespace) -> None:

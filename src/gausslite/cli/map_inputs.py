@@ -188,10 +188,10 @@ def _open_recorded(options: argparse.Namespace, require_poses: bool) -> Source:
         source = open_recorded(options.source, options.up, require_poses)
     except (DatasetError, PoseError) as error:
         raise _with_advice(error, options, require_poses) from None
-    errors = [_error_of(source, i) for i in {0, len(source) // 2, len(source) - 1}] if require_poses else []
-    if errors and None not in errors:
-        advised = _with_advice(errors[0], options, require_poses)
-        if advised is not errors[0]:
+    first = _error_of(source, 0) if require_poses else None
+    if first is not None and all(_error_of(source, i) for i in (len(source) // 2, len(source) - 1)):
+        advised = _with_advice(first, options, require_poses)
+        if advised is not first:
             raise advised
     return source
 

@@ -10,7 +10,7 @@ from typing import Any
 from tqdm import tqdm
 
 from gausslite.mission.task_mapper import FrameOutcome
-from gausslite.process import printable
+from gausslite.process import printable, size_text
 
 _TERMINAL_INTERVAL_S, _LOG_INTERVAL_S = 0.2, 10.0
 
@@ -62,6 +62,6 @@ class MappingBar:
         hz = done / max(time.monotonic() - self._start_s, 1e-9)
         figures = f"{gaussians / 1e3:.1f}k Gaussians, ROI {roi_share:.1%}, {hz:.1f} Hz"
         if uplink_bytes is not None:
-            figures += f", sent {uplink_bytes / 1e6:.2f} MB"
+            figures += f", sent {size_text(uplink_bytes)}"
         self._bar.set_postfix_str(figures, refresh=False)
         self._bar.update(done - self._bar.n)

@@ -101,6 +101,7 @@ class _NoSurfaces:
     def stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
         """Return None."""
         del relation, seen
+        return None
 
 
 def _landmark(number: int, found: ObjectLandmark) -> Landmark:
