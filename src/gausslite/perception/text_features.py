@@ -116,9 +116,9 @@ def match_noun(
         for basis, classes in (
             (MatchBasis.NAME, (name, *(known for known in by_name if _joined(known) == _joined(name)))),
             (MatchBasis.SYNONYM, (synonyms().get(name, ""),)),
-            (MatchBasis.SYNONYM, synonymous_classes(name, by_name)),
+            (MatchBasis.SYNONYM, synonymous_classes(name, by_name) if name == noun or not is_thing(noun) else ()),
             (MatchBasis.KIND, kinds_among(name, by_name) if is_whole else ()),
-            (MatchBasis.KIND, nearest_above(name, by_name)),
+            (MatchBasis.KIND, nearest_above(name, by_name) if is_whole else ()),
         ):
             if found := tuple(by_name[known] for known in dict.fromkeys(classes) if known in by_name):
                 return NounMatch(phrase, basis, found)
