@@ -61,7 +61,7 @@ class AgentData:
     ) -> None:
         self._store, self._votes, self._maps, self._alignments = store, votes, maps, alignments
         self._aligner = aligner
-        self._parts = (alignments, aligner, *parts)
+        self._parts: tuple[AgentPart, ...] = (alignments, aligner, *parts)
 
     def remove(self, agent_id: str) -> None:
         """Delete all data of the agent, with its earlier map. Raises StorageError."""

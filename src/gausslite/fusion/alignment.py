@@ -35,6 +35,8 @@ _MIN_SHARED, _MIN_BLOCK = 10, 3
 _MIN_BLOCKS = 8
 _MIN_MATCHED = 0.4
 _SIGMAS = 4.0
+_APART = 0.65
+"""Mean distance as a share of its saturation; the largest of 650 pairs of maps in the same frame is 0.55."""
 """Of 650 pairs of maps in the same frame, none has a motion with such gains of both residuals."""
 
 
@@ -51,7 +53,8 @@ class FrameFit:
     """A motion of the source map, and the misfit before and after it on the held-out half of the overlap.
 
     shift_m, rotation_deg: the motion of the overlap's centre and its angle. compared: number of held-out samples.
-    is_better: distance and colour improve by more than four times their uncertainty.
+    is_better: distance and colour improve by more than four times their uncertainty. is_apart: before the motion, the
+    surfaces are farther apart than those of maps in the same frame.
     """
 
     motion: Float64[ndarray, "4 4"]
@@ -61,6 +64,7 @@ class FrameFit:
     rotation_deg: float
     compared: int
     is_better: bool
+    is_apart: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,29 +184,33 @@ def _evaluate(
 ) -> FrameFit:
     before, after = target.residuals(held_out), target.residuals(held_out.moved(motion))
     is_better = after[2].mean() >= _MIN_MATCHED and all(
-        _is_gain(old - new, blocks) for old, new in zip(before[:2], after[:2], strict=True)
+        _lower_bound(old - new, blocks) > 0 for old, new in zip(before[:2], after[:2], strict=True)
     )
+    is_apart = bool(before[0].mean() > _APART)
     misfit_before, misfit_after = (
         Misfit(_MAX_DISTANCE_M * float(distance.mean()), _MAX_COLOUR * float(colour.mean()))
         for distance, colour, _ in (before, after)
     )
     rotation_deg, shift_m = rotation_angle_deg(motion, np.eye(4)), _shift_m(motion, centre_m)
-    return FrameFit(motion, misfit_before, misfit_after, shift_m, rotation_deg, len(held_out), bool(is_better))
+    return FrameFit(
+        motion, misfit_before, misfit_after, shift_m, rotation_deg, len(held_out), bool(is_better), is_apart
+    )
 
 
-def _is_gain(gains: Float64[ndarray, " n"], blocks: Int64[ndarray, " n"]) -> bool:
-    """Return whether a residual shrinks by more than its uncertainty; neighbours err together, so blocks count."""
+def _lower_bound(values: Float64[ndarray, " n"], blocks: Int64[ndarray, " n"]) -> float:
+    """Return the mean less four of its standard errors; neighbours err together, so blocks count."""
     names, of_sample, counts = np.unique(blocks, return_inverse=True, return_counts=True)
-    means = (np.bincount(of_sample, gains, len(names)) / counts)[counts >= _MIN_BLOCK]
-    if len(means) < _MIN_BLOCKS:
-        return False
-    return bool(means.mean() > max(_SIGMAS * means.std(ddof=1) / np.sqrt(len(means)), 0.0))
+    means = (np.bincount(of_sample, values, len(names)) / counts)[counts >= _MIN_BLOCK]
+    return float(means.mean() - _SIGMAS * means.std(ddof=1) / np.sqrt(len(means)))
 
 
 def _in_shared_cubes(points_m: Float64[ndarray, "n 3"], others_m: Float64[ndarray, "m 3"]) -> Bool[ndarray, " n"]:
-    """Return which points are in cubes that hold at least ten of the other points."""
-    keys, counts = np.unique(_SHARED_GRID.keys(others_m.astype(np.float32)), return_counts=True)
-    shared: Bool[ndarray, " n"] = np.isin(_SHARED_GRID.keys(points_m.astype(np.float32)), keys[counts >= _MIN_SHARED])
+    """Return which points are in cubes that hold at least ten of the other points, and half as many as of these."""
+    keys = _SHARED_GRID.keys(points_m.astype(np.float32))
+    other_keys = np.sort(_SHARED_GRID.keys(others_m.astype(np.float32)))
+    cubes, cube_of, own = np.unique(keys, return_inverse=True, return_counts=True)
+    others = np.searchsorted(other_keys, cubes, "right") - np.searchsorted(other_keys, cubes)
+    shared: Bool[ndarray, " n"] = (others >= np.maximum(_MIN_SHARED, own / 2))[cube_of]
     return shared
 
 

@@ -42,23 +42,21 @@ class AlignmentSettings:
     """When a misfit is corrected, and when two maps contradict each other.
 
     min_shift_m, min_rotation_deg: smaller motions are errors of the registration, which occur between maps in the same
-    frame. max_shift_m, max_rotation_deg: a larger motion that fits better is a contradiction. max_distance_m: so is a
-    larger mean distance, saturated at 10 cm, where both maps have surfaces. refit_share: a comparison is due when so
-    many voxels have changed since the last one, as a share of the agent's voxels.
+    frame. max_shift_m, max_rotation_deg: a larger motion that fits better is a contradiction. refit_share: a
+    comparison is due when so many voxels have changed since the last one, as a share of the agent's voxels.
     """
 
     min_shift_m: float = 0.03
     min_rotation_deg: float = 1.5
     max_shift_m: float = 0.25
     max_rotation_deg: float = 8.0
-    max_distance_m: float = 0.065
     refit_share: float = 0.25
 
     def contradicts(self, fit: FrameFit) -> bool:
         """Return whether no allowed correction explains the misfit."""
         if fit.is_better:
             return fit.shift_m > self.max_shift_m or fit.rotation_deg > self.max_rotation_deg
-        return fit.before.distance_m > self.max_distance_m
+        return fit.is_apart
 
     def corrects(self, fit: FrameFit) -> bool:
         """Return whether the motion is applied."""
@@ -230,7 +228,7 @@ def _encode(alignment: FrameAlignment) -> bytes:
         else {
             "motion": fit.motion.reshape(-1).tolist(),
             "misfits": [fit.before.distance_m, fit.before.colour, fit.after.distance_m, fit.after.colour],
-            "rest": [fit.shift_m, fit.rotation_deg, fit.compared, fit.is_better],
+            "rest": [fit.shift_m, fit.rotation_deg, fit.compared, fit.is_better, fit.is_apart],
         },
     }
     return json.dumps(value).encode()
@@ -244,10 +242,12 @@ def _decode(data: bytes) -> FrameAlignment:
         fit = None
         if stored is not None:
             misfits = [float(number) for number in stored["misfits"]]
-            shift_m, rotation_deg, compared, is_better = stored["rest"]
+            shift_m, rotation_deg, compared, *flags = stored["rest"]
             before, after = Misfit(*misfits[:2]), Misfit(*misfits[2:])
             motion = _matrix(stored["motion"])
-            fit = FrameFit(motion, before, after, float(shift_m), float(rotation_deg), int(compared), bool(is_better))
+            is_better, is_apart = (bool(flag) for flag in flags)
+            sizes = float(shift_m), float(rotation_deg), int(compared)
+            fit = FrameFit(motion, before, after, *sizes, is_better, is_apart)
         return FrameAlignment(
             int(value["order"]),
             AlignmentState(value["state"]),

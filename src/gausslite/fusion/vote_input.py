@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
@@ -172,13 +172,14 @@ class VoteInput:
         order = np.argsort(np.concatenate([np.zeros(0, np.int64), *rows]))
         return Gaussians.concatenate(parts).take(order)
 
-    def _in_range(self, gaussians: Gaussians) -> ndarray:
+    def _in_range(self, gaussians: Gaussians) -> Bool[ndarray, " n"]:
         """Return which Gaussians are within the range of the grid; the others are dropped."""
+        inside = np.ones(len(gaussians), np.bool_)
         try:
             self._grid.keys(gaussians.means_m)
         except InvalidInputError:
-            return (np.abs(gaussians.means_m) < 0.99 * self._grid.max_coordinate_m).all(axis=1)
-        return np.ones(len(gaussians), np.bool_)
+            inside = (np.abs(gaussians.means_m) < 0.99 * self._grid.max_coordinate_m).all(axis=1)
+        return inside
 
     def _with_moved(
         self, table: VoxelScoreTable, index: int, moved: _MovedVoxels, keys: Int64[ndarray, " k"] | None

@@ -47,7 +47,7 @@ def judge_pairs(maps: Sequence[tuple[SurfaceSamples, SurfaceSamples]], count: in
     pairs: list[FramePair] = []
     kinds = [*PARTS, PLANE]
     while len(pairs) < count:
-        one, other = maps[rng.integers(len(maps))]
+        one, other = maps[int(rng.integers(len(maps)))]
         target, source = (one, other) if rng.random() < 0.5 else (other, one)
         part = kinds[len(pairs) // 2 % len(kinds)]
         target = target if rng.random() < 0.6 else target.take(_in_box(target, PARTS["1 to 2 m"], rng))

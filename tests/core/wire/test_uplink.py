@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from fusion_running import GRID, fusion_server, make_batch
 from uplink_running import EAGER, WAIT_S, accepted, expected_kappas, scripted, stored_kappas, uplink
+from waiting import wait_until
 
+from gausslite.cli.main import main
 from gausslite.domain.errors import (
     InvalidInputError,
     MismatchError,
@@ -19,6 +21,7 @@ from gausslite.domain.errors import (
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
@@ -48,6 +51,23 @@ def test_the_agent_declares_its_frame() -> None:
         assert link.drain(WAIT_S)
         [agent] = fusion.client.status().agents
     assert list(agent.alignment.t_fused_agent.row_major) == T_fused_agent.reshape(-1).tolist()
+
+
+def test_a_quarantine_is_in_the_agents_log_and_in_the_status(
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reason = "frame: contradicts ant, bee: 0.61 m and 20 deg would fit better (ant)"
+    quarantined = FrameAlignment(0, AlignmentState.QUARANTINED, message=reason, against=("ant", "bee"))
+    with (
+        fusion_server() as fusion,
+        uplink(fusion.client.address, replace(EAGER, check_interval_s=0.1)) as link,
+    ):
+        link.enqueue(make_batch({1: [5]}))
+        assert link.drain(WAIT_S)
+        fusion.servicer._engine._mission.alignments.put("robot", quarantined)
+        wait_until(lambda: f"uplink: {reason}" in caplog.text)
+        assert main(["status", fusion.client.address]) == 0
+    assert "frame quarantined: contradicts ant, bee: 0.61 m and 20 deg" in capsys.readouterr().out
 
 
 def test_handover_is_counted_separately_and_sends_only_changed_voxels() -> None:
