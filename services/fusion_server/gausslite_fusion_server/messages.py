@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.codec.subset_codec import decode_stored
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -28,7 +27,7 @@ from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.refinement import LayerView
-from gausslite.fusion.store import PutOutcome
+from gausslite.fusion.store import PutOutcome, SessionRecord
 from gausslite.fusion.traffic import AgentContribution, TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
@@ -56,9 +55,14 @@ _ACCEPTED, _STALE, _REJECTED = (
 
 def agent_of_session(engine: FusionEngine, session_id: str, caller: Caller) -> str:
     """Return the agent of a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
-    agent_id = engine.session(session_id).agent_id
-    caller.require_agent(agent_id)
-    return agent_id
+    return session_of(engine, session_id, caller).agent_id
+
+
+def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> SessionRecord:
+    """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
+    session = engine.session(session_id)
+    caller.require_agent(session.agent_id)
+    return session
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,19 +75,13 @@ class QueuedSubset:
     put: Future[PutOutcome]
 
 
-def enqueue_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, caller: Caller) -> QueuedSubset:
-    """Decode one message and queue it. An invalid one is rejected by `put`; errors of the whole stream are raised."""
-    agent_id = agent_of_session(engine, request.session_id, caller)
+def enqueue_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, session: SessionRecord) -> QueuedSubset:
+    """Queue one message of a session, without decoding it. Raises UnavailableError if too many wait."""
     size = len(request.subset)
     is_handover = request.purpose == pb.PURPOSE_HANDOVER
     traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
-    put: Future[PutOutcome] = Future()
-    try:
-        subset, grid = decode_stored(request.subset)
-        put = engine.enqueue_update(request.session_id, subset, grid)
-    except GaussLiteError as error:
-        put.set_exception(error)
-    return QueuedSubset(agent_id, request.sequence, traffic, put)
+    put = engine.enqueue_update(session, request.subset)
+    return QueuedSubset(session.agent_id, request.sequence, traffic, put)
 
 
 async def outcome_of(engine: FusionEngine, queued: QueuedSubset) -> pb.SubsetOutcome:

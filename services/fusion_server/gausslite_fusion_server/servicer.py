@@ -48,6 +48,7 @@ from gausslite_fusion_server.messages import (
     layer_from_message,
     outcome_of,
     read_keyframe,
+    session_of,
     store_keyframe,
     view_to_message,
 )
@@ -129,10 +130,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._engine = engine
         self._refinement_worker = refinement_worker
         self._workers = ThreadPoolExecutor(_WORKERS, "fusion")
-        # one thread: several would contend for the interpreter's lock, which costs more than they gain
-        self._decoder = ThreadPoolExecutor(1, "decode")
         # one thread: messages that arrive during a commit wait for the next one and share it
         self._committer = ThreadPoolExecutor(1, "commit")
+        self._commit_is_due = False
         self._encoded_parts = EncodedPartCache()
         # one thread each: a comparison of frames or a rendering must not delay the acknowledgements
         self._aligner = ThreadPoolExecutor(1, "align")
@@ -163,12 +163,21 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes.notify()
         self._align_in_background()
 
+    def _commit_soon(self) -> None:
+        """Commit what is queued in the commit thread; one call serves all messages queued before it begins."""
+        if not self._commit_is_due:
+            self._commit_is_due = True
+            self._committer.submit(self._commit)
+
+    def _commit(self) -> None:
+        self._commit_is_due = False
+        self._engine.commit_updates()
+
     def close(self) -> None:
         """Wait until the work in threads has ended."""
         self._aligner.shutdown(wait=True, cancel_futures=True)
         self._background.shutdown(wait=True, cancel_futures=True)
         self._workers.shutdown(wait=True)
-        self._decoder.shutdown(wait=True)
         self._committer.shutdown(wait=True)
         self._refinement_worker.close()
 
@@ -220,12 +229,17 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
     ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
         """Store voxel updates; one acknowledgement for each message."""
-        acknowledged, caller, loop = 0, Caller.of(context), asyncio.get_running_loop()
+        acknowledged, caller, session = 0, Caller.of(context), None
         async for request in self._gate.admit(request_iterator):
+            if session is None or session.session_id != request.session_id:
+                session = await self._work(session_of, self._engine, request.session_id, caller)
             self._gate.require_open()
-            queued = await loop.run_in_executor(self._decoder, enqueue_subset, self._engine, request, caller)
-            if not queued.put.done():
-                self._committer.submit(self._engine.commit_updates)
+            try:
+                queued = enqueue_subset(self._engine, request, session)
+            except UnavailableError as error:
+                self._rejections.record(caller.key, "UNAVAILABLE", str(error))
+                raise
+            self._commit_soon()
             outcome = await outcome_of(self._engine, queued)
             if outcome.status == pb.SUBSET_STATUS_REJECTED:
                 self._rejections.record(caller.key, outcome.reason, outcome.message)

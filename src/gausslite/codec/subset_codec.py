@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from gausslite.codec import lossless_body, quantised_body
 from gausslite.codec.body_layout import BodyLayout, require_encodable
 from gausslite.codec.columns import MAX_COARSE_BITS, PositionPrecision
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.stored_voxels import CODES, VOXELS, StoredSubset
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 
@@ -106,6 +106,15 @@ def decode_stored(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[St
     """Check a message and return it as a store keeps it, without decoding its Gaussians. Raises as decode_subset."""
     stored, _, grid = _decode(data, limits)
     return stored, grid
+
+
+def declared_bytes(data: bytes) -> int:
+    """Return the size of a message's voxels and Gaussians in a store, as its header declares it, within the limits."""
+    if len(data) < _HEADER.size:
+        return 0
+    voxels, gaussians = _HEADER.unpack_from(data)[7:9]
+    voxels, gaussians = min(voxels, DEFAULT_LIMITS.max_voxels), min(gaussians, DEFAULT_LIMITS.max_gaussians)
+    return int(voxels * VOXELS.itemsize + gaussians * CODES.itemsize)
 
 
 def _decode(data: bytes, limits: CodecLimits) -> tuple[StoredSubset, str, VoxelGrid]:

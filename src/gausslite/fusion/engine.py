@@ -12,6 +12,7 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.subset_codec import decode_stored
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import MismatchError, NotPermittedError
 from gausslite.domain.gaussians import Gaussians
@@ -103,7 +104,9 @@ class FusionEngine:
         if first_revision is None:
             first_revision = time.time_ns() // 1000
         self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe)
-        self._committer = UpdateCommitter(store, self._lock, self._check_update, self._record_updates)
+        self._committer = UpdateCommitter(
+            store, self._lock, self._decode_update, self._check_update, self._record_updates
+        )
 
     @property
     def grid(self) -> VoxelGrid:
@@ -186,24 +189,19 @@ class FusionEngine:
         Raises SessionUnknownError, MismatchError (another grid), NotPermittedError (another agent's name),
         InvalidInputError, QuotaError, StorageError, UnavailableError; see UpdateCommitter for what is stored then.
         """
-        future = self.enqueue_update(session_id, StoredSubset.exact(subset), grid)
+        agent_id = self.session(session_id).agent_id
+        self._require_own(agent_id, subset.agent_id, grid)
+        future = self._committer.add(PendingUpdate(session_id, agent_id, StoredSubset.exact(subset)))
         self._committer.commit()
         # another thread may be committing it
         return future.result()
 
-    def enqueue_update(self, session_id: str, subset: StoredSubset, grid: VoxelGrid) -> Future[PutOutcome]:
-        """Queue an agent's voxel updates; the future has what `contribute` returns or raises, after a commit.
+    def enqueue_update(self, session: SessionRecord, message: bytes) -> Future[PutOutcome]:
+        """Queue an encoded message of a session; the future has what `contribute` returns or raises, after a commit.
 
-        Raises NotPermittedError for another agent's name, so that no agent waits in another one's queue.
+        The message is decoded when it is its agent's turn. Raises UnavailableError.
         """
-        agent_id = self.session(session_id).agent_id
-        if subset.agent_id != agent_id:
-            raise NotPermittedError(
-                f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(subset.agent_id)}"
-            )
-        if grid != self.grid:
-            raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
-        return self._committer.add(session_id, subset)
+        return self._committer.add(PendingUpdate(session.session_id, session.agent_id, message))
 
     def commit_updates(self) -> None:
         """Commit the queued updates. Call it after each `enqueue_update`."""
@@ -346,6 +344,21 @@ class FusionEngine:
     def _drop_contradicted(self, agent_id: str) -> bool:
         with self._committer.committing, self._lock:
             return self._mission.agents.drop_contradicted(agent_id)
+
+    def _decode_update(self, update: PendingUpdate) -> StoredSubset:
+        """Return the message as it is stored. Raises GaussLiteError."""
+        if not isinstance(update.message, bytes):
+            return update.message
+        subset, grid = decode_stored(update.message)
+        self._require_own(update.agent_id, subset.agent_id, grid)
+        return subset
+
+    def _require_own(self, agent_id: str, named: str, grid: VoxelGrid) -> None:
+        """Raise NotPermittedError for another agent's name, MismatchError for another grid."""
+        if named != agent_id:
+            raise NotPermittedError(f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(named)}")
+        if grid != self.grid:
+            raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
 
     def _check_update(self, update: PendingUpdate) -> StoredSubset:
         """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""

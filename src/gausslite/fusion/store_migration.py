@@ -22,7 +22,7 @@ from gausslite.fusion.store_rows import SEGMENT_BITS, UpdateRow, row_checksum
 
 OldRow = tuple[str, int, int, int, int, int, bytes]
 """agent_id, voxel, update_seq, Σkappa, count, checksum, Gaussians."""
-_OLD_CODES = np.dtype([*((name, *CODES.fields[name][:1]) for name in (CODES.names or ())[:-1]), ("kappa", "<u2")])
+_OLD_CODES = np.dtype([*CODES.descr[:-1], ("kappa", "<u2")])
 _SIZE, _HEADER = struct.Struct("<d"), struct.Struct("<qqqq")
 _SEGMENT_ROWS = 64
 

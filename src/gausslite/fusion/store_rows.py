@@ -280,5 +280,5 @@ def _size(voxels: StoredVoxels) -> int:
 
 def _scores(table: NDArray[Any], rows: Int64[ndarray, " k"]) -> tuple[Int64[ndarray, " k"], StoredScores]:
     """Return the keys of voxels and their totals, of elements of VOXELS."""
-    columns = (np.ascontiguousarray(table[name]) for name in ("kappa_sums", "counts"))
-    return np.ascontiguousarray(table["keys"]), StoredScores(table["update_seqs"].astype(np.int64), *columns, rows)
+    keys, sums, counts = (np.ascontiguousarray(table[name]) for name in ("keys", "kappa_sums", "counts"))
+    return keys, StoredScores(table["update_seqs"].astype(np.int64), sums, counts, rows)

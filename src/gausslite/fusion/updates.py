@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import logging
 import struct
 import time
 from collections import deque
@@ -16,6 +17,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.subset_codec import declared_bytes
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
 from gausslite.fusion.limits import Quotas
@@ -76,25 +78,50 @@ class UpdateChecks:
 
 SLICE_VOXELS = 2048
 """A larger message is stored in parts of this size, so that it does not delay the other agents."""
-_MESSAGE_COST = 16
-"""The cost of a message beside its voxels, in voxels."""
-_MAX_PENDING = 64
+_MESSAGE_BYTES = 1024
+"""The cost of a message beside its content."""
+_MAX_PENDING, _AGENT_BYTES = 64, 4 << 20
 """Of one agent; a robot waits for each acknowledgement, so it has one or two."""
+_TOTAL_BYTES = 64 << 20
+_LATE_S, _LATE_LOG_S = 2.0, 10.0
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, eq=False)
 class PendingUpdate:
-    """A message that waits for its commit. It is stored in slices; `outcomes` has those of the stored slices."""
+    """A message that waits for its commit, encoded or as it is stored. `outcomes` has those of the stored slices."""
 
     session_id: str
-    subset: StoredSubset
+    agent_id: str
+    message: bytes | StoredSubset
     future: Future[PutOutcome] = field(default_factory=Future)
     next_voxel: int = 0
     outcomes: list[PutOutcome] = field(default_factory=list)
+    queued_s: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
         # a client that disconnects cannot cancel it any more: the message is stored in any case
         self.future.set_running_or_notify_cancel()
+
+    @property
+    def subset(self) -> StoredSubset:
+        """The decoded message."""
+        assert isinstance(self.message, StoredSubset)
+        return self.message
+
+    @property
+    def encoded_bytes(self) -> int:
+        """The size of a message that is not decoded yet."""
+        return len(self.message) if isinstance(self.message, bytes) else 0
+
+    @property
+    def cost(self) -> int:
+        """The bytes to decode and to store next."""
+        if isinstance(self.message, bytes):
+            return _MESSAGE_BYTES + max(len(self.message), declared_bytes(self.message))
+        voxels = self.message.voxels
+        share = min(SLICE_VOXELS / max(len(voxels), 1), 1.0)
+        return _MESSAGE_BYTES + int(share * (voxels.voxels.nbytes + voxels.gaussians.nbytes))
 
     def next_slice(self) -> StoredSubset:
         """Return the part of the message to store next."""
@@ -118,7 +145,9 @@ class PendingUpdate:
 
 
 class UpdateQueue:
-    """Start-time fair queueing over the agents, by voxels. Thread-safe.
+    """Start-time fair queueing over the agents, by the bytes and Gaussians of their messages. Thread-safe.
+
+    It stands before decoding: a message costs its size, or what its header declares if that is more.
 
     Source: P. Goyal et al., "Start-time fair queueing", IEEE/ACM Transactions on Networking 5(5), 1997.
     """
@@ -131,19 +160,26 @@ class UpdateQueue:
         self._finish: dict[str, float] = {}
         self._now = 0.0
         self._arrivals = 0
+        self._bytes = 0
 
     def add(self, update: PendingUpdate) -> None:
-        """Queue a message. Raises UnavailableError if its agent has too many."""
-        agent_id = update.subset.agent_id
+        """Queue a message. Raises UnavailableError if its agent, or all agents together, have too many."""
+        agent_id, size = update.agent_id, update.encoded_bytes
         with self._lock:
-            own = self._pending.setdefault(agent_id, deque())
-            if len(own) >= _MAX_PENDING:
+            own = self._pending.get(agent_id, ())
+            if own and (len(own) >= _MAX_PENDING or size + sum(map(_encoded_bytes, own)) > _AGENT_BYTES):
                 raise UnavailableError(
-                    f"agent {quote_name(agent_id)}: expected at most {_MAX_PENDING} messages that wait for their "
-                    "acknowledgement; wait for some"
+                    f"agent {quote_name(agent_id)}: expected at most {_MAX_PENDING} messages and {_AGENT_BYTES >> 20} "
+                    "MiB that wait for their acknowledgement; wait for some"
                 )
-            own.append(update)
-            if len(own) == 1:
+            if self._bytes + size > _TOTAL_BYTES:
+                raise UnavailableError(
+                    f"fusion server: {len(self._pending)} agents have {self._bytes >> 20} MiB that wait for their "
+                    "acknowledgement; try again in a moment"
+                )
+            self._bytes += size
+            self._pending.setdefault(agent_id, deque()).append(update)
+            if not own:
                 self._wait(agent_id)
 
     @property
@@ -151,24 +187,26 @@ class UpdateQueue:
         """Whether `take` would return a message."""
         return bool(self._waiting)
 
-    def take(self, max_voxels: int) -> list[PendingUpdate]:
+    def take(self, max_bytes: int) -> list[PendingUpdate]:
         """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue."""
         taken: list[PendingUpdate] = []
         cost = 0
         with self._lock:
-            while self._waiting and cost < max_voxels:
+            while self._waiting and cost < max_bytes:
                 start, _, agent_id = heapq.heappop(self._waiting)
                 self._now = start
                 update = self._pending[agent_id][0]
-                own_cost = _MESSAGE_COST + min(len(update.subset.voxels) - update.next_voxel, SLICE_VOXELS)
+                own_cost = update.cost
                 self._finish[agent_id] = start + own_cost
                 cost += own_cost
+                # it is decoded now
+                self._bytes -= update.encoded_bytes
                 taken.append(update)
         return taken
 
     def put_back(self, update: PendingUpdate, is_done: bool) -> None:
         """Let the agent of a taken message wait for its next slice, or for its next message."""
-        agent_id = update.subset.agent_id
+        agent_id = update.agent_id
         with self._lock:
             own = self._pending[agent_id]
             if is_done:
@@ -188,7 +226,13 @@ class UpdateQueue:
         heapq.heappush(self._waiting, (start, self._arrivals, agent_id))
 
 
-_GROUP_VOXELS = 4096
+def _encoded_bytes(update: PendingUpdate) -> int:
+    return update.encoded_bytes
+
+
+_GROUP_BYTES = 2 << 20
+Decode = Callable[[PendingUpdate], StoredSubset]
+"""Returns the decoded message. Raises GaussLiteError to refuse it."""
 Check = Callable[[PendingUpdate], StoredSubset]
 """Returns the message as it is stored. Raises GaussLiteError to refuse it."""
 Record = Callable[[Sequence[tuple[str, Int64[ndarray, " _"]]]], None]
@@ -196,48 +240,67 @@ Record = Callable[[Sequence[tuple[str, Int64[ndarray, " _"]]]], None]
 
 
 class UpdateCommitter:
-    """Owns the queue. Messages are checked and recorded under the engine's lock, and committed without it.
+    """Owns the queue. Messages are checked and recorded under the engine's lock, decoded and committed without it.
 
     A message with more than SLICE_VOXELS voxels is stored in several transactions. If one of them fails, the stored
     part stays; it is a part of the agent's newest data, and sending the message again completes it. Thread-safe.
     """
 
-    def __init__(self, store: FusionStore, lock: RLock, check: Check, record: Record) -> None:
-        self._store, self._lock, self._check, self._record = store, lock, check, record
+    def __init__(self, store: FusionStore, lock: RLock, decode: Decode, check: Check, record: Record) -> None:
+        self._store, self._lock, self._decode, self._check, self._record = store, lock, decode, check, record
         self._queue = UpdateQueue()
+        self._next_log_s = 0.0
         self.committing = Lock()
         """Held through a commit; who deletes an agent's data takes it before the engine's lock."""
 
-    def add(self, session_id: str, subset: RoiSubset) -> Future[PutOutcome]:
+    def add(self, update: PendingUpdate) -> Future[PutOutcome]:
         """Queue a message; the future has its outcome after a commit. Raises UnavailableError."""
-        update = PendingUpdate(session_id, subset)
         self._queue.add(update)
         return update.future
 
     def commit(self) -> None:
         """Commit the queued messages, group by group, until none waits."""
         while self._queue.has_waiting:
-            with self.committing:
-                group = self._queue.take(_GROUP_VOXELS)
-                try:
-                    self._commit(group)
-                except Exception as error:
-                    # reaches the senders through their futures
-                    for update in group:
-                        _fail(update, error)
-                finally:
-                    for update in group:
-                        self._queue.put_back(update, update.future.done())
+            group = self._queue.take(_GROUP_BYTES)
+            try:
+                self._decode_all(group)
+                with self.committing:
+                    self._commit([update for update in group if not update.future.done()])
+            except Exception as error:
+                # reaches the senders through their futures
+                for update in group:
+                    _fail(update, error)
+            finally:
+                for update in group:
+                    self._queue.put_back(update, update.future.done())
+
+    def _decode_all(self, group: list[PendingUpdate]) -> None:
+        for update in group:
+            self._log_if_late(update)
+            try:
+                update.message = self._decode(update)
+            except GaussLiteError as error:
+                _fail(update, error)
+
+    def _log_if_late(self, update: PendingUpdate) -> None:
+        now_s = time.monotonic()
+        if isinstance(update.message, bytes) and now_s - update.queued_s > _LATE_S and now_s >= self._next_log_s:
+            self._next_log_s = now_s + _LATE_LOG_S
+            _log.warning(
+                "messages are late: one of agent %s has waited %.1f s", update.agent_id, now_s - update.queued_s
+            )
 
     def _commit(self, group: list[PendingUpdate]) -> None:
         checked: list[tuple[PendingUpdate, StoredSubset]] = []
         with self._lock:
             for update in group:
                 try:
-                    update.subset = self._check(update)
+                    update.message = self._check(update)
                     checked.append((update, update.next_slice()))
                 except GaussLiteError as error:
                     _fail(update, error)
+        if not checked:
+            return
         outcomes = self._put(checked)
         with self._lock:
             self._record(

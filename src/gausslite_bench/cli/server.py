@@ -13,6 +13,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.server.agent_load import LoadResult
 from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
 from gausslite_bench.server.server_process import DEFAULT_COMMAND
+from gausslite_bench.server.stages import measure_stages
 
 
 def configure_server(parser: argparse.ArgumentParser) -> None:
@@ -29,12 +30,19 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also measure 8 agents beside one that resends a message of 200000 tombstones",
     )
+    parser.add_argument(
+        "--stages",
+        action="store_true",
+        help="only measure the stages of a message in this process: CPU and bytes written, without gRPC",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_server)
 
 
 def run_server(options: argparse.Namespace) -> int:
     """Measure a server for each number of Gaussians held."""
+    if options.stages:
+        return _run_stages(options.json)
     if not options.seconds > 0:
         raise InvalidInputError(f"--seconds: expected more than 0, got {options.seconds:g}")
     settings = ServerBenchSettings(
@@ -55,6 +63,23 @@ def run_server(options: argparse.Namespace) -> int:
                 progress.write("\n".join(_lines(results[-1])))
     if options.json:
         sys.stdout.write(json.dumps(list(map(_values, results)), indent=1) + "\n")
+    return 0
+
+
+def _run_stages(is_json: bool) -> int:
+    results = {
+        f"{name} voxels, groups of {group}": measure_stages(group, name == "scattered")
+        for name in ("near", "scattered")
+        for group in (1, 8)
+    }
+    if is_json:
+        sys.stdout.write(json.dumps({title: asdict(result) for title, result in results.items()}, indent=1) + "\n")
+        return 0
+    for title, result in results.items():
+        sys.stdout.write(
+            f"{title}: decode {result.decode_ms:.2f} ms, store {result.store_ms:.2f} ms, checks, vote and log "
+            f"{result.other_ms:.2f} ms; {result.message_bytes} bytes received, {result.written_bytes} written\n"
+        )
     return 0
 
 

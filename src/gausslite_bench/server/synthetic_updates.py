@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.gaussians import Gaussians
@@ -18,10 +19,10 @@ _FILL_VOXELS = 500
 _PATCHES = 8
 
 
-def voxels_batch(first: int, count: int, seed: int) -> VoxelBatch:
-    """Return `count` voxels of a slab, from the voxel `first` on, each with GAUSSIANS_PER_VOXEL Gaussians."""
+def voxels_batch(voxels: Sequence[int] | NDArray[np.int64], seed: int) -> VoxelBatch:
+    """Return these voxels of a slab, by number, each with GAUSSIANS_PER_VOXEL Gaussians."""
     rng = np.random.default_rng(seed)
-    cells = np.repeat(np.arange(first, first + count), GAUSSIANS_PER_VOXEL)
+    cells = np.repeat(np.asarray(voxels, np.int64), GAUSSIANS_PER_VOXEL)
     corners = np.stack([cells % _ROW_VOXELS, cells // _ROW_VOXELS % _ROW_VOXELS, cells // _ROW_VOXELS**2], axis=1)
     n = len(cells)
     means_m = (corners + rng.uniform(0.05, 0.95, (n, 3))) * GRID.size_m
@@ -41,7 +42,7 @@ def voxels_batch(first: int, count: int, seed: int) -> VoxelBatch:
 def fill_messages(agent_id: str, first: int, voxels: int) -> Iterator[bytes]:
     """Yield encoded messages that fill these voxels."""
     for seq, start in enumerate(range(first, first + voxels, _FILL_VOXELS), start=1):
-        batch = voxels_batch(start, min(_FILL_VOXELS, first + voxels - start), seed=start)
+        batch = voxels_batch(range(start, min(start + _FILL_VOXELS, first + voxels)), seed=start)
         yield encode_subset(RoiSubset(agent_id, "", seq, seq, batch), GRID)
 
 
@@ -49,7 +50,8 @@ def delta_messages(agent_id: str, number: int, count: int, first_seq: int) -> li
     """Return encoded updates of the agent's area; half of it is shared with the next agent."""
     area = number * _PATCHES // 2 * DELTA_VOXELS
     batches = [
-        voxels_batch(area + patch * DELTA_VOXELS, DELTA_VOXELS, number * 100 + patch) for patch in range(_PATCHES)
+        voxels_batch(range(start, start + DELTA_VOXELS), number * 100 + patch)
+        for patch, start in enumerate(range(area, area + _PATCHES * DELTA_VOXELS, DELTA_VOXELS))
     ]
     return [
         encode_subset(RoiSubset(agent_id, "", seq, seq, batches[seq % _PATCHES]), GRID)

@@ -64,24 +64,25 @@ def test_a_declared_kappa_sum_wins_no_voxel(declared: int) -> None:
     assert won == {"good": (1000, 7000), "liar": (0, 0)}
 
 
-def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -> None:
-    def update(kappas_by_cell: dict[int, list[int]]) -> StoredSubset:
-        return StoredSubset.exact(make_subset("ant", 1, kappas_by_cell))
+def received(cells: dict[int, list[int]]) -> StoredSubset:
+    return StoredSubset.exact(make_subset("ant", 1, cells))
 
+
+def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -> None:
     store, clock = MemoryStore(), Clock()
     quotas = Quotas(kappa_at_join=100, kappa_per_second=10)
     checks = UpdateChecks(store, quotas, clock)
     checks.record_join("ant")
-    assert checks.check(update({0: [100], 1: []})).voxels.voxels["kappa_sums"].tolist() == [100, 0]
+    assert checks.check(received({0: [100], 1: []})).voxels.batch().kappa_sums.tolist() == [100, 0]
     with pytest.raises(QuotaError, match="'ant': expected a kappa of at most 100 this long after its first join"):
-        checks.check(update({0: [101]}))
+        checks.check(received({0: [101]}))
     clock.now_s += 5
     checks.record_join("ant")
-    assert checks.check(update({0: [150]}))
+    assert checks.check(received({0: [150]}))
     # a restarted server does not start again
-    assert UpdateChecks(store, quotas, clock).check(update({0: [150]}))
+    assert UpdateChecks(store, quotas, clock).check(received({0: [150]}))
     clock.now_s -= 500
-    assert checks.check(update({0: [100]}))
+    assert checks.check(received({0: [100]}))
 
 
 def test_a_sequence_number_cannot_use_up_all_later_ones() -> None:

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_gaussians import plain_gaussians
 from test_fusion_properties import assert_same_batch
 from test_fusion_stores import make_subset
 
 from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import RoiSubset, tombstones
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
@@ -29,6 +31,17 @@ def many_tombstones(agent_id: str, voxels: int) -> StoredSubset:
     return StoredSubset.exact(RoiSubset(agent_id, "", 1, 1, tombstones(np.arange(voxels, dtype=np.int64))))
 
 
+def pending(agent_id: str, message: bytes | StoredSubset) -> PendingUpdate:
+    return PendingUpdate("", agent_id, message)
+
+
+def encoded(agent_id: str, seq: int, cells: dict[int, int]) -> bytes:
+    """A message with this number of Gaussians in cells along x."""
+    means = [(0.1 * cell + 0.05, 0.05, 0.05) for cell, count in cells.items() for _ in range(count)]
+    batch = group_by_voxel(plain_gaussians(np.array(means).reshape(-1, 3), kappa=1), VoxelGrid(0.1))
+    return encode_subset(RoiSubset(agent_id, "", seq, seq, batch), VoxelGrid(0.1))
+
+
 def served(queue: UpdateQueue, max_voxels: int) -> list[str]:
     """Take one group, store nothing of it, and return its agents."""
     group = queue.take(max_voxels)
@@ -41,11 +54,11 @@ def served(queue: UpdateQueue, max_voxels: int) -> list[str]:
 def test_a_large_message_does_not_delay_the_messages_of_other_agents() -> None:
     queue = UpdateQueue()
     for _ in range(3):
-        queue.add(PendingUpdate("", many_tombstones("hog", 50 * SLICE_VOXELS)))
+        queue.add(pending("hog", many_tombstones("hog", 50 * SLICE_VOXELS)))
     order = served(queue, 1)
     for _ in range(20):
         for agent_id in ("ant", "bee"):
-            queue.add(PendingUpdate("", StoredSubset.exact(make_subset(agent_id, 1, {11: 1}))))
+            queue.add(pending(agent_id, StoredSubset.exact(make_subset(agent_id, 1, {11: 1}))))
         order += served(queue, 1) + served(queue, 1) + served(queue, 1)
     assert order.count("ant") == order.count("bee") == 20
     # the small messages together cost less than one slice, so the hog gets the rest
@@ -56,7 +69,7 @@ def test_a_large_message_does_not_delay_the_messages_of_other_agents() -> None:
 @settings(max_examples=30)
 def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tuple[str, int]], group: int) -> None:
     queue = UpdateQueue()
-    updates = [PendingUpdate("", many_tombstones(name, voxels)) for name, voxels in messages]
+    updates = [pending(name, many_tombstones(name, voxels)) for name, voxels in messages]
     for update in updates:
         queue.add(update)
     done: list[PendingUpdate] = []
@@ -76,9 +89,59 @@ def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tup
 def test_an_agent_that_does_not_wait_for_acknowledgements_is_refused() -> None:
     queue = UpdateQueue()
     for _ in range(64):
-        queue.add(PendingUpdate("", many_tombstones("hog", 1)))
+        queue.add(pending("hog", many_tombstones("hog", 1)))
     with pytest.raises(UnavailableError, match="wait for their acknowledgement"):
-        queue.add(PendingUpdate("", many_tombstones("hog", 1)))
+        queue.add(pending("hog", many_tombstones("hog", 1)))
+
+
+def test_messages_wait_encoded_and_their_bytes_are_limited() -> None:
+    queue = UpdateQueue()
+    large = bytes(1 << 20)
+    for _ in range(4):
+        queue.add(pending("hog", large))
+    with pytest.raises(UnavailableError, match=r"agent 'hog': expected at most 64 messages and 4 MiB"):
+        queue.add(pending("hog", large))
+    for number in range(15):
+        for _ in range(4):
+            queue.add(pending(f"other-{number}", large))
+    with pytest.raises(UnavailableError, match="16 agents have 64 MiB that wait"):
+        queue.add(pending("ant", b"small"))
+    # a message that is taken is decoded, so it makes room for another one
+    [taken] = queue.take(1)
+    queue.add(pending("ant", b"small"))
+    queue.put_back(taken, True)
+
+
+def test_a_message_costs_what_its_header_declares() -> None:
+    many = tombstones(np.arange(100_000, dtype=np.int64))
+    message = encode_subset(RoiSubset("hog", "", 1, 1, many), VoxelGrid(0.1))
+    assert len(message) < 20_000
+    assert pending("hog", message).cost > 20 * 100_000
+    queue = UpdateQueue()
+    queue.add(pending("hog", message))
+    queue.add(pending("hog", message))
+    for _ in range(20):
+        queue.add(pending("ant", encoded("ant", 1, {0: 40})))
+    order = []
+    while queue.has_waiting:
+        [update] = queue.take(1)
+        order.append(update.agent_id)
+        queue.put_back(update, True)
+    # after the first large message, all small ones come before the second
+    assert order == ["hog", *["ant"] * 20, "hog"]
+
+
+def test_a_late_message_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings())
+    session = engine.join("ant", ANY).session
+    for seq in (1, 2):
+        engine.enqueue_update(session, encoded("ant", seq, {0: 2}))
+    for update in engine._committer._queue._pending["ant"]:
+        update.queued_s -= 60.0
+    engine.commit_updates()
+    assert [record.getMessage() for record in caplog.records if "late" in record.getMessage()] == [
+        "messages are late: one of agent ant has waited 60.0 s"
+    ]
 
 
 class CountingStore(MemoryStore):
@@ -100,15 +163,12 @@ def test_messages_of_many_agents_share_one_commit_and_a_refused_one_fails_alone(
     store = CountingStore(refused="cat")
     engine = FusionEngine(store, FusionSettings())
     agents = ["ant", "bee", "cat", "dog"]
-    sessions = {name: engine.join(name, ANY).session.session_id for name in agents}
-    futures = {
-        name: engine.enqueue_update(sessions[name], StoredSubset.exact(make_subset(name, 1, {11: 2})), engine.grid)
-        for name in agents
-    }
+    sessions = {name: engine.join(name, ANY).session for name in agents}
+    futures = {name: engine.enqueue_update(sessions[name], encoded(name, 1, {11: 2})) for name in agents}
     engine.commit_updates()
     assert store.groups[0] == 4
     assert isinstance(futures.pop("cat").exception(), StorageError)
-    assert all(future.result().accepted.tolist() == [11] for future in futures.values())
+    assert all(len(future.result().accepted) == 1 for future in futures.values())
     assert store.agents() == ("ant", "bee", "dog")
 
 
