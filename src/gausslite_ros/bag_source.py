@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.files import FolderCamera, read_camera_file
+from gausslite.datasets.camera_files import FolderCamera, read_camera_file
 from gausslite.datasets.folder import FIRST_VIEW_UP, Origin, PoseTrack
 from gausslite.datasets.source import excluded_frames_note, require_matches, require_position
 from gausslite.domain.camera import Camera, Lens

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
+from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.corrected import undistort_colour, undistort_depth
-from gausslite.datasets.files import FolderCamera, RgbdImage, resize_rgbd
+from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.registered_source import register_depth
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError

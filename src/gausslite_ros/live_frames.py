@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.files import FolderCamera
+from gausslite.datasets.camera_files import FolderCamera
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame

@@ -14,7 +14,8 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.datasets.files import FolderCamera, decode_image, lens_of, require_pixel_count
+from gausslite.datasets.camera_files import FolderCamera, lens_of
+from gausslite.datasets.files import decode_image, require_pixel_count
 from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError
 

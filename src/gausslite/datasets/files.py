@@ -1,13 +1,12 @@
-"""Read the images, camera files and text files of a sequence; each error names the file."""
+"""Read the images and text files of a sequence; each error names the file."""
 
 from __future__ import annotations
 
 import codecs
-import json
 import re
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,9 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.domain.camera import Camera, FileIntrinsics, Lens, LensModel
+from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_size
-from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import image_size
 
 _MAX_IMAGE_PX = 1 << 26
@@ -261,196 +260,3 @@ def parse_numbers(location: str, fields: list[str], count: int, meaning: str) ->
         return [float(field) for field in fields]
     except ValueError as error:
         raise DatasetError(f"{location}: expected {count} numbers ({meaning}); {error}") from None
-
-
-INTRINSICS_FILE = "camera-intrinsics.txt"
-CAMERA_FILE = "cam_params.json"
-CAMERA_INFO_FILES = ("camera_info.yaml", "camera_info.yml")
-COLMAP_FILE = "cameras.txt"
-
-
-def find_in_or_above(folder: Path, name: str) -> Path | None:
-    """Return the file of this name in the folder or in its parent, or None."""
-    return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)
-
-
-@dataclass(frozen=True, slots=True)
-class FolderCamera:
-    """Camera that a folder's files state; units_per_metre: of the depth images, None if the file states none.
-
-    note: message that names a file of another folder; empty if the camera's file is the recording's own.
-    depth_registered: whether each depth pixel belongs to the colour pixel at its place, None if it is not stated.
-    """
-
-    camera: Camera
-    units_per_metre: float | None = None
-    lens: Lens | None = None
-    note: str = ""
-    depth_registered: bool | None = None
-
-
-def read_folder_camera(
-    folder: Path, width_px: int, height_px: int, published: FolderCamera | None = None
-) -> FolderCamera | None:
-    """Return the camera of a file in the folder, else the published one, else that of a file one folder above.
-
-    A file above may belong to another recording: it is used only for images of its size, with a note. Read in this
-    order: cam_params.json (with depth units), camera_info.yaml (ROS), cameras.txt (COLMAP), camera-intrinsics.txt (a
-    matrix). Returns None without a camera. Raises DatasetError.
-    """
-    names = (CAMERA_FILE, *CAMERA_INFO_FILES, COLMAP_FILE, INTRINSICS_FILE)
-    for path in (folder / name for name in names):
-        if path.is_file():
-            return read_camera_file(path, width_px, height_px)
-    if published is not None:
-        return published
-    for path in (folder.absolute().parent / name for name in names):
-        if path.is_file():
-            found = read_camera_file(path, width_px, height_px)
-            if (found.camera.width_px, found.camera.height_px) == (width_px, height_px):
-                return replace(found, note=f"the camera is that of {path}, one folder above; expected it in the folder")
-    return None
-
-
-def read_camera_file(path: Path, width_px: int, height_px: int) -> FolderCamera:
-    """Return the camera of a file by its name: *.json, *.yaml, cameras.txt of COLMAP, or another text with a matrix.
-
-    The size is that of the images; only a matrix does not state it. Raises DatasetError.
-    """
-    if path.suffix == ".json":
-        return read_json_camera(path)
-    if path.suffix in (".yaml", ".yml"):
-        return read_camera_info(path)
-    if path.name == COLMAP_FILE:
-        return read_colmap_camera(path)
-    return FolderCamera(read_matrix(path).camera(str(path), width_px, height_px))
-
-
-def read_matrix(path: Path) -> FileIntrinsics:
-    """Return the intrinsics of a file with a 3x3 matrix K in three rows. Raises DatasetError."""
-    rows = read_rows(path)
-    if len(rows) != 3:
-        raise DatasetError(f"{path}: expected the 3 rows of a camera matrix, got {len(rows)}")
-    K = np.array([parse_numbers(location, fields, 3, "a row of a camera matrix") for location, fields in rows])
-    zeros = (K[0, 1], K[1, 0], K[2, 0], K[2, 1])
-    if any(value != 0.0 for value in zeros) or K[2, 2] != 1.0:
-        raise DatasetError(f"{path}: expected rows fx 0 cx, 0 fy cy, 0 0 1, got {K.tolist()}")
-    return FileIntrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-
-
-def read_json_camera(path: Path) -> FolderCamera:
-    """Return the camera of {"camera": {"w","h","fx","fy","cx","cy","scale"}}, scale: depth units per metre.
-
-    "distortion_model" and "distortion" (a list) may state the lens, "depth_registered" (true or false) whether depth
-    belongs to the colour pixels. Raises DatasetError.
-    """
-    try:
-        fields = json.loads(read_text(path))["camera"]
-        numbers = {name: float(fields[name]) for name in ("w", "h", "fx", "fy", "cx", "cy", "scale")}
-        lens = lens_of(str(path), fields.get("distortion_model", "plumb_bob"), fields.get("distortion", ()))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
-        raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {error}") from None
-    if not (np.isfinite(numbers["scale"]) and numbers["scale"] > 0):
-        raise DatasetError(f"{path}: expected a positive depth scale, got {numbers['scale']}")
-    if not (np.isfinite(numbers["w"]) and np.isfinite(numbers["h"])):
-        raise DatasetError(f"{path}: expected a finite width and height, got {numbers['w']} and {numbers['h']}")
-    registered = fields.get("depth_registered")
-    if not isinstance(registered, bool | None):
-        raise DatasetError(f"{path}: depth_registered: expected true or false, got {registered!r}")
-    camera = FileIntrinsics(numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"]).camera(
-        str(path), int(numbers["w"]), int(numbers["h"])
-    )
-    return FolderCamera(camera, numbers["scale"], lens, depth_registered=registered)
-
-
-def read_camera_info(path: Path) -> FolderCamera:
-    """Return the camera of a ROS camera_info file (YAML): image_width, camera_matrix, distortion_coefficients.
-
-    Raises DatasetError.
-    """
-    import yaml
-
-    try:
-        fields = yaml.safe_load(read_text(path))
-        width, height = int(fields["image_width"]), int(fields["image_height"])
-        K = [float(value) for value in fields["camera_matrix"]["data"]]
-        lens = lens_of(
-            str(path), fields.get("distortion_model", "plumb_bob"), fields["distortion_coefficients"]["data"]
-        )
-        intrinsics = FileIntrinsics(K[0], K[4], K[2], K[5])
-    except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-        expected = "image_width, image_height, camera_matrix and distortion_coefficients with data"
-        reason = " ".join(str(error).split())[:120]
-        raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {reason}") from None
-    return FolderCamera(intrinsics.camera(str(path), width, height), lens=lens)
-
-
-_COLMAP_LENSES: Mapping[str, Callable[[Sequence[float]], tuple[float, ...]]] = {
-    "SIMPLE_PINHOLE": lambda p: (p[0], p[0], p[1], p[2]),
-    "PINHOLE": lambda p: (p[0], p[1], p[2], p[3]),
-    "SIMPLE_RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0),
-    "RADIAL": lambda p: (p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0),
-    "OPENCV": lambda p: tuple(p[:8]),
-    "FULL_OPENCV": lambda p: tuple(p[:12]),
-    "OPENCV_FISHEYE": lambda p: tuple(p[:8]),
-}
-"""Parameters of COLMAP's camera models as fx fy cx cy and OpenCV's distortion coefficients."""
-
-
-def read_colmap_camera(path: Path) -> FolderCamera:
-    """Return the first camera of COLMAP's cameras.txt, whose principal point counts from the image corner.
-
-    Raises DatasetError.
-    """
-    location, fields = next(iter(read_rows(path)), (str(path), []))
-    model = fields[1] if len(fields) > 1 else ""
-    if model not in _COLMAP_LENSES:
-        raise DatasetError(
-            f"{location}: expected ID MODEL WIDTH HEIGHT PARAMETERS with a model of "
-            f"{', '.join(_COLMAP_LENSES)}, got {model[:30]!r}"
-        )
-    numbers = parse_numbers(location, fields[2:], len(fields) - 2, "a camera's size and parameters")
-    try:
-        fx, fy, cx, cy, *distortion = _COLMAP_LENSES[model](numbers[2:])
-    except (IndexError, ValueError):
-        raise DatasetError(f"{location}: expected more parameters for {model}, got {len(numbers) - 2}") from None
-    lens = lens_of(str(path), "equidistant" if model == "OPENCV_FISHEYE" else "plumb_bob", distortion)
-    camera = FileIntrinsics(fx, fy, cx - 0.5, cy - 0.5).camera(str(path), int(numbers[0]), int(numbers[1]))
-    return FolderCamera(camera, lens=lens)
-
-
-_LENS_MODELS = {
-    **dict.fromkeys(("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "opencv"), LensModel.RADTAN),
-    **dict.fromkeys(("brownconrady", "modifiedbrownconrady", "inversebrownconrady"), LensModel.RADTAN),
-    **dict.fromkeys(("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4"), LensModel.FISHEYE),
-}
-"""Names of ROS, Kalibr, OpenCV and the RealSense SDK, in lower case, without marks between words."""
-_WITHOUT_LENS = ("", "none", "pinhole", "ideal", "undistorted", "rectified")
-_MAX_COEFFICIENTS = {LensModel.RADTAN: 8, LensModel.FISHEYE: 4}
-
-
-def lens_of(location: str, model: str, coefficients: Iterable[float]) -> Lens | None:
-    """Return the lens of these coefficients in OpenCV's order; None for a pinhole camera. Raises DatasetError.
-
-    An equidistant lens whose coefficients are all zero is no pinhole camera. OpenCV's thin prism and tilt, after the
-    eighth coefficient, must be zero.
-    """
-    values = tuple(float(value) for value in coefficients)
-    name = re.sub(r"[\s_-]", "", str(model).lower())
-    lens_model = _LENS_MODELS.get(name)
-    if lens_model is not LensModel.FISHEYE and not any(values) and (lens_model or name in _WITHOUT_LENS):
-        return None
-    if lens_model is None:
-        expected = "plumb_bob, rational_polynomial, radtan, equidistant or fisheye"
-        raise DatasetError(f"{location}: distortion_model: expected {expected}, got {str(model)[:40]!r}")
-    count = _MAX_COEFFICIENTS[lens_model]
-    if any(values[count:]):
-        raise DatasetError(
-            f"{location}: expected a {lens_model} lens of at most {count} coefficients, got {len(values)}; rectify the "
-            "images (a ROS bag: with image_proc, and use image_rect_color)"
-        )
-    try:
-        return Lens(lens_model, values[:count])
-    except InvalidInputError as error:
-        raise DatasetError(f"{location}: {error}") from None

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
-from gausslite.datasets.files import DepthUnits, FolderCamera, load_rgbd, parse_numbers, read_rows
+from gausslite.datasets.camera_files import FolderCamera
+from gausslite.datasets.files import DepthUnits, load_rgbd, parse_numbers, read_rows
 from gausslite.datasets.regions import REGIONS_FILE, balls_for_small_objects, load_voxel_regions
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera, Lens

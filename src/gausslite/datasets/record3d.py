@@ -23,15 +23,8 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.datasets.files import (
-    DepthUnits,
-    FolderCamera,
-    RgbdImage,
-    decode_image,
-    require_pixel_count,
-    resize_depth,
-    resize_rgbd,
-)
+from gausslite.datasets.camera_files import FolderCamera
+from gausslite.datasets.files import DepthUnits, RgbdImage, decode_image, require_pixel_count, resize_depth, resize_rgbd
 from gausslite.datasets.folder import FolderSource, estimate_up, is_lost, pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera

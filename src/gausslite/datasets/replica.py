@@ -9,14 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.files import (
-    CAMERA_FILE,
-    DepthUnits,
-    find_in_or_above,
-    parse_numbers,
-    read_json_camera,
-    read_rows,
-)
+from gausslite.datasets.camera_files import CAMERA_FILE, find_in_or_above, read_json_camera
+from gausslite.datasets.files import DepthUnits, parse_numbers, read_rows
 from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis

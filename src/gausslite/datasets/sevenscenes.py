@@ -9,16 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.files import (
-    CAMERA_FILE,
-    INTRINSICS_FILE,
-    DepthUnits,
-    FolderCamera,
-    first_readable_size,
-    parse_numbers,
-    read_folder_camera,
-    read_rows,
-)
+from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
+from gausslite.datasets.files import DepthUnits, first_readable_size, parse_numbers, read_rows
 from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource, estimate_up
 from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError, PoseError

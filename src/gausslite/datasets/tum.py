@@ -11,16 +11,13 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
 from gausslite.datasets.files import (
-    CAMERA_FILE,
-    INTRINSICS_FILE,
     DepthUnits,
-    FolderCamera,
     first_readable_size,
     is_number,
     load_rgbd,
     parse_numbers,
-    read_folder_camera,
     read_lines,
     read_rows,
 )

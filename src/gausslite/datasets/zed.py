@@ -10,15 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.files import (
-    CAMERA_FILE,
-    INTRINSICS_FILE,
-    DepthUnits,
-    first_readable_size,
-    parse_numbers,
-    read_folder_camera,
-    read_rows,
-)
+from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, read_folder_camera
+from gausslite.datasets.files import DepthUnits, first_readable_size, parse_numbers, read_rows
 from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource, is_lost, pose_from_quaternion
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis

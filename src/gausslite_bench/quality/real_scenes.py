@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
 from gausslite.datasets.corrected import CorrectedSource
-from gausslite.datasets.files import CAMERA_FILE, INTRINSICS_FILE, find_in_or_above
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 from gausslite.datasets.source import HeldOutSplit, Source

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
+from gausslite.datasets.camera_files import read_folder_camera
 from gausslite.datasets.corrected import CorrectedSource, correct_frame, ideal_camera
-from gausslite.datasets.files import read_folder_camera
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera, Lens, LensModel, lift, project
 from gausslite.domain.errors import DatasetError, InvalidInputError

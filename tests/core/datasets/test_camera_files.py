@@ -11,7 +11,7 @@ import pytest
 from tiny_sequences import write_seven_scenes, write_tum
 
 from gausslite.cli.source_options import open_recorded
-from gausslite.datasets.files import lens_of, read_folder_camera
+from gausslite.datasets.camera_files import lens_of, read_folder_camera
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import DatasetError
