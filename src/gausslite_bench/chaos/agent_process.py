@@ -43,7 +43,7 @@ class ChaosAgentSettings:
 def changed_voxels(rng: np.random.Generator) -> VoxelBatch:
     """Return new content of some neighbouring voxels of the area that all agents share; some of them are empty now."""
     first = int(rng.integers(_AREA_VOXELS - _STEP_VOXELS))
-    batch = voxels_batch(first, _STEP_VOXELS, int(rng.integers(1 << 31)))
+    batch = voxels_batch(range(first, first + _STEP_VOXELS), int(rng.integers(1 << 31)))
     removed = rng.random(len(batch)) < _TOMBSTONE_SHARE
     return merge_batches(select_voxels(batch, ~removed), tombstones(batch.keys[removed]))
 
