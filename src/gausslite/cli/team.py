@@ -207,8 +207,8 @@ def run_status(options: argparse.Namespace) -> int:
     else:
         print("\n".join((_agent_lines if status.is_agent else _fusion_lines)(status.values)))
     values = status.values
-    is_found = not (status.is_agent and "graph" in values and values["frames_mapped"]) or values["roi_share"] > 0
-    return 0 if is_found else TASK_NOT_FOUND
+    has_searched = status.is_agent and "graph" in values and int(values["frames_mapped"]) > 0
+    return TASK_NOT_FOUND if has_searched and values["roi_share"] == 0 else 0
 
 
 def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:

@@ -11,6 +11,9 @@ from fusion_running import GRID, frame, fusion_server
 
 from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply
+from gausslite.domain.relevance import BallRegion
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
@@ -45,6 +48,18 @@ def test_a_team_is_watched_ended_refined_and_fetched(tmp_path: Path, capsys: pyt
         assert main(["fetch", server, "--strategy", "refined", "--out", str(tmp_path / "again.ply")]) == 0
         assert len(read_ply(refined)) == len(read_ply(tmp_path / "again.ply")) > 0
         assert len(read_ply(voted)) > 0
+
+
+def test_the_status_of_an_agent_that_has_not_found_its_task_exits_with_3() -> None:
+    mug = RegionDetector({"mug_1": BallRegion((0.0, 0.0, 1.2), 0.2)})
+    with agent(lambda graph: TaskRelevanceEstimator(graph, mug)) as a:
+        robot = a.client.address
+        assert a.client.assign_task("Find the unicorn").warnings == (
+            "no region matches 'unicorn'; the regions are mug_1",
+        )
+        assert main(["status", robot]) == 0  # it has seen nothing yet
+        list(a.client.ingest([frame(0)]))
+        assert main(["status", robot]) == 3
 
 
 def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
