@@ -137,7 +137,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         # one thread each: a comparison of frames or a rendering must not delay the acknowledgements
         self._aligner = ThreadPoolExecutor(1, "align")
         self._background = ThreadPoolExecutor(1, "background")
-        self._aligning, self._align_pause_s = False, _ALIGN_DELAY_S
+        self._aligning, self._align_again, self._align_pause_s = False, False, _ALIGN_DELAY_S
         self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
@@ -404,6 +404,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     def _align_in_background(self) -> None:
         """Estimate the agents' frames soon, unless an estimate is pending or running. Use on the event loop."""
+        self._align_again = True
         if not self._aligning:
             self._aligning = True
             asyncio.get_running_loop().call_later(self._align_pause_s, self._align)
@@ -411,6 +412,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def _align(self) -> None:
         if not self._gate.is_open:
             return
+        self._align_again = False
         future = asyncio.get_running_loop().run_in_executor(self._aligner, self._align_due)
         future.add_done_callback(self._after_aligning)
 
@@ -425,6 +427,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._aligning = False
         if future.cancelled():
             return
+        if self._align_again and self._gate.is_open:
+            # messages that arrived meanwhile
+            self._align_in_background()
         if future.exception() is not None:
             _log.error("frames are not estimated: %s", future.exception())
         elif future.result():

@@ -191,9 +191,15 @@ def _evaluate(
         Misfit(_MAX_DISTANCE_M * float(distance.mean()), _MAX_COLOUR * float(colour.mean()))
         for distance, colour, _ in (before, after)
     )
-    rotation_deg, shift_m = rotation_angle_deg(motion, np.eye(4)), _shift_m(motion, centre_m)
     return FrameFit(
-        motion, misfit_before, misfit_after, shift_m, rotation_deg, len(held_out), bool(is_better), is_apart
+        motion,
+        misfit_before,
+        misfit_after,
+        shift_m=_shift_m(motion, centre_m),
+        rotation_deg=rotation_angle_deg(motion, np.eye(4)),
+        compared=len(held_out),
+        is_better=bool(is_better),
+        is_apart=is_apart,
     )
 
 

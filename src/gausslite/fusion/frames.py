@@ -254,8 +254,8 @@ def _decode(data: bytes) -> FrameAlignment:
             tuple((int(first), _matrix(T)) for first, T in value["segments"]),
             fit,
             str(value["message"]),
-            _matrix(value["declared"]),
-            tuple(str(name) for name in value["against"]),
+            declared=_matrix(value["declared"]),
+            against=tuple(str(name) for name in value["against"]),
         )
     except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
         raise CodecError(f"alignment: expected the JSON of an alignment, got other bytes ({error})") from error
