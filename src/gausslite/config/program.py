@@ -94,8 +94,9 @@ class Program:
         for key in self.positional:
             declared = self.options[key]
             parser.add_argument(declared.dest, nargs="?", default=SUPPRESS, **_argument(declared))
-        for key in self.flags:
-            self._add_flag(parser, self.options[key])
+        for key, declared in self.options.items():
+            if key not in self.positional:
+                self._add_flag(parser, declared)
         add = parser.add_argument_group("configuration", self._describe_other_keys()).add_argument
         add("--config", metavar="FILE.toml", help=_CONFIG_HELP)
         add("--set", metavar="KEY=VALUE", action="append", default=[], help="set any option; may be repeated")
@@ -149,18 +150,11 @@ class Program:
         """End the process with code 2 and a line about unknown flags: what they have become, or what is similar."""
         flag = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
         key = "" if flag is None else flag.removeprefix("--")
-        if key in self.options:
-            example = f"{key} = {_placeholder(self.options[key], quoted=True)}"
-            setting = f"--set {key}={_placeholder(self.options[key])}"
-            parser.error(f"{flag}: is a key of the configuration file: {setting}, or {example} in the file of --config")
         if key in self.removed:
             parser.error(f"{flag}: was removed; {self.removed[key]}")
         if key.removeprefix("no-") in self.options:
             parser.error(f"{flag}: write --set {key.removeprefix('no-')}=false")
-        known = [*parser.flags, *(f"--set {name}=..." for name in self.options if name not in self.flags)]
         similar = "" if flag is None else suggestion(flag, parser.flags)
-        if not similar and (name := nearest(key, self.options)) is not None:
-            similar = f"; did you mean {next(text for text in known if name in text)}?"
         parser.error(f"unrecognized arguments: {' '.join(unknown)}{similar}")
 
     def name(self, key: str) -> str:
@@ -169,17 +163,20 @@ class Program:
 
     def _add_flag(self, parser: CommandParser, declared: OptionField) -> None:
         flag = f"--{declared.key}"
+        details = {"help": describe(declared)} if declared.plain_type is bool else _argument(declared)
+        if declared.key not in self.flags:
+            details["help"] = SUPPRESS  # accepted, but the help shows what changes from run to run
         if declared.plain_type is bool:
-            parser.add_argument(flag, action="store_true", default=SUPPRESS, help=describe(declared))
+            parser.add_argument(flag, action="store_true", default=SUPPRESS, **details)
         else:
             action = "append" if declared.option.repeats else "store"
-            parser.add_argument(flag, action=action, default=SUPPRESS, **_argument(declared))
+            parser.add_argument(flag, action=action, default=SUPPRESS, **details)
 
     def _describe_other_keys(self) -> str:
         keys = [key for key in self.options if key not in (*self.flags, *self.positional)]
         if not keys:
             return ""
-        return f"Further options, for --set and the file; --print-config describes them: {', '.join(keys)}."
+        return f"Further options, as --KEY, --set or in the file; --print-config describes them: {', '.join(keys)}."
 
     def _command_line(self, parsed: Namespace) -> _Layer:
         given: dict[str, _Given] = {}
@@ -190,7 +187,7 @@ class Program:
             self._require_known(key, f"--set {key}")
             earlier = given[key].value if key in given and self.options[key].option.repeats else []
             given[key] = _Given([*earlier, value] if self.options[key].option.repeats else value, f"--set {key}")
-        for key in (*self.flags, *self.positional):
+        for key in self.options:
             if hasattr(parsed, self.options[key].dest):
                 given[key] = _Given(getattr(parsed, self.options[key].dest), self.name(key))
         return self._without_contradiction(given, "")

@@ -146,14 +146,10 @@ WRONG_ARGUMENTS = {
     ("--set", "verbose=maybe"): "--set verbose: expected true or false, got 'maybe'",
 }
 WRONG_FLAGS = {
-    (
-        "--speed",
-        "fast",
-    ): '--speed: is a key of the configuration file: --set speed=slow|fast, or speed = "slow|fast" in',
     ("--vote=free",): "--vote: was removed; the vote has one rule",
     ("--no-verbose",): "--no-verbose: write --set verbose=false",
     ("--max-item", "5"): "unrecognized arguments: --max-item 5; did you mean --max-items?",
-    ("--sped=fast",): "unrecognized arguments: --sped=fast; did you mean --set speed=...?",
+    ("--sped=fast",): "unrecognized arguments: --sped=fast; did you mean --speed?",
     ("more",): "unrecognized arguments: more",
 }
 
