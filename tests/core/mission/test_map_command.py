@@ -154,6 +154,6 @@ def test_nouns_that_the_detector_cannot_find_are_named_before_mapping(
 ) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     options = ["--task", "Find the umbrella", "--size", "32x24", "--frames", "0:1", "--max-gaussians", "100"]
-    assert main(["map", "sim:home", *options, "--out", str(tmp_path / "out")]) == 0
+    assert main(["map", "sim:home", *options, "--out", str(tmp_path / "out")]) == 3
     messages = capsys.readouterr().err
     assert 0 <= messages.index("no region matches 'umbrella'") < messages.index("map:")
