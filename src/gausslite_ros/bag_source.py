@@ -265,8 +265,7 @@ class BagSource:
         """Which topics and poses are used, for a message to the user."""
         depth = "aligned" if self._cameras.depth is None else "registered to colour here; aligned=yes if it is already"
         poses = "none" if self._poses is None else str(self._poses)
-        chosen = f"color={self._colour.name}, depth={self._depth.name} ({depth}), poses: {poses}"
-        return "; ".join([chosen, *self._bag.notes])
+        return f"color={self._colour.name}, depth={self._depth.name} ({depth}), poses: {poses}"
 
     @property
     def camera(self) -> Camera:
@@ -315,10 +314,10 @@ class BagSource:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages on the colour images without depth or pose at their stamp, and on an origin that is not zero."""
+        """Messages on colour images without depth or pose, on parts that are cut, and on an origin that is not zero."""
         reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
         note = excluded_frames_note(self._recorded - len(self), self._recorded, reason)
-        return tuple(filter(None, (note, self._origin.note)))
+        return tuple(filter(None, (note, *self._bag.notes, self._origin.note)))
 
     def __len__(self) -> int:
         return len(self._matches)

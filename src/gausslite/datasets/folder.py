@@ -192,7 +192,7 @@ class FolderSource:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages on a camera file of another folder, and on excluded frames."""
+        """Messages on a camera file of another folder, on excluded frames, and on an origin that is not zero."""
         return tuple(filter(None, (self._camera_note, self.excluded_frames, self._origin.note)))
 
     @property
