@@ -24,7 +24,7 @@ from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
-from gausslite.fusion.objects import find_objects
+from gausslite.fusion.objects import merge_objects
 from gausslite.mission.results import TRAJECTORY, as_text, read_report
 from gausslite.wire.security import TlsFiles
 
@@ -122,7 +122,7 @@ def _read_folder(folder: Path) -> _Place:
     targets = report.get("targets")
     nouns = tuple(str(target) for target in targets) if isinstance(targets, list) else ()
     graph = TaskGraph("", str(report.get("task") or ""), nouns, (), ())
-    objects = find_objects({agent_id: ObjectReport(graph, tuple(object_from_json(value) for value in values))}, {})
+    objects = merge_objects({agent_id: ObjectReport(graph, tuple(object_from_json(value) for value in values))})
     map_file, trajectory = folder / "map.ply", folder / TRAJECTORY
     poses = read_pose_rows(trajectory)[1] if trajectory.is_file() else np.zeros((0, 4, 4))
     return _Place(

@@ -31,7 +31,7 @@ from gausslite.fusion.keyframes import (
 )
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.mission_data import MissionData
-from gausslite.fusion.objects import find_objects
+from gausslite.fusion.objects import MergedObjects, find_objects
 from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.traffic import AgentContribution, MissionStatus, StorageProbe, TrafficCounters
 from gausslite.fusion.updates import PendingUpdate, UpdateCommitter, require_within_quotas
@@ -101,6 +101,7 @@ class FusionEngine:
         self._store = store
         self._settings = settings
         self._storage = StorageProbe(store)
+        self._merged_objects = MergedObjects()
         if first_revision is None:
             first_revision = time.time_ns() // 1000
         self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe)
@@ -260,7 +261,7 @@ class FusionEngine:
         """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
         with self._lock:
             reports, frames = self._mission.objects.reports(), self._mission.alignments.transforms()
-        return find_objects(reports, frames, noun)
+        return find_objects(self._merged_objects.of(reports, frames), noun)
 
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.

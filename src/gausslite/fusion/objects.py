@@ -1,6 +1,7 @@
 """Merge the agents' object landmarks: those of one noun that overlap or are near each other are one object.
 
-The result is a pure function of the reports, so it does not depend on their order of arrival.
+The result is a pure function of the reports, so it does not depend on their order of arrival. Landmarks are compared
+with those around them only, and the number of comparisons has a limit.
 """
 
 from __future__ import annotations
@@ -8,9 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from threading import Lock
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.json import decode_object_report, encode_object_report
@@ -33,6 +35,12 @@ from gausslite.fusion.store import FusionStore
 _MIN_MATCH_DISTANCE_M = 0.15
 _MATCH_DISTANCE_SHARE = 0.5
 _MIN_OVERLAP = 0.3
+_GROUP, _CROWD = 64, 1024
+"""Landmarks that are compared pair by pair; in a crowd that space does not divide, only the first ones."""
+MAX_COMPARISONS = 2_000_000
+_CUT_SHARE = 1.5
+_NOUN_DISTANCE_M = 8 * MAX_OBJECT_COORDINATE_M
+"""As if each noun had a space of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,28 +57,29 @@ class _Observed:
         return self.landmark.first_seen_ns, self.agent_id, self.landmark.object_id
 
 
-def merge_objects(reports: Mapping[str, ObjectReport]) -> tuple[TeamObject, ...]:
-    """Return the team's objects, the most confident first; an agent's landmarks are never merged with each other."""
+def merge_objects(
+    reports: Mapping[str, ObjectReport], frames: Mapping[str, Float64[ndarray, "4 4"]] | None = None
+) -> tuple[TeamObject, ...]:
+    """Return the team's objects, the most confident first; an agent's landmarks are never merged with each other.
+
+    frames: T_fused_agent of the agents whose landmarks are moved to the fused map's frame; absent: not moved.
+    A landmark that this moves out of range is left out.
+    """
+    frames = frames or {}
+    moved = {name: _moved(report, frames[name]) if name in frames else report for name, report in reports.items()}
     observed = sorted(
         (
             _Observed(agent_id, landmark, report.target_index(landmark.noun))
-            for agent_id, report in reports.items()
+            for agent_id, report in moved.items()
             for landmark in report.objects
         ),
-        key=lambda each: each.order,
+        key=lambda member: member.order,
     )
-    position = {id(member): i for i, member in enumerate(observed)}
-    clusters = [[member] for member in observed]
-    # pairs at the smallest distance are merged first; a cluster has at most one landmark of each agent
-    for _, i, j in _matching_pairs([member.landmark for member in observed]):
-        first, second = clusters[i], clusters[j]
-        if first is second or {member.agent_id for member in first} & {member.agent_id for member in second}:
-            continue
-        first += second
-        for member in second:
-            clusters[position[id(member)]] = first
-    merged = [_merge(cluster) for cluster in {id(cluster): cluster for cluster in clusters}.values()]
-    return tuple(sorted(merged, key=lambda each: (-each.landmark.confidence, each.landmark.object_id)))
+    agents = sorted(reports)
+    owner = [agents.index(member.agent_id) for member in observed]
+    pairs = _matching_pairs([member.landmark for member in observed], np.array(owner, np.int64))
+    merged = [_merge([observed[i] for i in sorted(cluster)]) for cluster in _clusters(pairs, owner)]
+    return tuple(sorted(merged, key=lambda member: (-member.landmark.confidence, member.landmark.object_id)))
 
 
 def team_object_id(agent_id: str, object_id: str) -> str:
@@ -78,52 +87,96 @@ def team_object_id(agent_id: str, object_id: str) -> str:
     return f"{agent_id}/{object_id}".encode()[:MAX_NAME_BYTES].decode(errors="ignore")
 
 
-def _matching_pairs(landmarks: Sequence[ObjectLandmark]) -> list[tuple[float, int, int]]:
-    """Return (distance of the centroids, i, j) of the landmarks that can be one object, the nearest first."""
-    groups: dict[str, list[int]] = {}
-    for i, landmark in enumerate(landmarks):
-        groups.setdefault(landmark.noun, []).append(i)
-    pairs: list[tuple[float, int, int]] = []
-    for group in groups.values():
-        centroids = np.array([landmarks[i].centroid_m for i in group])
-        low = np.array([landmarks[i].extent_m.min_m for i in group])
-        high = np.array([landmarks[i].extent_m.max_m for i in group])
-        diagonal, volume = np.linalg.norm(high - low, axis=1), np.prod(high - low, axis=1)
-        for k in range(1, len(group)):
-            distance = np.linalg.norm(centroids[:k] - centroids[k], axis=1)
-            reach = np.maximum(_MIN_MATCH_DISTANCE_M, _MATCH_DISTANCE_SHARE * np.minimum(diagonal[:k], diagonal[k]))
-            sides = np.maximum(np.minimum(high[:k], high[k]) - np.maximum(low[:k], low[k]), 0.0)
-            smaller = np.minimum(volume[:k], volume[k])
-            overlaps = (smaller > 0) & (np.prod(sides, axis=1) >= _MIN_OVERLAP * smaller)
-            pairs += [(float(distance[j]), group[k], group[j]) for j in np.flatnonzero((distance < reach) | overlaps)]
-    return sorted(pairs)
+def _clusters(pairs: Int64[ndarray, "p 2"], owner: Sequence[int]) -> list[list[int]]:
+    """Merge the pairs in their order; returns the members of each cluster, which has at most one of each owner."""
+    members = [[i] for i in range(len(owner))]
+    cluster_of = list(range(len(owner)))
+    # one bit for each owner: clusters with a common one never merge
+    owners = [1 << number for number in owner]
+    for i, j in pairs.tolist():
+        a, b = cluster_of[i], cluster_of[j]
+        if a == b or owners[a] & owners[b]:
+            continue
+        owners[a] |= owners[b]
+        for member in members[b]:
+            cluster_of[member] = a
+        members[a] += members[b]
+        members[b] = []
+    return [own for own in members if own]
+
+
+def _matching_pairs(landmarks: Sequence[ObjectLandmark], owner: Int64[ndarray, " n"]) -> Int64[ndarray, "p 2"]:
+    """Return the pairs (i, j < i) of landmarks of two owners that can be one object, the nearest centroids first."""
+    if not landmarks:
+        return np.zeros((0, 2), np.int64)
+    nouns = np.unique([landmark.noun for landmark in landmarks], return_inverse=True)[1].reshape(-1)
+    centroids = np.array([landmark.centroid_m for landmark in landmarks]).T
+    low = np.array([landmark.extent_m.min_m for landmark in landmarks]).T
+    high = np.array([landmark.extent_m.max_m for landmark in landmarks]).T
+    diagonal, volume = np.linalg.norm(high - low, axis=0), np.prod(high - low, axis=0)
+    # two landmarks can match only where these boxes meet: half the largest distance of a match around box and centroid
+    margin = 0.5 * np.maximum(_MIN_MATCH_DISTANCE_M, _MATCH_DISTANCE_SHARE * diagonal)
+    near_low, near_high = np.minimum(low, centroids) - margin, np.maximum(high, centroids) + margin
+    apart = nouns * _NOUN_DISTANCE_M
+    groups = group_boxes(np.vstack([near_low, apart]).T, np.vstack([near_high, apart]).T)
+
+    def match(i: Int64[ndarray, " k"], j: Int64[ndarray, " k"]) -> tuple[ndarray, ndarray]:
+        distance = np.linalg.norm(centroids[:, j] - centroids[:, i], axis=0)
+        reach = np.maximum(_MIN_MATCH_DISTANCE_M, _MATCH_DISTANCE_SHARE * np.minimum(diagonal[i], diagonal[j]))
+        sides = np.maximum(np.minimum(high[:, i], high[:, j]) - np.maximum(low[:, i], low[:, j]), 0.0)
+        smaller = np.minimum(volume[i], volume[j])
+        overlaps = (smaller > 0) & (np.prod(sides, axis=0) >= _MIN_OVERLAP * smaller)
+        return distance, (distance < reach) | overlaps
+
+    numbers, distances = [np.zeros(0, np.int64)], [np.zeros(0)]
+    for group in groups:
+        later, earlier = np.tril_indices(len(group), -1)
+        i, j = group[later], group[earlier]
+        possible = (nouns[i] == nouns[j]) & (owner[i] != owner[j])
+        i, j = i[possible], j[possible]
+        distance, matches = match(i, j)
+        numbers.append((i * len(landmarks) + j)[matches])
+        distances.append(distance[matches])
+    # a pair can be in several groups
+    number, first = np.unique(np.concatenate(numbers), return_index=True)
+    order = np.lexsort((number, np.concatenate(distances)[first]))
+    return np.stack(np.divmod(number[order], len(landmarks)), axis=1)
+
+
+def group_boxes(low: Float64[ndarray, "n d"], high: Float64[ndarray, "n d"]) -> list[Int64[ndarray, " g"]]:
+    """Return groups, ascending, so that two boxes that meet share one, by halving space until a group is small.
+
+    In a crowd that no cut divides, only the first boxes are grouped, so that the number of pairs is bounded.
+    """
+    groups: list[Int64[ndarray, " g"]] = []
+    waiting = [np.arange(len(low))]
+    pairs = 0
+    while waiting and pairs < MAX_COMPARISONS:
+        group = waiting.pop()
+        halves = _halves(low[group], high[group]) if len(group) > _GROUP else None
+        if halves is not None:
+            waiting += [group[half] for half in halves]
+            continue
+        groups.append(group[:_CROWD])
+        pairs += len(groups[-1]) ** 2 // 2
+    return groups
+
+
+def _halves(low: Float64[ndarray, "n d"], high: Float64[ndarray, "n d"]) -> tuple[ndarray, ndarray] | None:
+    """Return masks of the boxes on each side of a cut, those on it in both; None if no cut divides them."""
+    centres = (low + high) / 2
+    for axis in np.argsort(-np.ptp(centres, axis=0)).tolist():
+        cut = np.median(centres[:, axis])
+        below, above = low[:, axis] <= cut, high[:, axis] > cut
+        if below.sum() + above.sum() <= _CUT_SHARE * len(low) and not (below.all() or above.all()):
+            return below, above
+    return None
 
 
 def _merge(cluster: Sequence[_Observed]) -> TeamObject:
-    """Return one object: mean centroid weighted by confidence, common box, and the confidence that any agent is right.
-
-    The agents' detections are treated as independent.
-    """
-    members = sorted(cluster, key=lambda each: each.order)
-    landmarks = [member.landmark for member in members]
-    weights = [max(landmark.confidence, 1e-6) for landmark in landmarks]
-    x, y, z = (
-        sum(w * landmark.centroid_m[axis] for w, landmark in zip(weights, landmarks, strict=True)) / sum(weights)
-        for axis in range(3)
-    )
-    low_x, low_y, low_z = (min(landmark.extent_m.min_m[axis] for landmark in landmarks) for axis in range(3))
-    high_x, high_y, high_z = (max(landmark.extent_m.max_m[axis] for landmark in landmarks) for axis in range(3))
-    is_target = any(landmark.role is ObjectRole.TARGET for landmark in landmarks)
-    merged = ObjectLandmark(
-        object_id=team_object_id(members[0].agent_id, landmarks[0].object_id),
-        noun=landmarks[0].noun,
-        role=ObjectRole.TARGET if is_target else ObjectRole.ANCHOR,
-        centroid_m=(x, y, z),
-        extent_m=AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z)),
-        confidence=1.0 - math.prod(1.0 - landmark.confidence for landmark in landmarks),
-        first_seen_ns=min(landmark.first_seen_ns for landmark in landmarks),
-        last_seen_ns=max(landmark.last_seen_ns for landmark in landmarks),
-    )
+    """Return one object of the members, the earliest first."""
+    landmarks = [member.landmark for member in cluster]
+    object_id = team_object_id(cluster[0].agent_id, landmarks[0].object_id)
     observers = tuple(
         ObjectObserver(
             member.agent_id,
@@ -133,9 +186,34 @@ def _merge(cluster: Sequence[_Observed]) -> TeamObject:
             member.landmark.first_seen_ns,
             member.landmark.last_seen_ns,
         )
-        for member in sorted(members, key=lambda each: each.agent_id)
+        for member in sorted(cluster, key=lambda member: member.agent_id)
     )
-    return TeamObject(merged, observers)
+    merged = landmarks[0] if len(landmarks) == 1 else _merge_landmarks(landmarks)
+    return TeamObject(replace(merged, object_id=object_id), observers)
+
+
+def _merge_landmarks(landmarks: Sequence[ObjectLandmark]) -> ObjectLandmark:
+    """Return one landmark: mean centroid weighted by confidence, common box, the confidence that any agent is right.
+
+    The agents' detections are treated as independent. The id is that of the first landmark.
+    """
+    weights = [max(landmark.confidence, 1e-6) for landmark in landmarks]
+    x, y, z = (
+        sum(w * landmark.centroid_m[axis] for w, landmark in zip(weights, landmarks, strict=True)) / sum(weights)
+        for axis in range(3)
+    )
+    low_x, low_y, low_z = (min(landmark.extent_m.min_m[axis] for landmark in landmarks) for axis in range(3))
+    high_x, high_y, high_z = (max(landmark.extent_m.max_m[axis] for landmark in landmarks) for axis in range(3))
+    is_target = any(landmark.role is ObjectRole.TARGET for landmark in landmarks)
+    return replace(
+        landmarks[0],
+        role=ObjectRole.TARGET if is_target else ObjectRole.ANCHOR,
+        centroid_m=(x, y, z),
+        extent_m=AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z)),
+        confidence=1.0 - math.prod(1.0 - landmark.confidence for landmark in landmarks),
+        first_seen_ns=min(landmark.first_seen_ns for landmark in landmarks),
+        last_seen_ns=max(landmark.last_seen_ns for landmark in landmarks),
+    )
 
 
 RECORD = "objects"
@@ -175,25 +253,46 @@ class TeamObjects:
         return dict(self._reports)
 
 
-def find_objects(
-    reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]], noun: str = ""
-) -> tuple[TeamObject, ...]:
-    """Merge the reports; return the objects that the noun names, or all, the most confident first.
+class MergedObjects:
+    """Keeps the merged objects until a report or a frame changes. Thread-safe."""
 
-    frames: T_fused_agent of the agents whose landmarks are moved to the fused map's frame; absent: not moved.
-    A landmark that this moves out of range is left out. Raises InvalidInputError if the noun is not printable.
-    """
+    def __init__(self) -> None:
+        # held while reports are merged, so that many queries at once merge once
+        self._lock = Lock()
+        self._reports: dict[str, ObjectReport] = {}
+        self._frames: dict[str, Float64[ndarray, "4 4"]] = {}
+        self._merged: tuple[TeamObject, ...] = ()
+
+    def of(
+        self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]]
+    ) -> tuple[TeamObject, ...]:
+        """Return `merge_objects` of these reports and frames."""
+        with self._lock:
+            if not self._is_of(reports, frames):
+                self._merged = merge_objects(reports, frames)
+                self._reports, self._frames = reports, frames
+            return self._merged
+
+    def _is_of(self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]]) -> bool:
+        # a report is never changed, so the same object has the same content
+        return (
+            reports.keys() == self._reports.keys()
+            and all(report is self._reports[agent_id] for agent_id, report in reports.items())
+            and frames.keys() == self._frames.keys()
+            and all(np.array_equal(frame, self._frames[agent_id]) for agent_id, frame in frames.items())
+        )
+
+
+def find_objects(objects: Sequence[TeamObject], noun: str = "") -> tuple[TeamObject, ...]:
+    """Return the objects that the noun names, or all. Raises InvalidInputError if the noun is not printable."""
     require_name("noun", noun)
-    if noun and not noun.strip():
+    if not noun:
+        return tuple(objects)
+    phrase = noun.strip().lower()
+    if not phrase:
         raise InvalidInputError(f"noun: expected a noun phrase such as 'mug', got {quote_name(noun)}")
-    moved = {
-        agent_id: report if agent_id not in frames else _moved(report, frames[agent_id])
-        for agent_id, report in reports.items()
-    }
-    objects = merge_objects(moved)
-    return tuple(
-        team_object for team_object in objects if not noun or same_kind(noun.strip().lower(), team_object.landmark.noun)
-    )
+    is_meant = {name: same_kind(phrase, name) for name in {found.landmark.noun for found in objects}}
+    return tuple(found for found in objects if is_meant[found.landmark.noun])
 
 
 def _moved(report: ObjectReport, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectReport:

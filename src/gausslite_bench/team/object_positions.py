@@ -17,7 +17,7 @@ from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
-from gausslite.fusion.objects import find_objects
+from gausslite.fusion.objects import find_objects, merge_objects
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.settings import PerceptionSettings
 from gausslite.task.rules import RuleParser
@@ -108,7 +108,7 @@ def _target_objects(reports: dict[str, ObjectReport], graph: TaskGraph) -> list[
     objects = {
         found.landmark.object_id: found
         for target in graph.targets
-        for found in find_objects(reports, {}, noun_of(target))
+        for found in find_objects(merge_objects(reports), noun_of(target))
     }
     return list(objects.values())
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gausslite.codec.json import decode_object_report, encode_object_report
 from gausslite.domain.errors import CodecError, InvalidInputError
@@ -16,7 +19,7 @@ from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.objects import find_objects, merge_objects
+from gausslite.fusion.objects import MAX_COMPARISONS, MergedObjects, find_objects, group_boxes, merge_objects
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import MissionConfig
 
@@ -43,7 +46,7 @@ def test_two_observations_of_one_object_are_merged_with_both_observers() -> None
         "ant": report(landmark("mug", (1, 0, 0))),
         "bee": report(near, landmark("table", (1, 0.5, 0), half_m=0.4)),
     }
-    mug, table = sorted(merge_objects(reports), key=lambda each: each.landmark.noun)
+    mug, table = sorted(merge_objects(reports), key=lambda found: found.landmark.noun)
     assert mug.landmark.object_id == "ant/mug-1"
     assert mug.landmark.confidence == pytest.approx(1 - 0.5 * 0.2)
     assert mug.landmark.centroid_m[0] == pytest.approx((0.5 * 1 + 0.8 * 1.06) / 1.3)
@@ -71,6 +74,78 @@ def test_each_object_merges_with_the_nearest_one() -> None:
     assert merged == {"ant/mug-1": 1, "bee/mug-1": 2} or merged == {"ant/mug-1": 1, "ant/mug-2": 2}
 
 
+def merge_all_pairs(reports: dict[str, ObjectReport]) -> set[frozenset[tuple[str, str]]]:
+    """Return the observers of each object by the definition: all pairs that match, the nearest first."""
+    landmarks = sorted(
+        ((owner, mark) for owner, own in reports.items() for mark in own.objects),
+        key=lambda member: (member[1].first_seen_ns, member[0], member[1].object_id),
+    )
+    pairs = []
+    for (i, (owner, first)), (j, (other, second)) in itertools.combinations(enumerate(landmarks), 2):
+        boxes = [(np.array(mark.extent_m.min_m), np.array(mark.extent_m.max_m)) for mark in (first, second)]
+        (low, high), (low2, high2) = boxes
+        distance = float(np.linalg.norm(np.array(first.centroid_m) - np.array(second.centroid_m)))
+        diagonal = min(float(np.linalg.norm(box[1] - box[0])) for box in boxes)
+        shared = np.prod(np.maximum(np.minimum(high, high2) - np.maximum(low, low2), 0.0))
+        smaller = min(float(np.prod(box[1] - box[0])) for box in boxes)
+        overlaps = smaller > 0 and shared >= 0.3 * smaller
+        if owner != other and first.noun == second.noun and (distance < max(0.15, 0.5 * diagonal) or overlaps):
+            pairs.append((distance, j, i))
+    clusters = [{(owner, mark.object_id)} for owner, mark in landmarks]
+    for _, i, j in sorted(pairs):
+        a, b = (
+            next(cluster for cluster in clusters if (landmarks[k][0], landmarks[k][1].object_id) in cluster)
+            for k in (i, j)
+        )
+        if a is not b and not {owner for owner, _ in a} & {owner for owner, _ in b}:
+            clusters.remove(b)
+            a |= b
+    return {frozenset(cluster) for cluster in clusters}
+
+
+@pytest.mark.parametrize("largest_group", [4, 64])
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1), side_m=st.sampled_from([0.3, 1.0, 5.0]), largest_m=st.sampled_from([0.1, 0.5, 3.0])
+)
+def test_landmarks_are_merged_as_if_all_pairs_were_compared(
+    largest_group: int, seed: int, side_m: float, largest_m: float
+) -> None:
+    rng = np.random.default_rng(seed)
+
+    def random_landmark(number: int) -> ObjectLandmark:
+        centre = tuple(rng.uniform(0, side_m, 3).round(2).tolist())
+        return landmark(str(rng.choice(["mug", "cup"])), centre, number, float(rng.uniform(0, largest_m)))
+
+    reports = {name: report(*map(random_landmark, range(6))) for name in "abcd"}
+    with patch("gausslite.fusion.objects._GROUP", largest_group):
+        merged = merge_objects(reports)
+    observers = {frozenset((seen.agent_id, seen.object_id) for seen in found.observers) for found in merged}
+    assert observers == merge_all_pairs(reports)
+
+
+@pytest.mark.parametrize("spread_m", [0.0, 1.0, 50.0])
+def test_the_number_of_comparisons_is_bounded_however_many_landmarks_there_are(spread_m: float) -> None:
+    rng = np.random.default_rng(1)
+    low = rng.uniform(0, spread_m, (60 * 200, 3))
+    high = low + np.where(np.arange(len(low)) % 2, 100.0, 0.1)[:, None]
+    groups = group_boxes(low, high)
+    assert sum(len(group) ** 2 // 2 for group in groups) <= 2 * MAX_COMPARISONS
+    assert max(len(group) for group in groups) <= 1024
+
+
+def test_objects_are_merged_once_until_a_report_or_a_frame_changes() -> None:
+    reports, merged = {"ant": report(landmark("mug", (1, 0, 0)))}, MergedObjects()
+    with patch("gausslite.fusion.objects.merge_objects", wraps=merge_objects) as merging:
+        first = merged.of(reports, {})
+        assert merged.of(dict(reports), {}) is first
+        merged.of(reports, {"ant": np.eye(4)})
+        merged.of(reports, {"ant": np.eye(4)})
+        [mug] = merged.of(reports | {"ant": report(landmark("mug", (2, 0, 0)))}, {})
+    assert mug.landmark.centroid_m == (2, 0, 0)
+    assert merging.call_count == 3
+
+
 def test_the_result_does_not_depend_on_the_order_of_the_agents() -> None:
     rng = np.random.default_rng(3)
     reports = {
@@ -83,26 +158,26 @@ def test_the_result_does_not_depend_on_the_order_of_the_agents() -> None:
 
 def test_a_query_finds_synonyms_and_plurals_and_moves_landmarks_to_the_fused_frame() -> None:
     reports = {"ant": report(landmark("mug", (1, 0, 0)), landmark("table", (0, 0, 0)))}
-    assert [each.landmark.noun for each in find_objects(reports, {}, "mug")] == ["mug"]
-    assert [each.landmark.noun for each in find_objects(reports, {}, " Cup ")] == ["mug"]
-    assert find_objects(reports, {}, "bicycle") == ()
-    assert len(find_objects(reports, {})) == 2
+    assert [each.landmark.noun for each in find_objects(merge_objects(reports), "mug")] == ["mug"]
+    assert [each.landmark.noun for each in find_objects(merge_objects(reports), " Cup ")] == ["mug"]
+    assert find_objects(merge_objects(reports), "bicycle") == ()
+    assert len(find_objects(merge_objects(reports))) == 2
     T = np.eye(4)
     T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     T[:3, 3] = (0, 0, 2)
-    [moved] = find_objects(reports, {"ant": T}, "mug")
+    [moved] = find_objects(merge_objects(reports, {"ant": T}), "mug")
     assert moved.landmark.centroid_m == pytest.approx((0, 1, 2))
     assert moved.landmark.extent_m.min_m == pytest.approx((-0.05, 0.95, 1.95))
     for noun in ("\n", "x" * 1000, "  "):
         with pytest.raises(InvalidInputError, match="noun"):
-            find_objects(reports, {}, noun)
+            find_objects(merge_objects(reports), noun)
 
 
 def test_a_landmark_that_moves_out_of_range_is_left_out_and_others_are_found() -> None:
     reports = {"ant": report(landmark("mug", (999_999, 0, 0)), landmark("table", (0, 0, 0)))}
     T = np.eye(4)
     T[0, 3] = 9000.0
-    [table] = find_objects(reports, {"ant": T})
+    [table] = merge_objects(reports, {"ant": T})
     assert table.landmark.centroid_m == (9000.0, 0.0, 0.0)
 
 
