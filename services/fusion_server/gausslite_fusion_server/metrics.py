@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.traffic import AgentContribution, MissionStatus
+from gausslite.fusion.traffic import ACKNOWLEDGEMENT_BOUNDS_S, AgentContribution, MissionStatus
 from gausslite.wire.channel import host_and_port
 
 _log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ class MissionCollector:
 
     def collect(self) -> Iterator[Any]:
         """Yield the metrics of the mission and of each agent, with the ids as the labels `mission` and `agent`."""
-        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
         status, is_writable = self._engine.status(), self._engine.storage.is_writable
         mission_id = status.mission_config.mission_id
@@ -68,6 +69,13 @@ class MissionCollector:
             of_mission = GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, labels=["mission"])
             of_mission.add_metric([mission_id], value(status, is_writable))
             yield of_mission
+        counts, total_s = self._engine.acknowledgements.histogram()
+        bounds = [*map(str, ACKNOWLEDGEMENT_BOUNDS_S), "+Inf"]
+        acknowledgement = HistogramMetricFamily(
+            "gausslite_fusion_acknowledgement_seconds", "time from a message to its answer", labels=["mission"]
+        )
+        acknowledgement.add_metric([mission_id], list(zip(bounds, accumulate(counts), strict=True)), total_s)
+        yield acknowledgement
         for metric in _OF_AGENTS:
             kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
             family = kind(f"gausslite_agent_{metric.name}", metric.help_text, labels=["mission", "agent"])

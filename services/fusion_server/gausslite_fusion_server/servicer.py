@@ -151,6 +151,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             pb.DESCRIPTOR.services_by_name["FusionService"].full_name,
             functools.partial(pb_grpc.add_FusionServiceServicer_to_server, self),
             self._engine.storage.check,
+            self._engine.acknowledgements.check,
         )
 
     def drain(self) -> None:

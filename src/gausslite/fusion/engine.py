@@ -33,7 +33,13 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.mission_data import MissionData
 from gausslite.fusion.objects import MergedObjects, find_objects
 from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome, SessionRecord, require_storable
-from gausslite.fusion.traffic import AgentContribution, MissionStatus, StorageProbe, TrafficCounters
+from gausslite.fusion.traffic import (
+    Acknowledgements,
+    AgentContribution,
+    MissionStatus,
+    StorageProbe,
+    TrafficCounters,
+)
 from gausslite.fusion.updates import PendingUpdate, UpdateCommitter, require_within_quotas
 
 
@@ -101,6 +107,7 @@ class FusionEngine:
         self._store = store
         self._settings = settings
         self._storage = StorageProbe(store)
+        self._acknowledgements = Acknowledgements()
         self._merged_objects = MergedObjects()
         if first_revision is None:
             first_revision = time.time_ns() // 1000
@@ -138,6 +145,11 @@ class FusionEngine:
     def storage(self) -> StorageProbe:
         """The check whether the store can write."""
         return self._storage
+
+    @property
+    def acknowledgements(self) -> Acknowledgements:
+        """The times until the messages are answered."""
+        return self._acknowledgements
 
     def stored_digests(self, session_id: str) -> TileDigests:
         """Return the digests of the stored updates of the session's agent. Raises SessionUnknownError."""
@@ -202,7 +214,9 @@ class FusionEngine:
 
         The message is decoded when it is its agent's turn. Raises UnavailableError.
         """
-        return self._committer.add(PendingUpdate(session.session_id, session.agent_id, message))
+        put = self._committer.add(PendingUpdate(session.session_id, session.agent_id, message))
+        self._acknowledgements.add(put)
+        return put
 
     def commit_updates(self) -> None:
         """Commit the queued updates. Call it after each `enqueue_update`."""

@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+from bisect import bisect_left
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
+from threading import Lock
 
-from gausslite.domain.errors import CodecError, StorageError
+from gausslite.domain.errors import CodecError, StorageError, UnavailableError
 from gausslite.fusion.frames import FrameAlignment
-from gausslite.fusion.store import FusionStore, MissionConfig
+from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome
 
 _PROBE_BYTES = 256 << 10
 # no agent can have an empty id
@@ -39,6 +42,50 @@ class StorageProbe:
             self._is_writable = False
             raise
         self._is_writable = True
+
+
+ACKNOWLEDGEMENT_BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+_LONGEST_WAIT_S = 5.0
+
+
+class Acknowledgements:
+    """The times from the arrival of a message to its answer. Thread-safe. clock_s: the time in seconds."""
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._lock = Lock()
+        # the oldest first
+        self._arrived_s: dict[Future[PutOutcome], float] = {}
+        self._counts = [0] * (len(ACKNOWLEDGEMENT_BOUNDS_S) + 1)
+        self._total_s = 0.0
+
+    def add(self, put: Future[PutOutcome]) -> None:
+        """Note a message that has arrived; its future ends with the answer."""
+        with self._lock:
+            self._arrived_s[put] = self._clock_s()
+        put.add_done_callback(self._end)
+
+    def check(self) -> None:
+        """Raise UnavailableError while a message waits for its answer for more than 5 s."""
+        with self._lock:
+            waiting = len(self._arrived_s)
+            longest_s = self._clock_s() - next(iter(self._arrived_s.values())) if waiting else 0.0
+        if longest_s > _LONGEST_WAIT_S:
+            raise UnavailableError(
+                f"{waiting} messages wait for their acknowledgement, the oldest for {longest_s:.0f} s; expected at "
+                f"most {_LONGEST_WAIT_S:g} s"
+            )
+
+    def histogram(self) -> tuple[tuple[int, ...], float]:
+        """Return the number of answers up to each of ACKNOWLEDGEMENT_BOUNDS_S and beyond, and the sum of the times."""
+        with self._lock:
+            return tuple(self._counts), self._total_s
+
+    def _end(self, put: Future[PutOutcome]) -> None:
+        with self._lock:
+            taken_s = self._clock_s() - self._arrived_s.pop(put)
+            self._counts[bisect_left(ACKNOWLEDGEMENT_BOUNDS_S, taken_s)] += 1
+            self._total_s += taken_s
 
 
 _SAVE_INTERVAL_S = 10.0

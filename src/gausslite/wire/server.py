@@ -41,18 +41,27 @@ from gausslite.wire.status import code_and_reason, to_status
 _log = logging.getLogger(__name__)
 _CHECK_S = 30.0
 _RETRY_S = 1.0
+_CHECK_LIMIT_S = 5.0
+"""A check that takes longer has failed: it waits for the same disk as the calls."""
 LIVENESS = "liveness"
 """A name that health checks answer with SERVING while the process runs, so that a full disk restarts no container."""
 Check = Callable[[], None]
-"""Raises GaussLiteError while the service cannot work. It may block; it runs in a thread."""
+"""Raises GaussLiteError while the service cannot work."""
 
 
 class ReadinessWatch:
-    """Calls a service's check every 30 s, after `wake`, and every second while it fails. Use it on the event loop."""
+    """Calls a service's check every 30 s, after `wake`, and every second while it fails. Use it on the event loop.
 
-    def __init__(self, service: str, check: Check, set_serving: Callable[[bool], Awaitable[None]]) -> None:
-        self._service, self._check, self._set_serving = service, check, set_serving
+    check: may block; it runs in a thread. check_progress: must not block; it is called every second.
+    """
+
+    def __init__(
+        self, service: str, check: Check, check_progress: Check, set_serving: Callable[[bool], Awaitable[None]]
+    ) -> None:
+        self._service, self._check, self._check_progress = service, check, check_progress
+        self._set_serving = set_serving
         self._woken = asyncio.Event()
+        self._checking: asyncio.Future[None] | None = None
         self._failing_since_s: float | None = None
 
     def wake(self) -> None:
@@ -61,20 +70,34 @@ class ReadinessWatch:
 
     async def run(self) -> None:
         """Check until the task is cancelled."""
+        next_check_s = time.monotonic() + _CHECK_S
         while True:
-            interval_s = _CHECK_S if self._failing_since_s is None else _RETRY_S
             if self._failing_since_s is not None:
                 # calls that fail meanwhile must not shorten the interval
-                await asyncio.sleep(interval_s)
+                await asyncio.sleep(_RETRY_S)
             else:
-                await _wait_at_most(self._woken, interval_s)
+                await _wait_at_most(self._woken, _RETRY_S)
+            is_due = self._woken.is_set() or self._failing_since_s is not None or time.monotonic() >= next_check_s
             self._woken.clear()
             try:
-                await asyncio.to_thread(self._check)
+                self._check_progress()
+                if is_due:
+                    await self._check_in_time()
+                    next_check_s = time.monotonic() + _CHECK_S
             except GaussLiteError as error:
                 await self._record_failure(error)
             else:
                 await self._record_success()
+
+    async def _check_in_time(self) -> None:
+        """Wait for the running check, or for a new one. Raises UnavailableError if it takes too long."""
+        if self._checking is None:
+            self._checking = asyncio.ensure_future(asyncio.to_thread(self._check))
+        done, _ = await asyncio.wait([self._checking], timeout=_CHECK_LIMIT_S)
+        if not done:
+            raise UnavailableError(f"the check has not ended within {_CHECK_LIMIT_S:g} s")
+        checked, self._checking = self._checking, None
+        checked.result()
 
     async def _record_failure(self, error: GaussLiteError) -> None:
         if self._failing_since_s is None:
@@ -111,11 +134,12 @@ _OPTIONS = (
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A servicer's full name, a function that adds it to a server, and a check whether it can work."""
+    """A servicer's full name, a function that adds it to a server, and its checks, see ReadinessWatch."""
 
     name: str
     register: Callable[[grpc.aio.Server], None]
     check: Check | None = None
+    check_progress: Check = lambda: None
 
 
 class RunningServer:
@@ -158,7 +182,12 @@ async def start_server(
     limits = limits or CallLimits()
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     watches = [
-        ReadinessWatch(service.name, service.check, functools.partial(_set_health, health_servicer, service.name))
+        ReadinessWatch(
+            service.name,
+            service.check,
+            service.check_progress,
+            functools.partial(_set_health, health_servicer, service.name),
+        )
         for service in services
         if service.check is not None
     ]

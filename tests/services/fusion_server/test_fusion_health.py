@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 import resource
 import subprocess
+import threading
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,9 +17,14 @@ import pytest
 from fusion_running import COMMAND, GRID, fusion_server, make_subset, request
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from gausslite.domain.errors import StorageError
+from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.domain.errors import StorageError, UnavailableError
+from gausslite.fusion import traffic
+from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.traffic import StorageProbe
+from gausslite.fusion.store import PutOutcome
+from gausslite.fusion.traffic import Acknowledgements, StorageProbe
+from gausslite.wire import server
 from gausslite.wire.clients import FusionClient
 
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
@@ -111,3 +118,61 @@ def test_a_check_leaves_nothing_in_the_store(tmp_path: Path) -> None:
     assert store.agents() == ()
     assert (tmp_path / "store.sqlite").stat().st_size < 1 << 20
     store.close()
+
+
+class StandingStore(MemoryStore):
+    """A store whose disk takes no write until it is `running`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.running = threading.Event()
+        self.running.set()
+
+    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
+        assert self.running.wait(WAIT_S)
+        return super().put_all(updates)
+
+    def save_record(self, agent_id: str, name: str, data: bytes) -> None:
+        assert self.running.wait(WAIT_S)
+        super().save_record(agent_id, name, data)
+
+
+@pytest.mark.parametrize("limit", [(traffic, "_LONGEST_WAIT_S"), (server, "_CHECK_LIMIT_S")])
+def test_health_follows_the_acknowledgements_and_a_check_that_does_not_end(
+    limit: tuple[object, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = StandingStore()
+    monkeypatch.setattr(*limit, 0.2)
+    if limit[0] is server:
+        monkeypatch.setattr(server, "_CHECK_S", 0.0)
+    with fusion_server(store) as t:
+        session = t.client.join("ant", GRID).session_id
+        health = watch_health(t.channel)
+        assert next(health) == SERVING
+        store.running.clear()
+        sender = threading.Thread(target=t.send, args=[request(session, make_subset("ant", 1, {0: [1]}))])
+        sender.start()
+        try:
+            assert next(health) == NOT_SERVING
+        finally:
+            store.running.set()
+        sender.join()
+        assert next(health) == SERVING
+
+
+def test_acknowledgements_are_late_after_five_seconds_and_counted_by_their_time() -> None:
+    now_s = 0.0
+    times = Acknowledgements(lambda: now_s)
+    first, second = Future[PutOutcome](), Future[PutOutcome]()
+    times.add(first)
+    now_s = 4.0
+    times.add(second)
+    times.check()
+    now_s = 5.5
+    with pytest.raises(UnavailableError, match="2 messages wait for their acknowledgement, the oldest for 6 s"):
+        times.check()
+    first.set_exception(StorageError("full"))
+    times.check()
+    second.cancel()
+    counts, total_s = times.histogram()
+    assert (counts[8], counts[10], sum(counts), total_s) == (1, 1, 2, 7.0)

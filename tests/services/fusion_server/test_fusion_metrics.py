@@ -56,6 +56,7 @@ def test_prometheus_reads_the_mission_and_each_agent(engine: FusionEngine) -> No
         assert values["gausslite_agent_joined", "ant"] == 1
         assert values["gausslite_agent_roi_bytes_total", "bee"] == 5000
         assert values["gausslite_agent_subsets_rejected_total", "bee"] == 7
+        assert values["gausslite_fusion_acknowledgement_seconds_count", ""] == 2
         assert values["process_resident_memory_bytes", ""] > 1e6
         engine.evict("bee", ban=True)
         values = read(port)
