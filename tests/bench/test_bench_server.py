@@ -21,7 +21,7 @@ def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.
 
 
 def test_the_stages_of_a_message_are_measured_and_few_bytes_are_written(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "server", "--stages", "--json"]) == 0
+    assert main(["bench", "server", "--stages", "--seconds", "1", "--json"]) == 0
     results = json.loads(capsys.readouterr().out)
     assert len(results) == 4
     assert all(min(result["decode_ms"], result["store_ms"]) > 0 for result in results.values())

@@ -10,7 +10,7 @@ from dataclasses import asdict
 
 from gausslite.cli.progress import progress_bar
 from gausslite.domain.errors import InvalidInputError
-from gausslite_bench.server.agent_load import LoadResult
+from gausslite_bench.server.agent_load import RATE_HZ, LoadResult
 from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
 from gausslite_bench.server.server_process import DEFAULT_COMMAND
 from gausslite_bench.server.stages import measure_stages
@@ -41,10 +41,10 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
 
 def run_server(options: argparse.Namespace) -> int:
     """Measure a server for each number of Gaussians held."""
-    if options.stages:
-        return _run_stages(options.json)
     if not options.seconds > 0:
         raise InvalidInputError(f"--seconds: expected more than 0, got {options.seconds:g}")
+    if options.stages:
+        return _run_stages(max(int(options.seconds * RATE_HZ), 1), options.json)
     settings = ServerBenchSettings(
         held=_numbers("--held", options.held, 0),
         agents=_numbers("--agents", options.agents, 1),
@@ -66,9 +66,9 @@ def run_server(options: argparse.Namespace) -> int:
     return 0
 
 
-def _run_stages(is_json: bool) -> int:
+def _run_stages(count: int, is_json: bool) -> int:
     results = {
-        f"{name} voxels, groups of {group}": measure_stages(group, name == "scattered")
+        f"{name} voxels, groups of {group}": measure_stages(group, name == "scattered", count)
         for name in ("near", "scattered")
         for group in (1, 8)
     }

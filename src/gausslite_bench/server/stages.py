@@ -20,7 +20,7 @@ from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import MissionConfig, PutOutcome
 from gausslite_bench.server.synthetic_updates import DELTA_VOXELS, GRID, delta_messages, voxels_batch
 
-_AGENTS, _MESSAGES = 16, 24
+_AGENTS = 8
 _SCATTERED_CELLS = 20_000
 
 
@@ -49,12 +49,12 @@ class _TimedStore(SqliteStore):
             self.cpu_s += time.process_time() - begin_s
 
 
-def measure_stages(group: int, scattered: bool) -> StageResult:
-    """Commit messages of 16 agents in groups; scattered: a message's voxels are anywhere in a large room."""
+def measure_stages(group: int, scattered: bool, count: int) -> StageResult:
+    """Commit `count` messages of each of 8 agents in groups; scattered: their voxels are anywhere in a large room."""
     names = [f"load-{number}" for number in range(_AGENTS)]
     make = _scattered_messages if scattered else _near_messages
-    messages = [make(name, number) for number, name in enumerate(names)]
-    in_order = [(agent, messages[agent][index]) for index in range(_MESSAGES) for agent in range(_AGENTS)]
+    messages = [make(name, number, count) for number, name in enumerate(names)]
+    in_order = [(agent, messages[agent][index]) for index in range(count) for agent in range(_AGENTS)]
     decode_s = -time.process_time()
     for _, message in in_order:
         decode_stored(message)
@@ -70,25 +70,25 @@ def measure_stages(group: int, scattered: bool) -> StageResult:
                 put.result()
         total_s = time.process_time() - begin_s
         written = _written_bytes() - begin_bytes
-    count = len(in_order)
+    total = len(in_order)
     return StageResult(
         group=group,
         message_bytes=len(in_order[0][1]),
-        decode_ms=1000 * decode_s / count,
-        store_ms=1000 * store.cpu_s / count,
-        other_ms=1000 * (total_s - decode_s - store.cpu_s) / count,
-        written_bytes=written // count,
+        decode_ms=1000 * decode_s / total,
+        store_ms=1000 * store.cpu_s / total,
+        other_ms=1000 * (total_s - decode_s - store.cpu_s) / total,
+        written_bytes=written // total,
     )
 
 
-def _near_messages(agent_id: str, number: int) -> list[bytes]:
-    return delta_messages(agent_id, number, _MESSAGES, 1)
+def _near_messages(agent_id: str, number: int, count: int) -> list[bytes]:
+    return delta_messages(agent_id, number, count, 1)
 
 
-def _scattered_messages(agent_id: str, number: int) -> list[bytes]:
+def _scattered_messages(agent_id: str, number: int, count: int) -> list[bytes]:
     rng = np.random.default_rng(number)
     return [
-        encode_subset(RoiSubset(agent_id, "", seq, seq, _scattered_batch(rng)), GRID) for seq in range(1, _MESSAGES + 1)
+        encode_subset(RoiSubset(agent_id, "", seq, seq, _scattered_batch(rng)), GRID) for seq in range(1, count + 1)
     ]
 
 
