@@ -73,12 +73,12 @@ def test_positions_of_objects_are_compared_with_ground_truth(
 
 
 def test_frames_of_pairs_are_judged_without_a_false_alarm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    size = ("--size", "80x60", "--frames", "12", "--views", "1", "--max-gaussians", "6000", "--iterations", "2")
-    arguments = ("bench", "team", "--frame-pairs", "60", "--homes", "1,4", "--policies", "uniform", "--threads", "1")
+    size = ("--size", "160x120", "--frames", "16", "--views", "1", "--max-gaussians", "15000", "--iterations", "2")
+    arguments = ("bench", "team", "--frame-pairs", "80", "--homes", "1", "--policies", "uniform", "--threads", "1")
     assert main([*arguments, *size, "--json", "--out", str(tmp_path)]) == 0
     pairs = json.loads(capsys.readouterr().out)["scenes"]
     outcomes = {error: [pair["outcome"] for pair in pairs if pair["error"] == error] for error in ("none", "gross")}
-    assert len(outcomes["none"]) == 30
+    assert len(outcomes["none"]) == 40
     assert set(outcomes["none"]) <= {"fits", "not compared"}
     assert outcomes["none"].count("fits") >= 10
     compared = [outcome for outcome in outcomes["gross"] if outcome != "not compared"]
