@@ -238,6 +238,9 @@ def _decode(data: bytes) -> FrameAlignment:
     """Decode a stored alignment. Raises CodecError."""
     try:
         value = json.loads(data)
+        if "against" not in value:
+            # of an earlier version: what it estimated is estimated again
+            return FrameAlignment(int(value["order"]), declared=_matrix(value["declared"]))
         stored = value["fit"]
         fit = None
         if stored is not None:
