@@ -67,7 +67,7 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "loop", "server")
         (("team", "--views", "0"), "views"),
         (("team", "--frames", "1000000"), "frames"),
         (("team", "--refine-iterations", "-1"), "refine-iterations"),
-        (("team", "--late-joiner", "--positions"), "got both"),
+        (("team", "--late-joiner", "--positions"), "got several"),
         (("team", "--detector", "yolo.onnx"), "--positions"),
         (("team", "--kinds", "mug"), "--real"),
     ],

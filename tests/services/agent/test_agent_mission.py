@@ -213,7 +213,7 @@ def test_errors_of_task_source_and_disk_are_raised(tmp_path: Path) -> None:
             "test-every: expected at least 2",
         ),
         (["--set", "threads=0"], "threads"),
-        (["--task", "Pick up the mug"], "name an ONNX file with --detector"),
+        (["--task", "Pick up the mug"], "expected --detector FILE.onnx"),
         (["--max-gaussians", "0"], "--max-gaussians: expected at least 1"),
         (["--agent-id", ""], "--agent-id"),
         (["--agent-id", "husky-\udcff"], "--agent-id: expected 1 to 64 letters, digits"),
