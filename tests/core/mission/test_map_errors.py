@@ -21,7 +21,7 @@ WITHOUT_ESTIMATES = ("--set", "register-depth=none", "--set", "pose-prior=none")
     ("options", "message"),
     [
         (("--set", "world-frame=a\nb"), "world-frame: expected no line breaks"),
-        (("--task", "Find the mug"), "name an ONNX file with --detector"),
+        (("--task", "Find the mug"), "expected --detector FILE.onnx"),
         (("--policy", "task"), "--policy task: expected a task"),
         (
             ("--task", "Find the mug", "--set", "task-at=4:Find the chair", "--set", "task-at=4:Find the table"),
