@@ -178,7 +178,8 @@ class FusionEngine:
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
         with self._committer.committing, self._lock:
-            self._mission.members.admit(agent_id, requested, token)
+            for ended in self._mission.members.admit(agent_id, requested, token):
+                self._mission.agents.remove(ended)
             session = self._mission.members.open_session(agent_id, token)
             if fresh_map:
                 self._mission.agents.begin_new_map(agent_id)

@@ -22,7 +22,7 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord, reconcile
 
 RECORD = "ban"
-_BANNED, _ALLOWED = b"banned", b""
+_BANNED = b"banned"
 
 
 class BanList:
@@ -52,7 +52,8 @@ class BanList:
         if agent_id not in self._agents:
             expected = ", ".join(self.agents[:8]) or "none is banned"
             raise InvalidInputError(f"agent_id: expected a banned agent ({expected}), got {quote_name(agent_id)}")
-        self._store.save_record(agent_id, RECORD, _ALLOWED)
+        # it has nothing else
+        self._store.remove_agent(agent_id)
         self._agents.remove(agent_id)
 
 
@@ -71,7 +72,7 @@ class SessionRegistry:
     def __init__(self, store: FusionStore, lease_s: float, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._store, self._lease_s, self._clock_s = store, lease_s, clock_s
         self._sessions = {session.session_id: session for session in store.sessions()}
-        # after a restart of the server, each robot has a whole lease to come back
+        # in the order of the agents' first sessions; after a restart, each robot has a whole lease to come back
         self._lease_ends_s = {session.agent_id: clock_s() + lease_s for session in self._sessions.values()}
         self._token_hashes = store.records(TOKEN_RECORD)
         # replaced sessions, and whether the same token replaced them
@@ -142,11 +143,20 @@ class SessionRegistry:
             del self._sessions[session_id]
         self._lease_ends_s.pop(agent_id, None)
 
-    def end_expired(self, kept: Collection[str]) -> None:
-        """End the sessions whose lease has ended, except those of the agents in `kept`. Raises StorageError."""
-        for agent_id in self.agents.difference(kept):
-            if self._remaining_s(agent_id) <= 0:
-                self.end_agent(agent_id)
+    def end_unused(self, kept: Collection[str]) -> list[str]:
+        """End the sessions whose lease has ended, or the oldest one; returns the agents. Those in `kept` keep theirs.
+
+        Raises StorageError.
+        """
+        unused = [agent_id for agent_id in self._lease_ends_s if agent_id not in kept]
+        ended = [agent_id for agent_id in unused if self._remaining_s(agent_id) <= 0] or unused[:1]
+        for agent_id in ended:
+            self.end_agent(agent_id)
+        return ended
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Forget the token of an agent; the store deletes it with the agent's updates."""
+        self._token_hashes.pop(agent_id, None)
 
     def _sessions_of(self, agent_id: str) -> list[str]:
         return [key for key, session in self._sessions.items() if session.agent_id == agent_id]
@@ -210,19 +220,25 @@ class Membership:
         """Return the session of this id, see SessionRegistry.get."""
         return self._sessions.get(session_id)
 
-    def admit(self, agent_id: str, requested: MissionConfig, token: str) -> None:
+    def admit(self, agent_id: str, requested: MissionConfig, token: str) -> list[str]:
         """Check that the agent may join, and agree on the mission's configuration.
 
+        Returns the agents without updates whose sessions have ended to make room; they can join again.
         Raises InvalidInputError, MismatchError, NameInUseError, NotPermittedError, QuotaError, StorageError.
         """
         require_identifier("agent_id", agent_id)
         self._bans.require_allowed(agent_id)
         self._sessions.require_free(agent_id, token)
-        self._make_room(agent_id)
+        ended = self._make_room(agent_id)
         agreed = self._mission_config if self._is_agreed(agent_id) else self._settings.mission_config
         mission_config = reconcile(agreed, requested).with_default_names()
         self._store.set_mission_config(mission_config)
         self._mission_config = mission_config
+        return ended
+
+    def remove_agent(self, agent_id: str) -> None:
+        """Forget the token of an agent, see SessionRegistry."""
+        self._sessions.remove_agent(agent_id)
 
     def open_session(self, agent_id: str, token: str) -> SessionRecord:
         """Return a new session of an admitted agent; its earlier one ends. Raises NameInUseError, StorageError."""
@@ -262,14 +278,18 @@ class Membership:
         """Return whether another live agent, or any data, fixes the mission's configuration."""
         return bool(frozenset(self._store.agents()) or self._sessions.live_agents - {agent_id})
 
-    def _make_room(self, agent_id: str) -> None:
-        """End sessions without a lease and without data if the mission is full. Raises QuotaError, StorageError."""
+    def _make_room(self, agent_id: str) -> list[str]:
+        """End sessions of agents without updates if the mission is full, so that names alone never fill it.
+
+        Returns the agents. Raises QuotaError, StorageError.
+        """
         limit = self._settings.quotas.agents
         if agent_id in self._agents() or len(self._agents()) < limit:
-            return
-        self._sessions.end_expired(kept=frozenset(self._store.agents()))
+            return []
+        ended = self._sessions.end_unused(kept=frozenset(self._store.agents()))
         if len(self._agents()) >= limit:
             raise QuotaError(f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it")
+        return ended
 
     def _agents(self) -> frozenset[str]:
         return frozenset(name for name in self.sources if not is_earlier_map(name))

@@ -12,6 +12,7 @@ from gausslite.fusion.fused_map import FusedMapLayers, load_refinement
 from gausslite.fusion.keyframes import FrameDecoder, KeyframePool
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.membership import Membership
+from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import TeamObjects
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import TrafficLog
@@ -42,13 +43,14 @@ class MissionData:
         grid, quotas = settings.grid, settings.quotas
         members = Membership(store, settings)
         keyframes = KeyframePool(store, quotas.keyframe_limits, decode)
-        objects, checks, traffic = TeamObjects(store), UpdateChecks(store, quotas), TrafficLog(store)
+        objects, checks = TeamObjects(store), UpdateChecks(store, quotas, MissionClock(store))
+        traffic = TrafficLog(store)
         alignments = FrameAlignments(store)
         votes = VoteInput(store, alignments, grid)
         aligner = FrameAligner(store, alignments, lock, grid, settings.alignment)
         refined = load_refinement(store)
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
-        of_agents = checks, traffic, keyframes, objects
+        of_agents = members, checks, traffic, keyframes, objects
         return cls(
             members=members,
             keyframes=keyframes,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import functools
 import json
@@ -66,12 +67,20 @@ CREATE TABLE mission_config (
 
 
 class StoreLock:
-    """Held by the one process that may write a store; readers such as a backup need none. Ends with the process."""
+    """Held by the one process that may write a store; readers such as a backup need none. Ends with the process.
+
+    It belongs to the file: symbolic links are followed, and a file with several names is refused.
+    """
 
     def __init__(self, path: Path) -> None:
         """Raises StorageError if another process holds the lock, or the folder is not writable."""
+        if path.is_file() and path.stat().st_nlink > 1:
+            raise StorageError(
+                f"store {path}: expected a file with one name, got {path.stat().st_nlink} (hard links); another server "
+                "could write it under another name: delete the others, or copy the file"
+            )
         try:
-            self._file = os.open(f"{path}-lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            self._file = os.open(f"{path.resolve()}-lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise StorageError(
                 f"store {path}: cannot be opened ({error.strerror}); expected a file in a writable folder"
@@ -91,14 +100,14 @@ def open_existing(path: Path, versions: Sequence[int] = (SCHEMA_VERSION,)) -> sq
     """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError."""
     if not path.is_file():
         raise StorageError(f"store {path}: expected a GaussLite store, got no file")
-    if path.stat().st_size == 0:
-        raise StorageError(
-            f"store {path}: expected a GaussLite store, got an empty file; restore a backup, or remove the file to "
-            "begin with an empty store"
-        )
     db = connect(path)
     try:
         with storage_errors(path):
+            if db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+                raise StorageError(
+                    f"store {path}: expected a GaussLite store, got an empty file; restore a backup, or remove the "
+                    "file to begin with an empty store"
+                )
             if db.execute("PRAGMA application_id").fetchone()[0] != _APPLICATION_ID:
                 raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
             version = db.execute("PRAGMA user_version").fetchone()[0]
@@ -120,8 +129,9 @@ def open_existing(path: Path, versions: Sequence[int] = (SCHEMA_VERSION,)) -> sq
 
 def open_or_create(path: Path) -> sqlite3.Connection:
     """Connect to a store for writing; a missing file is created. Raises StorageError."""
-    is_new = not path.exists()
-    db = connect(path) if is_new else open_existing(path, (SCHEMA_VERSION, _VOXEL_ROWS_VERSION))
+    if not path.exists():
+        _create(path)
+    db = open_existing(path, (SCHEMA_VERSION, _VOXEL_ROWS_VERSION))
     try:
         with storage_errors(path):
             db.execute("PRAGMA journal_mode = WAL")
@@ -129,16 +139,25 @@ def open_or_create(path: Path) -> sqlite3.Connection:
             # freed pages are overwritten only where that costs no additional write
             db.execute("PRAGMA secure_delete = FAST")
             db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
-            if is_new:
-                header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
-                db.executescript(f"BEGIN IMMEDIATE; {header} {_UPDATES_SCHEMA} {_SCHEMA} COMMIT;")
-                renew_incarnation(db)
-            elif db.execute("PRAGMA user_version").fetchone()[0] == _VOXEL_ROWS_VERSION:
+            if db.execute("PRAGMA user_version").fetchone()[0] == _VOXEL_ROWS_VERSION:
                 _convert(db, path)
     except BaseException:
         db.close()
         raise
     return db
+
+
+def _create(path: Path) -> None:
+    """Create an empty store, at once: a server that is killed meanwhile leaves no file under this name."""
+    # the file behind a symbolic link, which may not exist yet
+    path = path.resolve()
+    new = path.with_name(path.name + "-new")
+    new.unlink(missing_ok=True)
+    header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
+    with contextlib.closing(connect(new)) as db, storage_errors(path):
+        db.executescript(f"BEGIN IMMEDIATE; {header} {_UPDATES_SCHEMA} {_SCHEMA} COMMIT;")
+        renew_incarnation(db)
+    new.replace(path)
 
 
 def _convert(db: sqlite3.Connection, path: Path) -> None:
@@ -165,12 +184,6 @@ def _damaged(path: Path, what: str) -> StorageError:
 def renew_incarnation(db: sqlite3.Connection) -> None:
     """Give the content a new id, so that the agents compare digests."""
     db.execute("INSERT OR REPLACE INTO properties VALUES ('incarnation_id', ?)", (secrets.token_hex(16),))
-
-
-def remove_store(path: Path) -> None:
-    """Delete a store that no process uses, with its log and its lock."""
-    for suffix in ("", "-wal", "-shm", "-lock"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 def connect(path: Path) -> sqlite3.Connection:

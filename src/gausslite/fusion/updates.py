@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import logging
 import struct
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -32,10 +31,10 @@ _JOINED = struct.Struct("<d")
 class UpdateChecks:
     """Knows when each agent first joined. Not thread-safe; FusionEngine holds a lock.
 
-    The first joins persist with the store. clock_s: the time since the epoch in seconds.
+    The first joins persist with the store. clock_s: the mission's time in seconds.
     """
 
-    def __init__(self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float] = time.time) -> None:
+    def __init__(self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float]) -> None:
         self._store, self._quotas, self._clock_s = store, quotas, clock_s
         self._first_joined_s = {agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(RECORD).items()}
 

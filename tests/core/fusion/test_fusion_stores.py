@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import sqlite3
 import subprocess
@@ -10,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Thread
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -337,6 +339,42 @@ def test_a_second_server_on_the_same_store_is_refused(open_durable: OpenStore) -
     assert "\n" not in str(caught.value)
     first.close()
     open_durable().close()
+
+
+def test_links_do_not_let_a_second_server_open_the_store(tmp_path: Path) -> None:
+    path, symbolic, hard = tmp_path / "store.sqlite", tmp_path / "other" / "s", tmp_path / "hard.sqlite"
+    symbolic.parent.mkdir()
+    symbolic.symlink_to(path)
+    # the first one begins behind the link
+    first = SqliteStore(symbolic)
+    first.put(make_subset("ant", 1, {11: 3}))
+    for name in (path, symbolic):
+        with pytest.raises(StorageError, match="in use by another server"):
+            SqliteStore(name)
+    os.link(path, hard)
+    for name in (path, symbolic, hard):
+        with pytest.raises(StorageError, match=r"expected a file with one name, got 2 \(hard links\)"):
+            SqliteStore(name)
+    hard.unlink()
+    first.close()
+    second = SqliteStore(path)
+    assert second.agents() == ("ant",)
+    second.close()
+
+
+def test_a_server_killed_while_it_creates_its_store_leaves_a_name_that_can_be_opened(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    for step in ("connect", "renew_incarnation", "storage_errors"):
+        stopped = patch(f"gausslite.fusion.sqlite_store.{step}", side_effect=KeyboardInterrupt)
+        with stopped, pytest.raises(KeyboardInterrupt):
+            SqliteStore(path)
+        assert not path.exists()
+    store = SqliteStore(path)
+    # the file says what it is without its log
+    alone = tmp_path / "alone.sqlite"
+    alone.write_bytes(path.read_bytes())
+    SqliteStore(alone).close()
+    store.close()
 
 
 def test_a_full_disk_refuses_the_message_and_keeps_earlier_ones(tmp_path: Path) -> None:

@@ -18,11 +18,14 @@ from gausslite.domain.errors import (
     QuotaError,
     SessionUnknownError,
 )
+from gausslite.domain.objects import ObjectReport
+from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.membership import SessionRegistry
 from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore, MissionConfig
 from gausslite.fusion.updates import MAX_SEQ_STEP, UpdateChecks
@@ -81,8 +84,26 @@ def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -
     assert checks.check(received({0: [150]}))
     # a restarted server does not start again
     assert UpdateChecks(store, quotas, clock).check(received({0: [150]}))
-    clock.now_s -= 500
-    assert checks.check(received({0: [100]}))
+
+
+def test_a_wrong_wall_clock_neither_sets_the_mission_back_nor_far_ahead() -> None:
+    store, wall, monotonic = MemoryStore(), Clock(), Clock()
+    # of a computer without a battery for its clock, before it finds a time server
+    wall.now_s, monotonic.now_s = 0.0, 7.0
+    clock = MissionClock(store, wall, monotonic)
+    assert clock() == 0.0
+    wall.now_s, monotonic.now_s = 1.7e9, 107.0
+    assert clock() == 100.0
+    # after a restart, the time without a server counts up to a day
+    wall.now_s, monotonic.now_s = 1.8e9, 1.0
+    assert MissionClock(store, wall, monotonic)() == 100.0 + 86400.0
+    wall.now_s = -5.0
+    assert MissionClock(store, wall, monotonic)() == 100.0 + 86400.0
+    wall.now_s = 100.0 + 86400.0 + 30.0
+    restarted = MissionClock(store, wall, monotonic)
+    monotonic.now_s += 2.0
+    wall.now_s -= 5000.0
+    assert restarted() == 100.0 + 86400.0 + 32.0
 
 
 def test_a_sequence_number_cannot_use_up_all_later_ones() -> None:
@@ -163,11 +184,51 @@ def test_names_that_never_contributed_do_not_fill_a_mission() -> None:
         join(engine, f"junk-{number}")
     assert join(engine, "late")
     assert {agent.agent_id for agent in engine.status().agents} >= {"good", "late"}
-    crowded = new_engine(quotas=Quotas(agents=3))
-    for number in range(3):
-        join(crowded, f"junk-{number}")
+
+
+def test_names_that_hold_their_leases_without_updates_make_room_the_oldest_first() -> None:
+    store = MemoryStore()
+    crowded = new_engine(store, quotas=Quotas(agents=3))
+    for name in ("good", "junk-0", "junk-1"):
+        session = join(crowded, name)
+        if name == "good":
+            crowded.contribute(session, make_subset(name, 1, {0: [1]}), GRID)
+    # who joins again is not younger
+    join(crowded, "junk-0")
+    late = join(crowded, "late")
+    assert {agent.agent_id for agent in crowded.status().agents} == {"good", "junk-1", "late"}
+    assert not any("junk-0" in records for records in all_records(store).values())
+    crowded.contribute(late, make_subset("late", 1, {1: [1]}), GRID)
+    last = join(crowded, "last")
+    crowded.contribute(last, make_subset("last", 1, {2: [1]}), GRID)
     with pytest.raises(QuotaError, match="at most 3 in this mission"):
-        join(crowded, "late")
+        join(crowded, "later")
+
+
+@pytest.mark.parametrize("how", ["leave", "evict", "unban"])
+def test_an_agent_that_is_gone_leaves_no_record(how: str) -> None:
+    store = MemoryStore()
+    engine = new_engine(store)
+    session = join(engine, "ant")
+    engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
+    engine.report_objects(session, ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ()))
+    assert {"objects", "join-token", "first-joined"} <= {
+        name for name, records in all_records(store).items() if "ant" in records
+    }
+    if how == "leave":
+        engine.leave(session, forget=True)
+    else:
+        engine.evict("ant", ban=how == "unban")
+    if how == "unban":
+        engine.unban("ant")
+    assert not any("ant" in records for records in all_records(store).values())
+    # another robot can take the name
+    assert join(engine, "ant", token="another")
+
+
+def all_records(store: MemoryStore) -> dict[str, dict[str, bytes]]:
+    names = ("alignment", "ban", "first-joined", "join-token", "objects")
+    return {name: store.records(name) for name in names}
 
 
 def test_a_joiner_that_is_gone_and_never_contributed_fixes_nothing() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from pathlib import Path
 
@@ -68,8 +69,13 @@ def test_a_damaged_keyframe_or_record_is_not_served(path: Path, table: str, read
     assert verify(path).damaged_rows == 0
 
 
-def test_an_emptied_file_is_refused(path: Path) -> None:
+@pytest.mark.parametrize("is_database", [False, True])
+def test_an_emptied_file_is_refused(path: Path, is_database: bool) -> None:
     path.write_bytes(b"")
+    if is_database:
+        with contextlib.closing(sqlite3.connect(path)) as db:
+            db.execute("PRAGMA journal_mode = WAL")
+        assert path.stat().st_size > 0
     with pytest.raises(StorageError, match="got an empty file; restore a backup"):
         SqliteStore(path)
 
