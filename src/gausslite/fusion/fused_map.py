@@ -262,11 +262,6 @@ class FusedMapLayers:
             batches = self._votes.batches(changed)
         return refined.replace_changed(fuse(batches), changed)
 
-    def layer(self, layer: MapLayer) -> VoxelBatch:
-        """Return the map that the layer shows now."""
-        with self._lock:
-            return self.refined_map() if layer is MapLayer.REFINED and self.is_refined else self.voted_map()
-
     def tiles(self, layer: MapLayer) -> tuple[int, Int64[ndarray, " t"]]:
         """Return the layer's revision and the tiles of its voxels, ascending."""
         with self._lock:

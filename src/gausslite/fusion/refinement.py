@@ -31,6 +31,7 @@ from gausslite.mapping.settings import REFINE_RATES, DensitySettings
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import (
+    ROW_WIDTH,
     AdamSettings,
     LossWeights,
     Rasterizer,
@@ -254,23 +255,25 @@ class LayerView:
 
 
 class MapRenderer:
-    """Renders on one thread; the rasterizer is created with the first view, and the rows are kept per revision."""
+    """Renders on one thread, from its own copy of a layer; the rasterizer is created with the first view.
+
+    The copy is brought up to date tile by tile, so that the map is held for one tile at a time.
+    """
 
     def __init__(self, engine: FusionEngine, create_rasterizer: Callable[[], Rasterizer]) -> None:
         self._engine, self._create_rasterizer = engine, create_rasterizer
         self._rasterizer: Rasterizer | None = None
         self._shown: tuple[MapLayer, int] | None = None
-        self._rows = np.zeros((0, 16), np.float32)
+        # the revision and the rows of each tile
+        self._tiles: dict[int, tuple[int, Float32[ndarray, "n 16"]]] = {}
+        self._rows = np.zeros((0, ROW_WIDTH), np.float32)
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer) -> LayerView:
         """Return a view of a layer. Raises QuotaError above two megapixels, KernelError."""
         pixels = camera.width_px * camera.height_px
         if pixels > _MAX_VIEW_PX:
             raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
-        revision = self._engine.maps.revision(layer)
-        if self._shown != (layer, revision):
-            self._rows = gaussians_to_rows(self._engine.maps.layer(layer).gaussians)
-            self._shown = layer, revision
+        revision = self._update(layer)
         size = camera.height_px, camera.width_px
         rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
         if len(self._rows):
@@ -280,3 +283,22 @@ class MapRenderer:
             rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
             depth_m = rendering.expected_depth_m()
         return LayerView(rgb, depth_m, revision)
+
+    def _update(self, layer: MapLayer) -> int:
+        """Read the tiles that have changed since the latest view; returns the layer's revision before."""
+        maps = self._engine.maps
+        revision, tiles = maps.tiles(layer)
+        if self._shown == (layer, revision):
+            return revision
+        kept = self._tiles if self._shown is not None and self._shown[0] is layer else {}
+        self._tiles = {}
+        for tile in tiles.tolist():
+            # read before the tile: a change in between makes the copy newer than its revision, never older
+            changed_at = maps.tile_revision(layer, tile)
+            if tile in kept and kept[tile][0] == changed_at:
+                self._tiles[tile] = kept[tile]
+            else:
+                self._tiles[tile] = changed_at, gaussians_to_rows(maps.tile(layer, tile).batch.gaussians)
+        self._rows = np.concatenate([np.zeros((0, ROW_WIDTH), np.float32), *(rows for _, rows in self._tiles.values())])
+        self._shown = layer, revision
+        return revision

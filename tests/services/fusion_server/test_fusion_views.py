@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import grpc
 import numpy as np
@@ -13,6 +14,13 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError
 from gausslite.domain.pose import transform_of
 from gausslite.domain.voxels import empty_batch
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fused_map import MapLayer
+from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.refinement import MapRenderer
+from gausslite.fusion.store import MissionConfig
+from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
 
@@ -111,3 +119,26 @@ def test_a_declared_frame_moves_the_agents_map() -> None:
             assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
         [agent] = server.client.status().agents
         assert list(agent.alignment.t_fused_agent.row_major) == T.reshape(-1).tolist()
+
+
+def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the_map_as_it_is() -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    ant = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
+    engine.contribute(ant, make_subset("ant", 1, {0: [5, 6], 20: [7], 40: [1, 1]}), GRID)
+    renderer = MapRenderer(engine, ReferenceRasterizer)
+    with patch.object(engine.maps, "tile", wraps=engine.maps.tile) as read:
+        for change, tiles in (
+            (lambda: None, 3),
+            (lambda: None, 0),
+            (lambda: engine.contribute(ant, make_subset("ant", 2, {1: [9, 9]}), GRID), 1),
+            (lambda: engine.contribute(ant, make_subset("ant", 3, {20: []}), GRID), 0),
+            (lambda: engine.evict("ant"), 0),
+        ):
+            change()
+            read.reset_mock()
+            shown = renderer.render(CAMERA, np.eye(4), MapLayer.REFINED)
+            assert read.call_count == tiles
+            alone = MapRenderer(engine, ReferenceRasterizer).render(CAMERA, np.eye(4), MapLayer.VOTE)
+            assert np.array_equal(shown.rgb, alone.rgb)
+            assert np.array_equal(shown.depth_m, alone.depth_m)
+    assert not shown.rgb.any()
