@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import logging
 import struct
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
