@@ -263,6 +263,10 @@ class MappingWorker:
             self._submit(work)
 
     def _assign(self, graph: TaskGraph) -> None:
+        self._report_task(self._switch(graph))
+
+    def _switch(self, graph: TaskGraph) -> TaskMapper:
+        """Make this the task of the next frame, and return its mapper."""
         current = self.status().graph
         if self._task_mapper is None:
             self._task_mapper = TaskMapper(
@@ -276,16 +280,20 @@ class MappingWorker:
         elif current is None or not graph.is_equivalent_to(current):
             self._task_mapper.assign(self._build_estimator(graph))
         self._status.update(graph=graph)
-        self._update_notes(self._task_mapper.notes)
-        self._update_objects(self._task_mapper.objects)
-        for noun in self._task_mapper.nouns:
+        return self._task_mapper
+
+    def _report_task(self, task_mapper: TaskMapper) -> None:
+        self._update_notes(task_mapper.notes)
+        self._update_objects(task_mapper.objects)
+        for noun in task_mapper.nouns:
             _log.info("%s", noun.match.describe())
 
     def _restore(self, saved: SavedMission) -> None:
         checkpoint = saved.checkpoint
-        self._assign(checkpoint.graph)
-        assert self._task_mapper is not None
-        saved.run.restore(self._task_mapper)
+        task_mapper = self._switch(checkpoint.graph)
+        saved.run.restore(task_mapper)
+        # not before: the fusion server replaces what it has by each report
+        self._report_task(task_mapper)
         self._last_index = checkpoint.last_index
         # the clock may have been set back since the mission was saved
         self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)

@@ -5,24 +5,30 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, red_frame
+from jaxtyping import Float32
+from numpy import ndarray
 from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.codec.state_file import read_state, write_state
 from gausslite.domain.errors import MapFileError, MismatchError
+from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.relevance import BallRegion
-from gausslite.domain.voxels import VoxelBatch, group_by_voxel
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.relevance import BallRegion, Region
+from gausslite.domain.state import State
+from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, group_by_voxel
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.perception.relevance import RegionRelevanceEstimator
+from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Purpose, Spool
@@ -44,7 +50,10 @@ def settings(state: Path, *more: str) -> AgentSettings:
 
 @contextmanager
 def agent_run(
-    options: AgentSettings, fusion: RunningServer | None = None, spool: Path | None = None
+    options: AgentSettings,
+    fusion: RunningServer | None = None,
+    spool: Path | None = None,
+    estimator: type[RegionRelevanceEstimator] = RegionRelevanceEstimator,
 ) -> Iterator[tuple[AgentMission, MappingWorker]]:
     """Start an agent as its program does, restored from its state file if there is one."""
     saved = (
@@ -56,7 +65,7 @@ def agent_run(
         client = FusionClient(fusion.client.address, token=opened_spool.token)
         uplink_settings = UplinkSettings(interval_s=0.0)
         uplink = Uplink(client, "robot", opened_spool, GRID, uplink_settings, has_restored_map=saved is not None)
-    worker = MappingWorker(options.mission, GRID, lambda _graph: RegionRelevanceEstimator([MUG]), uplink)
+    worker = MappingWorker(options.mission, GRID, lambda _graph: estimator([MUG]), uplink)
     try:
         if saved is not None:
             worker.restore(saved).result()
@@ -72,6 +81,49 @@ def agent_run(
 def map_frames(worker: MappingWorker, *indices: int) -> None:
     for i in indices:
         worker.submit(frame(i, CAMERA)).result()
+
+
+class SeeingEstimator(RegionRelevanceEstimator):
+    """An estimator that has seen a mug after its first frame; its state has it."""
+
+    def __init__(self, regions: Sequence[Region]) -> None:
+        super().__init__(regions)
+        self.seen = np.zeros(1, np.int64)
+
+    def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
+        self.seen[0] = 1
+        return super().estimate(frame, rendered_depth_m)
+
+    @property
+    def objects(self) -> tuple[ObjectLandmark, ...]:
+        box = AxisAlignedBox((-0.1, -0.1, 1.1), (0.1, 0.1, 1.3))
+        mug = ObjectLandmark("mug-1", "mug", ObjectRole.TARGET, (0.0, 0.0, 1.2), box, 0.5, 1, 2)
+        return (mug,) if self.seen[0] else ()
+
+    def state(self) -> State:
+        return {"seen": self.seen}
+
+    def restore(self, state: State) -> None:
+        self.seen = state["seen"].copy()
+
+
+def test_a_restarted_agent_keeps_its_objects_on_the_server(tmp_path: Path) -> None:
+    options, spool = settings(tmp_path / "robot.state"), tmp_path / "robot.spool"
+    with fusion_server() as fusion:
+        with agent_run(options, fusion, spool, SeeingEstimator) as (mission, worker):
+            map_frames(worker, 0, 1)
+            mission.finish()
+        assert [found.landmark.noun for found in fusion.client.query_objects()] == ["mug"]
+        with (
+            patch.object(Uplink, "report_objects", autospec=True, side_effect=Uplink.report_objects) as reporting,
+            agent_run(options, fusion, spool, SeeingEstimator) as (mission, worker),
+        ):
+            assert worker.uplink is not None
+            assert worker.uplink.drain(20.0)
+            assert [found.landmark.noun for found in fusion.client.query_objects()] == ["mug"]
+    reports = [call.args[1] for call in reporting.call_args_list]
+    assert reports
+    assert all(report.objects for report in reports)
 
 
 def map_of(worker: MappingWorker) -> Gaussians:
