@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
 from gausslite.cli.main import main
+from gausslite_bench.server.server_process import DEFAULT_COMMAND, ServerProcess
 
 
 def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.CaptureFixture[str]) -> None:
@@ -18,6 +21,22 @@ def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.
     assert all(load["missing"] == 0 for load in [*result["loads"], result["hostile"]])
     assert result["held"] == 20000
     assert min(result[name] for name in ("snapshot_s", "status_ms", "restart_s", "rss_mib")) > 0
+    assert result["server"] == "fusion server, default options, store in a file"
+
+
+def test_another_configuration_is_in_the_title(capsys: pytest.CaptureFixture[str]) -> None:
+    command = f"{DEFAULT_COMMAND} --set frame-alignment=trust"
+    arguments = ("bench", "server", "--held", "0", "--agents", "1", "--seconds", "0.25", "--watchers", "0")
+    assert main([*arguments, "--store", "memory", "--server", command]) == 0
+    assert capsys.readouterr().out.startswith(f"fusion server, {command}, store in memory\n0 Gaussians held")
+
+
+def test_the_server_is_started_without_options_of_the_benchmark(tmp_path: Path) -> None:
+    stopped = patch("gausslite_bench.server.server_process.subprocess.Popen", side_effect=KeyboardInterrupt)
+    with stopped as started, pytest.raises(KeyboardInterrupt):
+        ServerProcess(DEFAULT_COMMAND, tmp_path, "sqlite")
+    [arguments] = started.call_args.args
+    assert arguments[3:] == ["--listen", f"unix:{tmp_path}/fusion.sock", "--store", str(tmp_path / "store.sqlite")]
 
 
 def test_the_stages_of_a_message_are_measured_and_few_bytes_are_written(capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,7 +24,12 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
     add("--seconds", type=float, default=10.0, metavar="S", help="duration of each load (default: %(default)s)")
     add("--store", choices=["sqlite", "memory"], default="sqlite", help="store of the server (default: %(default)s)")
     add("--watchers", type=int, default=20, metavar="N", help="watchers that stop reading (default: %(default)s)")
-    add("--server", default=DEFAULT_COMMAND, metavar="COMMAND", help="starts the server, to compare versions")
+    add(
+        "--server",
+        default=DEFAULT_COMMAND,
+        metavar="COMMAND",
+        help="starts the server, with its default options unless the command has others",
+    )
     parser.add_argument(
         "--hostile",
         action="store_true",
@@ -56,13 +61,15 @@ def run_server(options: argparse.Namespace) -> int:
     )
     with progress_bar(len(settings.held), "server", "server") as progress:
         results = []
+        if not options.json:
+            progress.write(_title(settings))
         for held in settings.held:
             results.append(measure(settings, held, progress.set_description))
             progress.update()
             if not options.json:
                 progress.write("\n".join(_lines(results[-1])))
     if options.json:
-        sys.stdout.write(json.dumps(list(map(_values, results)), indent=1) + "\n")
+        sys.stdout.write(json.dumps([_values(settings, result) for result in results], indent=1) + "\n")
     return 0
 
 
@@ -93,8 +100,14 @@ def _numbers(name: str, text: str, least: int) -> list[int]:
     return numbers
 
 
-def _values(result: StoredSizeResult) -> dict[str, object]:
-    return asdict(result) | {"largest_team": result.largest_team}
+def _title(settings: ServerBenchSettings) -> str:
+    """Return the configuration of the server."""
+    command = "default options" if settings.command == DEFAULT_COMMAND else settings.command
+    return f"fusion server, {command}, store in {'memory' if settings.store == 'memory' else 'a file'}"
+
+
+def _values(settings: ServerBenchSettings, result: StoredSizeResult) -> dict[str, object]:
+    return {"server": _title(settings)} | asdict(result) | {"largest_team": result.largest_team}
 
 
 def _lines(result: StoredSizeResult) -> Iterator[str]:

@@ -44,27 +44,29 @@ class AgentLoad:
         self._next_seq = 1
 
     def fill(self, gaussians: int, gaussians_per_voxel: int) -> None:
-        """Store this many Gaussians, from _FILL_AGENTS agents."""
+        """Store this many Gaussians, from the first _FILL_AGENTS agents of the loads: a team holds its own map."""
         voxels = gaussians // gaussians_per_voxel // _FILL_AGENTS
         if not voxels:
             return
-        with FusionClient(self._address, deadline_s=600.0) as client:
+        with FusionClient(self._address, deadline_s=600.0, token=_TOKEN) as client:
             for number in range(_FILL_AGENTS):
-                agent_id = f"fill-{number}"
+                agent_id = _name(number)
                 session_id = client.join(agent_id, GRID).session_id
                 messages = list(fill_messages(agent_id, 200_000 + number * voxels, voxels))
                 asyncio.run(self._send_all(session_id, messages))
+                self._next_seq = len(messages) + 1
 
     def run(self, agents: int, seconds: float, hostile: bool = False) -> LoadResult:
         """Send deltas from these agents; hostile: one more agent resends a message of 200 000 tombstones."""
         count = max(int(seconds * RATE_HZ), 1)
-        names = [f"load-{number}" for number in range(agents)]
+        names, hostile_name = [_name(number) for number in range(agents)], _name(agents)
         with FusionClient(self._address, deadline_s=60.0, token=_TOKEN) as client:
             sessions = [client.join(name, GRID).session_id for name in names]
-            hostile_session = client.join("hostile", GRID).session_id if hostile else ""
+            hostile_session = client.join(hostile_name, GRID).session_id if hostile else ""
         messages = [delta_messages(name, number, count, self._next_seq) for number, name in enumerate(names)]
         self._next_seq += count
-        times_s, missing = asyncio.run(self._send(sessions, messages, hostile_session))
+        hostile_data = tombstone_message(hostile_name, HOSTILE_TOMBSTONES, self._next_seq) if hostile else b""
+        times_s, missing = asyncio.run(self._send(sessions, messages, hostile_session, hostile_data))
         p50, p99 = np.percentile(times_s or [np.inf], [50, 99]) * 1000
         return LoadResult(agents, agents * count, float(p50), float(p99), missing)
 
@@ -76,13 +78,12 @@ class AgentLoad:
             await stream.close()
 
     async def _send(
-        self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]], hostile_session: str
+        self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]], hostile_session: str, hostile_data: bytes
     ) -> tuple[list[float], int]:
         times_s: list[float] = []
         async with UpdateStreams(self._address) as streams:
-            data = tombstone_message("hostile", HOSTILE_TOMBSTONES, self._next_seq) if hostile_session else b""
             hostile = [
-                asyncio.ensure_future(streams.open(session).resend_forever(data))
+                asyncio.ensure_future(streams.open(session).resend_forever(hostile_data))
                 for session in (hostile_session,)
                 if session
             ]
@@ -104,6 +105,10 @@ class AgentLoad:
                 task.cancel()
             await asyncio.gather(*tasks, *hostile, return_exceptions=True)
         return times_s, sum(map(len, messages)) - len(times_s)
+
+
+def _name(number: int) -> str:
+    return f"load-{number}"
 
 
 async def _send_agent(stream: UpdateStream, messages: Sequence[bytes], begin_s: float, times_s: list[float]) -> None:

@@ -17,15 +17,13 @@ from gausslite_bench.loop.memory import resident_mib
 DEFAULT_COMMAND = f"{shlex.quote(sys.executable)} -m gausslite_fusion_server"
 _START_LIMIT_S = 300.0
 _POLL_S = 0.02
-_QUOTAS = (
-    *("--set", "quota-agents=1000", "--set", "quota-voxels=20000000", "--set", "quota-gaussians=500000000"),
-    # the agents' frames agree by construction
-    *("--set", "frame-alignment=trust"),
-)
 
 
 class ServerProcess:
-    """Owns the process of a server on a store, and appends what it logs to a file."""
+    """Owns the process of a server on a store, and appends what it logs to a file.
+
+    The server runs with its default options, but for those in the command.
+    """
 
     def __init__(self, command: str, folder: Path, store: str) -> None:
         self._command, self._store = command, "memory" if store == "memory" else str(folder / "store.sqlite")
@@ -80,7 +78,7 @@ class ServerProcess:
         """
         begin_s = time.monotonic()
         self._command = command or self._command
-        arguments = [*shlex.split(self._command), "--listen", self.address, "--store", self._store, *_QUOTAS]
+        arguments = [*shlex.split(self._command), "--listen", self.address, "--store", self._store]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(arguments, stderr=log)  # noqa: S603 - the user's own command
         socket = Path(self.address.removeprefix("unix:"))
