@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from gausslite.codec.json import encode_object_report
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.stored import to_records
-from gausslite.codec.subset_codec import SubsetCoding, encode_subset
+from gausslite.codec.subset_codec import SubsetCoding, decode_stored, encode_subset
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
@@ -56,7 +56,9 @@ def main() -> None:
 def codec_messages() -> Iterator[tuple[str, str, bytes]]:
     """Yield the messages that are decoded without a service."""
     for name, subset, coding in subsets():
-        yield "subset", name, encode_subset(subset, GRID, coding)
+        message = encode_subset(subset, GRID, coding)
+        yield "subset", name, message
+        yield "stored-row", name, decode_stored(message)[0].voxels.to_row()
     yield "object-report", "two-objects", encode_object_report(report())
     for name, image in frames():
         yield "keyframe", name, image.SerializeToString()
@@ -144,7 +146,7 @@ def subsets() -> Iterator[tuple[str, RoiSubset, SubsetCoding]]:
 
 def some_voxels(count: int) -> VoxelBatch:
     """Return voxels near the origin."""
-    return voxels_batch(0, count, seed=count)
+    return voxels_batch(range(count), seed=count)
 
 
 def frames(lens: Lens | None = None) -> Iterator[tuple[str, Message]]:

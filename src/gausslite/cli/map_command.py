@@ -39,6 +39,7 @@ from gausslite.evaluation.metrics import trajectory_error
 from gausslite.evaluation.pictures import render_preview
 from gausslite.evaluation.views import view_map
 from gausslite.mapping.keyframes import Keyframe
+from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.results import (
@@ -202,6 +203,7 @@ def _map(options: argparse.Namespace) -> int:
     if saved is None:
         # an estimate takes half a minute; first refuse what cannot be mapped, and name what cannot be found
         choose_rasterizer(inputs.mission.backend, inputs.mission.threads)
+        SplatTable(inputs.mission.max_gaussians)
         if isinstance(roi, TaskGraph):
             estimators.require_detector()
     _report_search(options, inputs, estimators)

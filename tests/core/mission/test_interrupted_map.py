@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from gausslite.codec.state_file import read_state
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.domain.frame import Frame
 from gausslite.mapping.poses import PoseHistory
+from gausslite.mission.runner import FrameStream, OnCorrupt
 from gausslite.process import DeferredInterrupt
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
@@ -39,15 +41,16 @@ def test_a_signal_ends_the_run_after_the_current_frame_and_it_can_be_resumed(
     sequence = write_seven_scenes(tmp_path / "kitchen", tuple(range(0, 24, 4)))
     state = str(tmp_path / "run.state")
     assert mapped(sequence, tmp_path / "whole") == 0
-    read = SevenScenesSource.frame
+    read = FrameStream.frames
 
-    def read_and_raise_signal(source: SevenScenesSource, position: int, size: tuple[int, int]) -> Frame:
-        if position == 2:
-            signal.raise_signal(number)
-        return read(source, position, size)
+    def read_and_raise_signal(stream: FrameStream, on_corrupt: OnCorrupt | None = None) -> Iterator[Frame]:
+        for position, frame in enumerate(read(stream, on_corrupt)):
+            if position == 2:
+                signal.raise_signal(number)
+            yield frame
 
     with monkeypatch.context() as patched:
-        patched.setattr(SevenScenesSource, "frame", read_and_raise_signal)
+        patched.setattr(FrameStream, "frames", read_and_raise_signal)
         assert mapped(sequence, tmp_path / "first", "--set", f"save-state={state}") == code
     last_line = capsys.readouterr().err.splitlines()[-1]
     kept = f"3 frames are mapped; map.ply, report.json and preview.png are in {tmp_path / 'first'}"

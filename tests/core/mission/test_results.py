@@ -34,7 +34,7 @@ def test_a_check_leaves_no_folder(tmp_path: Path) -> None:
 
 
 def test_a_file_of_another_kind_is_not_replaced(tmp_path: Path) -> None:
-    notes, map_file, empty = tmp_path / "notes.txt", tmp_path / "map.ply", tmp_path / "empty"
+    notes, map_file, empty = tmp_path / "notes.txt", tmp_path / "map.ply", tmp_path / "empty.ply"
     notes.write_text("poses of the recording")
     map_file.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
     empty.write_bytes(b"")
