@@ -15,6 +15,7 @@ from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.codec.run_files import ViewImage, read_view_images
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
+from gausslite.evaluation.lpips import NAME as LPIPS_NAME
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
 from gausslite.process import print_message, size_text
@@ -230,7 +231,7 @@ SCORES = (
     Figure("region SSIM", _of_scores("roi_ssim"), _similarity),
     Figure("image PSNR", _of_scores("full_psnr"), as_decibels),
     Figure("image SSIM", _of_scores("full_ssim"), _similarity),
-    Figure("region LPIPS", _of_scores("roi_lpips"), _similarity),
+    Figure(f"region {LPIPS_NAME}", _of_scores("roi_lpips"), _similarity),
     Figure("region depth error", _of_scores("roi_depth_l1_m"), _metres),
     Figure("image depth error", _of_scores("full_depth_l1_m"), _metres),
     Figure("region covered", _of_scores("roi_covered"), as_percent),

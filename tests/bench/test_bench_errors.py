@@ -51,7 +51,7 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "loop", "server")
         (("quality", "--max-gaussians", "0"), "max_gaussians: expected at least 1, got 0"),
         (("quality", "--perception", "none.onnx"), "model none.onnx: expected"),
         (("ablation", "--pair", "kitchen"), "pairs: expected names"),
-        (("ablation", "--lpips-weights", "none.pth"), "none.pth: expected a file of LPIPS weights"),
+        (("ablation", "--lpips-weights", "none.onnx"), "model none.onnx: expected an ONNX file, found nothing"),
         (("server", "--held", "many"), "--held"),
         (("server", "--agents", "0"), "--agents"),
         (("server", "--seconds", "0"), "--seconds"),

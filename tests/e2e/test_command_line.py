@@ -67,6 +67,16 @@ def test_map_writes_a_map_of_the_task_and_a_report(mug_map: Path) -> None:
     assert first.total < last.total <= len(gaussians)
 
 
+def test_eval_prints_lpips_with_a_file_of_it(mug_map: Path, shared_dir: Path) -> None:
+    file = shared_dir / "models" / "lpips_squeeze.onnx"
+    ball = ("--size", "160x120", "--test-every", "4", "--set", "roi-ball=2,2,0.8,0.5")
+    done = gausslite("eval", mug_map / "map.ply", HOME, *ball, "--set", f"lpips-weights={file}", "--json")
+    scores = json.loads(done.stdout)
+    assert 0.0 < scores["roi_lpips"] < scores["full_lpips"] < 1.0
+    done = gausslite("eval", mug_map / "map.ply", HOME, *ball, "--set", f"lpips-weights={file}")
+    assert done.stdout.count("LPIPS (SqueezeNet) 0.") == 2
+
+
 def test_eval_scores_a_map_on_frames(mug_map: Path) -> None:
     done = gausslite(
         "eval",
@@ -162,6 +172,7 @@ def test_every_wrong_input_gives_one_line_and_exit_code_two(tmp_path: Path, mug_
         "a-file": ("map", HOME, *task, "--out", tmp_path / "a-file"),
         "regions.npz": ("map", HOME, "--roi", tmp_path / "regions.npz", *out),
         "sim:": ("map", "sim:castle", *task, *out),
+        "none.onnx: expected an ONNX file": ("eval", mug_map / "map.ply", HOME, "--set", "lpips-weights=none.onnx"),
         "broken.ply": ("eval", tmp_path / "broken.ply", HOME),
         "missing.ply": ("fuse", tmp_path / "missing.ply", mug_map / "map.ply", "--out", tmp_path / "f.ply"),
         "two": ("fuse", mug_map / "map.ply", "--out", tmp_path / "f.ply"),

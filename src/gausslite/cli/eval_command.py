@@ -32,6 +32,7 @@ from gausslite.domain.pose import CorrectionTrack
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import Region
 from gausslite.evaluation.compare import CorrectedScores, MapScores, ViewScore, average, score_view
+from gausslite.evaluation.lpips import LPIPS_HELP, NAME, Lpips, load_lpips
 from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, render_fitted, view_map
 from gausslite.mission.results import (
@@ -76,6 +77,7 @@ class EvalOptions:
     )
     pictures: Path | None = option(None, "write side-by-side pictures of a few views", metavar="DIR")
     save_scores: bool = option(False, f"write the scores to {EVALUATION} next to MAP, for `gausslite report`")
+    lpips_weights: Path | None = option(None, LPIPS_HELP)
     threads: int | None = option(
         None,
         "threads (default: all that the processor has)",
@@ -143,16 +145,19 @@ class _Conditions:
 
     fit_views: their pose and exposure are fitted first. trajectory: returns the tracked pose at a time in nanoseconds;
     None to start from the given poses. corrections: those published with the map; None if there are none to score.
+    lpips: None if it is not scored.
     """
 
     stated: StatedValues
     fit_views: bool
     trajectory: Callable[[int], Float64[ndarray, "4 4"]] | None
     corrections: CorrectionTrack | None
+    lpips: Lpips | None
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _Conditions:
         """Return the conditions of the options; unset ones are those of the report next to the map."""
+        lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights, options.threads)
         report, from_report = read_report(options.map.parent), []
         registration, correction = options.register_depth, options.camera_correction
         fit_views = options.fit_views
@@ -172,10 +177,10 @@ class _Conditions:
         # views are scored from the poses as they are, or fitted; `map` has compared them with the images
         stated = replace(stated_values(registration, correction, PoseExposurePrior()), checked=True)
         if poses == PoseMode.TRACK:
-            return cls(stated, fit_views, read_trajectory(options.map.parent), None)
+            return cls(stated, fit_views, read_trajectory(options.map.parent), None, lpips)
         corrections = read_corrections(options.map.parent)
         corrections = None if corrections is None or corrections.is_identity else corrections
-        return cls(stated, fit_views, None, corrections)
+        return cls(stated, fit_views, None, corrections, lpips)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +251,7 @@ def _score_views(
         if not view.frame.has_depth:
             continue
         rendered = render_fitted(viewer, view.frame) if conditions.fit_views else viewer.render_frame(view.frame)
-        scores.append(score_view(rendered, view))
+        scores.append(score_view(rendered, view, conditions.lpips))
         if corrected is not None:
             corrected.add(viewer, view)
         if options.pictures is not None and position in pictured:
@@ -269,5 +274,11 @@ def _with_progress(positions: Sequence[int], quiet: bool) -> Iterator[int]:
 def _as_line(scores: MapScores, has_regions: bool) -> str:
     roi = f"no view shows {MIN_ROI_PIXELS} pixels of the region" if has_regions else "no region selected"
     if scores.roi_psnr is not None and scores.roi_ssim is not None:
-        roi = f"ROI PSNR {scores.roi_psnr:.2f} dB, SSIM {scores.roi_ssim:.3f} on {scores.n_roi_views} views"
-    return f"{roi}; full PSNR {scores.full_psnr:.2f} dB, SSIM {scores.full_ssim:.3f} on {scores.n_views} views"
+        roi = f"ROI PSNR {scores.roi_psnr:.2f} dB, SSIM {scores.roi_ssim:.3f}{_lpips_text(scores.roi_lpips)}"
+        roi += f" on {scores.n_roi_views} views"
+    full = f"full PSNR {scores.full_psnr:.2f} dB, SSIM {scores.full_ssim:.3f}{_lpips_text(scores.full_lpips)}"
+    return f"{roi}; {full} on {scores.n_views} views"
+
+
+def _lpips_text(distance: float | None) -> str:
+    return "" if distance is None else f", {NAME} {distance:.3f}"

@@ -14,10 +14,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32, Shaped, UInt8
+from jaxtyping import Bool, UInt8
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
@@ -25,6 +24,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import CorrectionTrack
 from gausslite.domain.relevance import Region
+from gausslite.evaluation.lpips import Lpips
 from gausslite.evaluation.metrics import covered_share, depth_l1_m, gradient_deviation, laplacian_ratio, psnr, ssim_map
 from gausslite.evaluation.pictures import comparison_sheet
 from gausslite.evaluation.views import HeldOutView, MapViewer, largest_roi_per_segment, largest_roi_views, render_fitted
@@ -33,15 +33,6 @@ from gausslite.render.rasterizer import Rasterizer, Rendering
 MAX_PSNR_DB = 100.0
 """Cap on a view's PSNR: equal images, such as a saturated region, would make the mean infinite."""
 _COVERED_ALPHA = 0.5
-
-
-@runtime_checkable
-class PerceptualDistance(Protocol):
-    """Perceptual distance of two images per pixel."""
-
-    def distance_map(self, a: Shaped[ndarray, "h w 3"], b: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
-        """Return the distance per pixel, 0 for equal images. Images are uint8, or floating in [0, 1]."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +72,7 @@ class MapScores:
     """Means over the views: PSNR in dB, depth in metres, coverage as a share.
 
     laplacian_ratio: sharpness relative to the photographs, 1 for equal; gradient_deviation: 0 for equal images.
-    A figure is None if no view has it, or if LPIPS has no weights. n_views and n_roi_views count the views behind the
+    A figure is None if no view has it; LPIPS needs a file. n_views and n_roi_views count the views behind the
     full-image and the ROI figures. roi_pixels sums the region's pixels over the n_roi_views views.
     """
 
@@ -121,12 +112,11 @@ def score_training_views(
     return average([score_view(viewer.render_frame(view.frame), view) for view in chosen])
 
 
-def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDistance | None = None) -> ViewScore:
-    """Return the scores of one rendering against its frame; LPIPS needs `perceptual`."""
+def score_view(rendering: Rendering, view: HeldOutView, lpips: Lpips | None = None) -> ViewScore:
+    """Return the scores of one rendering against its frame."""
     rgb = view.frame.rgb
     similarity = ssim_map(rendering.rgb, rgb)
     depth_m = rendering.expected_depth_m(_COVERED_ALPHA)
-    distance = None if perceptual is None else perceptual.distance_map(rendering.rgb, rgb)
     roi = None
     if view.shows_region:
         roi = RoiScore(
@@ -134,7 +124,7 @@ def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDi
             ssim=float(similarity[view.roi].mean()),
             depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m, view.roi),
             covered=covered_share(depth_m, view.frame.depth_m, view.roi),
-            lpips=None if distance is None else float(distance[view.roi].mean()),
+            lpips=None if lpips is None else lpips.distance(rendering.rgb, rgb, view.roi),
             laplacian_ratio=laplacian_ratio(rendering.rgb, rgb, view.roi),
             gradient_deviation=gradient_deviation(rendering.rgb, rgb, view.roi),
         )
@@ -145,7 +135,7 @@ def score_view(rendering: Rendering, view: HeldOutView, perceptual: PerceptualDi
         roi_pixels=int(np.count_nonzero(view.roi)),
         roi=roi,
         depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m),
-        lpips=None if distance is None else float(distance.mean()),
+        lpips=None if lpips is None else lpips.distance(rendering.rgb, rgb),
         laplacian_ratio=laplacian_ratio(rendering.rgb, rgb),
         gradient_deviation=gradient_deviation(rendering.rgb, rgb),
     )

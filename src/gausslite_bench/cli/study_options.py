@@ -19,6 +19,7 @@ from gausslite.config.values import NONE, PRIOR_FORM, read_prior, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.source import downscaled_size
 from gausslite.domain.errors import InvalidInputError
+from gausslite.evaluation.lpips import LPIPS_HELP
 from gausslite.mission.settings import POSE_PRIOR_HELP
 from gausslite_bench.cli.argument_types import read_image_size, read_seeds
 from gausslite_bench.quality.home_scenes import HomeScenePlan
@@ -55,14 +56,7 @@ def add_study_options(parser: argparse.ArgumentParser, default_seeds: tuple[int,
         help="size of the images that simulated cameras record and detectors see (default: --size, that of the maps)",
     )
     add("--threads", metavar="N", type=int, help="threads (default: all available cores)")
-    add(
-        "--lpips-weights",
-        metavar="PATH",
-        type=Path,
-        action="append",
-        default=[],
-        help="weights of AlexNet and LPIPS; repeatable (default: LPIPS is not computed)",
-    )
+    add("--lpips-weights", metavar="PATH", type=Path, help=LPIPS_HELP)
     add_real_sequence(parser)
 
 

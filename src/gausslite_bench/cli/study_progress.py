@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.state_file import write_atomic
+from gausslite.evaluation.lpips import load_lpips
 from gausslite.mission.build import open_models
 from gausslite.mission.results import write_json
 from gausslite_bench.quality.equal_time import first_visible_scene, load_rate, measure_rate, rate_trials
@@ -25,7 +26,7 @@ RATE_FILE = "rate.json"
 
 
 def run_with_progress(
-    study: Study, folder: Path, lpips_weights: list[Path], reuse_other_code: bool = False
+    study: Study, folder: Path, lpips_weights: Path | None, reuse_other_code: bool = False
 ) -> StudyResults:
     """Return the results of the study; finished trials are cached in the folder. Raises GaussLiteError."""
     # invalid names, numbers and files must fail before hours of work
@@ -33,16 +34,12 @@ def run_with_progress(
         for trial in study.trials(plan):
             _ = trial.mission
     open_models(study.conditions.perception.detector)
-    perceptual = None
-    if lpips_weights:
-        from gausslite_bench.quality.lpips import load_lpips
-
-        perceptual = load_lpips(lpips_weights)
+    lpips = None if lpips_weights is None else load_lpips(lpips_weights, study.conditions.threads)
     cache = TrialCache(folder)
     study = _with_measured_rate(study, folder / RATE_FILE)
-    _warn_about_other_code(expected_origins(study, cache, perceptual is not None, reuse_other_code))
+    _warn_about_other_code(expected_origins(study, cache, lpips is not None, reuse_other_code))
     with _StudyBar(study.count) as bar:
-        finished = run_study(study, cache, perceptual, bar, reuse_other_code)
+        finished = run_study(study, cache, lpips, bar, reuse_other_code)
     origins = Counter(trial.origin for trial in finished)
     print_above_bar(f"trials: {', '.join(f'{count} {origin}' for origin, count in origins.items())}")
     return StudyResults(finished)

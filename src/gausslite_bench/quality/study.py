@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
-from gausslite.evaluation.compare import PerceptualDistance
+from gausslite.evaluation.lpips import Lpips
 from gausslite_bench.quality.scenes import Scene, ScenePlan, UnseenRegionError
 from gausslite_bench.quality.trial_cache import CachedTrial, TrialCache
 from gausslite_bench.quality.trials import (
@@ -118,7 +118,7 @@ class _MapCache:
 def run_study(
     study: Study,
     cache: TrialCache,
-    perceptual: PerceptualDistance | None,
+    lpips: Lpips | None,
     observer: StudyObserver,
     reuse_other_code: bool = False,
 ) -> list[FinishedTrial]:
@@ -133,7 +133,7 @@ def run_study(
     for plan in study.plans:
         maps.enter_scene(plan)
         trials = study.trials(plan)
-        cached_trials = [_look_up(trial, cache, perceptual is not None, reuse_other_code) for trial in trials]
+        cached_trials = [_look_up(trial, cache, lpips is not None, reuse_other_code) for trial in trials]
         scene: Scene | None = None
         if any(cached is None for cached, _ in cached_trials):
             try:
@@ -148,7 +148,7 @@ def run_study(
             else:
                 assert scene is not None
                 trial_map = maps.get_or_build(trial, scene, observer)
-                result, images = evaluate_map(trial_map, trial, scene, perceptual)
+                result, images = evaluate_map(trial_map, trial, scene, lpips)
                 cache.store_trial(trial, result, images)
             finished.append(FinishedTrial(trial, result, origin))
             observer.on_finished(finished[-1])

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from statistics import fmean, pstdev
 
+from gausslite.evaluation.lpips import NAME as LPIPS_NAME
 from gausslite_bench.quality.study import FinishedTrial
 from gausslite_bench.quality.trials import TrialBudget
 
@@ -38,7 +39,7 @@ class Metric:
 ROI_METRICS = (
     Metric("PSNR↑", "roi_psnr", 2),
     Metric("SSIM↑", "roi_ssim", 3),
-    Metric("LPIPS↓", "roi_lpips", 3),
+    Metric(f"{LPIPS_NAME}↓", "roi_lpips", 3),
     Metric("depth L1 [cm]↓", "roi_depth_l1_m", 2, 100.0),
     Metric("covered [%]↑", "roi_covered", 1, 100.0),
     Metric("Laplacian ratio↑", "roi_laplacian_ratio", 2),
@@ -47,7 +48,7 @@ ROI_METRICS = (
 FULL_METRICS = (
     Metric("PSNR↑", "full_psnr", 2),
     Metric("SSIM↑", "full_ssim", 3),
-    Metric("LPIPS↓", "full_lpips", 3),
+    Metric(f"{LPIPS_NAME}↓", "full_lpips", 3),
     Metric("depth L1 [cm]↓", "full_depth_l1_m", 2, 100.0),
     Metric("Laplacian ratio↑", "full_laplacian_ratio", 2),
     Metric("GMSD↓", "full_gradient_deviation", 3),

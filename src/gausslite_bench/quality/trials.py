@@ -16,7 +16,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.evaluation.compare import MapScores, PerceptualDistance, average, score_view
+from gausslite.evaluation.compare import MapScores, average, score_view
+from gausslite.evaluation.lpips import Lpips
 from gausslite.evaluation.pictures import to_uint8
 from gausslite.evaluation.views import MapViewer, largest_roi_views, render_fitted, render_fitted_at_region
 from gausslite.mission.build import EstimatorFactory, build_mapper
@@ -214,7 +215,7 @@ def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Tr
 
 
 def evaluate_map(
-    trial_map: TrialMap, trial: Trial, scene: Scene, perceptual: PerceptualDistance | None
+    trial_map: TrialMap, trial: Trial, scene: Scene, lpips: Lpips | None
 ) -> tuple[TrialResult, ViewImages]:
     """Return the map's scores on the held-out views, and its renderings for the sheets. Raises GaussLiteError."""
     viewer = MapViewer(trial_map.gaussians, choose_rasterizer(threads=trial.conditions.threads))
@@ -222,11 +223,11 @@ def evaluate_map(
     scores, fitted, region_fitted, images = [], [], [], {}
     for i, view in enumerate(scene.held_out):
         rendering = viewer.render_frame(view.frame)
-        scores.append(score_view(rendering, view, perceptual))
+        scores.append(score_view(rendering, view, lpips))
         if trial.plan.pose_policy.fit_views:
-            fitted.append(score_view(render_fitted(viewer, view.frame), view, perceptual))
+            fitted.append(score_view(render_fitted(viewer, view.frame), view, lpips))
             if view.shows_region:
-                region_fitted.append(score_view(render_fitted_at_region(viewer, view), view, perceptual))
+                region_fitted.append(score_view(render_fitted_at_region(viewer, view), view, lpips))
         if i in shown:
             images[i] = to_uint8(rendering.rgb)
     result = TrialResult(
