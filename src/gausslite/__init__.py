@@ -49,6 +49,8 @@ if TYPE_CHECKING:
         map_sequence,
         open_calibrated,
         open_sequence,
+        region_at,
+        region_on_image,
         render_view,
         save_ply,
     )
@@ -91,6 +93,8 @@ __all__ = [
     "map_sequence",
     "open_calibrated",
     "open_sequence",
+    "region_at",
+    "region_on_image",
     "render_view",
     "save_ply",
 ]

@@ -40,6 +40,7 @@ from gausslite.mission.settings import (
     default_policy,
 )
 from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.pointing import region_at, region_on_image
 from gausslite.perception.questions import Z_UP, Answer, answer
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
@@ -80,6 +81,8 @@ __all__ = [
     "map_sequence",
     "open_calibrated",
     "open_sequence",
+    "region_at",
+    "region_on_image",
     "render_view",
     "save_ply",
 ]

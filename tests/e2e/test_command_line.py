@@ -69,7 +69,7 @@ def test_map_writes_a_map_of_the_task_and_a_report(mug_map: Path) -> None:
 
 def test_eval_prints_lpips_with_a_file_of_it(mug_map: Path, shared_dir: Path) -> None:
     file = shared_dir / "models" / "lpips_squeeze.onnx"
-    ball = ("--size", "160x120", "--test-every", "4", "--set", "roi-ball=2,2,0.8,0.5")
+    ball = ("--size", "160x120", "--test-every", "4", "--set", "target-at=2,2,0.8,0.5")
     done = gausslite("eval", mug_map / "map.ply", HOME, *ball, "--set", f"lpips-weights={file}", "--json")
     scores = json.loads(done.stdout)
     assert 0.0 < scores["roi_lpips"] < scores["full_lpips"] < 1.0
@@ -87,7 +87,7 @@ def test_eval_scores_a_map_on_frames(mug_map: Path) -> None:
         "--test-every",
         "4",
         "--set",
-        "roi-ball=2,2,0.8,0.5",
+        "target-at=2,2,0.8,0.5",
         "--json",
     )
     assert done.returncode == 0, done.stderr
@@ -166,7 +166,7 @@ def test_every_wrong_input_gives_one_line_and_exit_code_two(tmp_path: Path, mug_
         "seed": ("map", HOME, *task, "--seed=-1", *out),
         "size: expected": ("map", HOME, *task, "--size", "9" * 5000 + "x10", *out),
         "frames '99": ("map", HOME, *task, "--frames", "9" * 5000 + ":", *out),
-        "ball": ("map", HOME, "--set", "roi-ball=0,0,0,1e300", *out),
+        "ball": ("map", HOME, "--set", "target-at=0,0,0,1e300", *out),
         "UTF-8": ("parse", "find the m\udcffg"),
         "refine-iterations": ("demo", "--set", "refine-iterations=1000000", *out),
         "a-file": ("map", HOME, *task, "--out", tmp_path / "a-file"),

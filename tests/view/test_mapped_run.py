@@ -38,7 +38,7 @@ def map_region(sequence: Path, out: Path, *more: str) -> None:
         str(sequence),
         *common,
         "--set",
-        "roi-ball=0,0,2,0.4",
+        "target-at=0,0,2,0.4",
         "--test-every",
         "5",
         "--out",

@@ -167,14 +167,14 @@ def parse_task(options: argparse.Namespace) -> TaskGraph | None:
     """
     regions = has_regions(options)
     if options.task is not None and regions:
-        raise InvalidInputError("--task: give either a task, or regions with --roi, --objects or roi-ball, not both")
+        raise InvalidInputError("--task: give either a task, or regions with --roi, --objects or target-at, not both")
     if options.detector is not None and options.task is None:
         raise InvalidInputError("--detector: it finds the nouns of a task; give the task with --task TEXT")
     if options.task is None:
         if options.policy is not None and not regions and MissionSettings(policy=options.policy).follows_task:
             raise InvalidInputError(
                 f"--policy {options.policy}: expected a task, with --task TEXT, or regions, with --roi FILE.npz or "
-                "--set roi-ball=X,Y,Z,R"
+                "--set target-at=X,Y,Z[,R]"
             )
         return None
     from gausslite.task.rules import RuleParser
@@ -217,7 +217,7 @@ def _with_advice(error: GaussLiteError, options: argparse.Namespace, require_pos
 
 def has_regions(options: argparse.Namespace) -> bool:
     """Return True if the options select regions of space."""
-    return bool(options.roi is not None or options.objects or options.roi_ball)
+    return bool(options.roi is not None or options.objects or options.target_at)
 
 
 def choose_roi(options: argparse.Namespace, source: Source) -> TaskGraph | list[Region]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
@@ -22,15 +24,19 @@ from gausslite.config.values import (
 )
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
-from gausslite.domain.relevance import Region
+from gausslite.domain.relevance import Region, TargetPoint
 from gausslite.mission.runner import region_file_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
 from gausslite.process import Sibling, print_message, sibling
 
 _MESSAGE_WIDTH, _VALUE_WIDTH = 150, 30
 """Characters of a message on an estimate, and of the value in it; `gausslite calibrate` prints longer ones."""
+_SEARCHED_FRAMES = 60
+"""Frames of a recording, evenly spaced, of which one shows a point of target-at best."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +134,7 @@ def _report_estimate(evidence: Evidence) -> None:
 
 
 def selected_regions(options: argparse.Namespace, source: Source) -> list[Region]:
-    """Return the objects of --roi (those of --objects, or all) and every ball of roi-ball.
+    """Return the objects of --roi (those of --objects, or all) and the regions of target-at.
 
     --objects without --roi selects regions of the source. Empty if the user selects nothing. Raises
     InvalidInputError, DatasetError.
@@ -141,7 +147,23 @@ def selected_regions(options: argparse.Namespace, source: Source) -> list[Region
     elif options.objects:
         report_region_file(options.source, source)
         regions += choose_regions(source.regions(), options.objects)
-    return [*regions, *options.roi_ball]
+    return [*regions, *(_target_region(point, source) for point in options.target_at)]
+
+
+def _target_region(point: TargetPoint, source: Source) -> Region:
+    """Return the ball of a point with a radius, else the object there. Raises InvalidInputError."""
+    if point.radius_m is not None:
+        return point.ball()
+    from gausslite.perception.pointing import region_at
+
+    step = max(1, len(source) // _SEARCHED_FRAMES)
+    return region_at(point.point_m, _readable_frames(source, range(0, len(source), step)))
+
+
+def _readable_frames(source: Source, positions: Sequence[int]) -> Iterator[Frame]:
+    for position in positions:
+        with suppress(DatasetError, PoseError):
+            yield source.frame(position)
 
 
 def report_region_file(spec: str, source: Source) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
-from gausslite.domain.relevance import BallRegion
+from gausslite.domain.relevance import TargetPoint
 from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid
 
 AUTO, NONE = "auto", "none"
@@ -69,18 +69,20 @@ def write_numbers(values: Sequence[float]) -> str:
     return ",".join(f"{value:.17g}" for value in values)
 
 
-def read_balls(texts: Sequence[str]) -> tuple[BallRegion, ...]:
-    """Return the balls of "x,y,z,r", in metres. Raises ArgumentTypeError, InvalidInputError."""
-    balls = []
+def read_target_points(texts: Sequence[str]) -> tuple[TargetPoint, ...]:
+    """Return the points of "x,y,z" or "x,y,z,r", in metres. Raises ArgumentTypeError, InvalidInputError."""
+    points = []
     for text in texts:
-        x, y, z, radius_m = read_numbers(text, 4)
-        balls.append(BallRegion((x, y, z), radius_m))
-    return tuple(balls)
+        x, y, z, *radius_m = read_numbers(text, 3 if text.count(",") == 2 else 4)
+        points.append(TargetPoint((x, y, z), *radius_m))
+    return tuple(points)
 
 
-def write_balls(balls: Sequence[BallRegion]) -> list[str]:
-    """Return the texts that `read_balls` reads."""
-    return [write_numbers((*ball.centre_m, ball.radius_m)) for ball in balls]
+def write_target_points(points: Sequence[TargetPoint]) -> list[str]:
+    """Return the texts that `read_target_points` reads."""
+    return [
+        write_numbers(point.point_m if point.radius_m is None else (*point.point_m, point.radius_m)) for point in points
+    ]
 
 
 def read_registration(text: str) -> DepthRegistration | None:

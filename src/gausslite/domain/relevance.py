@@ -55,6 +55,21 @@ class BallRegion:
         return result
 
 
+@dataclass(frozen=True, slots=True)
+class TargetPoint:
+    """A point in the world that a person gives as the target: all within radius_m of it, None for the object there."""
+
+    point_m: tuple[float, float, float]
+    radius_m: float | None = None
+
+    def __post_init__(self) -> None:
+        self.ball()
+
+    def ball(self) -> BallRegion:
+        """Return the ball of the radius, of a metre without one. Raises InvalidInputError."""
+        return BallRegion(self.point_m, 1.0 if self.radius_m is None else self.radius_m)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelRegion:
     """Surface points in the listed voxels floor(p / size) or their neighbours."""

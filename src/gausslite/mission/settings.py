@@ -13,16 +13,16 @@ from gausslite.config.values import (
     CORRECTION_FORM,
     NONE,
     PRIOR_FORM,
-    read_balls,
     read_correction,
     read_prior,
     read_registration,
+    read_target_points,
     read_text,
     read_up_axis,
-    write_balls,
     write_correction,
     write_numbers,
     write_prior,
+    write_target_points,
 )
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import MotionModel
@@ -30,7 +30,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import meant_by
 from gausslite.domain.pose import UpAxis, require_up_axis
 from gausslite.domain.recording import TRACKED_PRIOR, CameraCorrection, DepthRegistration, PoseExposurePrior
-from gausslite.domain.relevance import BallRegion, Region
+from gausslite.domain.relevance import Region, TargetPoint
 from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM, disable, follows_task, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mapping.training import SkippableStage
@@ -181,14 +181,14 @@ class TaskSettings:
     task: str | None = option(None, 'the robot\'s task, such as "Pick up the mug on the table"', metavar="TEXT")
     roi: Path | None = option(None, "voxel file of ground-truth regions", metavar="FILE.npz", metadata=FILE)
     objects: tuple[str, ...] = option((), "objects of --roi (default: all) or of SOURCE", metavar="A,B")
-    roi_ball: tuple[BallRegion, ...] = option(
+    target_at: tuple[TargetPoint, ...] = option(
         (),
-        "balls of space in metres",
-        metavar="X,Y,Z,R",
+        "points on target objects in metres; with a radius, all within it",
+        metavar="X,Y,Z[,R]",
         repeats=True,
         plain_type=tuple[str, ...],
-        convert=read_balls,
-        to_plain=write_balls,
+        convert=read_target_points,
+        to_plain=write_target_points,
     )
 
 

@@ -50,6 +50,26 @@ class DepthSegmenter:
         """Return the largest surface in the centre region of each box; None if that region has no depth."""
         return [self._segment_box(frame, box) for box in boxes_px]
 
+    def grow(self, frame: Frame, seed: tuple[int, int], allowed: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+        """Return the surface around a pixel (row, column), as far as depth and colour are continuous."""
+        rows, columns = np.flatnonzero(allowed.any(axis=1)), np.flatnonzero(allowed.any(axis=0))
+        window = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+        layers = _similarity_image(np.where(allowed, frame.depth_m, np.float32(0))[window], frame.rgb[window])
+        mask = np.zeros(allowed.shape, np.bool_)
+        mask[window] = self._flooded(layers, seed[0] - window[0].start, seed[1] - window[1].start)
+        return mask
+
+    def _flooded(self, layers: Float32[ndarray, "h w 3"], y: int, x: int) -> Bool[ndarray, "h w"]:
+        """Return the pixels that small steps connect with one pixel."""
+        step = (self._settings.depth_step, self._settings.colour_step, self._settings.colour_step)
+        height, width = layers.shape[:2]
+        flooded = np.zeros((height + 2, width + 2), np.uint8)
+        flags = cv2.FLOODFILL_MASK_ONLY | 4 | (1 << 8)
+        cv2.floodFill(layers, flooded, (x, y), newVal=0, loDiff=step, upDiff=step, flags=flags)
+        surface: Bool[ndarray, "h w"] = flooded[1:-1, 1:-1] > 0
+        surface[y, x] = True
+        return surface
+
     def _segment_box(self, frame: Frame, box_px: Float32[ndarray, "4"]) -> Bool[ndarray, "h w"] | None:
         height, width = frame.depth_m.shape
         left, top = np.clip(np.floor(box_px[:2]).astype(int), 0, (width, height)).tolist()
@@ -74,7 +94,6 @@ class DepthSegmenter:
     ) -> Bool[ndarray, "h w"] | None:
         """Return the surface with the most pixels in the centre region."""
         layers = _similarity_image(depth_m, rgb)
-        step = (self._settings.depth_step, self._settings.colour_step, self._settings.colour_step)
         height, width = depth_m.shape
         centre = np.zeros((height, width), np.bool_)
         inset = self._settings.centre_inset_share
@@ -84,11 +103,7 @@ class DepthSegmenter:
         best, best_count = None, 0
         while (seeds := np.flatnonzero(unvisited)).size > best_count:
             y, x = divmod(int(seeds[0]), width)
-            flooded = np.zeros((height + 2, width + 2), np.uint8)
-            flags = cv2.FLOODFILL_MASK_ONLY | 4 | (1 << 8)
-            cv2.floodFill(layers, flooded, (x, y), newVal=0, loDiff=step, upDiff=step, flags=flags)
-            surface = flooded[1:-1, 1:-1] > 0
-            surface[y, x] = True
+            surface = self._flooded(layers, y, x)
             unvisited &= ~surface
             count = int(np.count_nonzero(surface & centre))
             if count > best_count:

@@ -212,14 +212,14 @@ def _check_gap(options: argparse.Namespace, source: Source, held_out: Sequence[i
     regions, size = selected_regions(options, source), frame_size(options.size, source)
     if not regions:
         raise InvalidInputError(
-            "--unlimited: expected regions to score, with --roi FILE.npz, --objects A,B or --roi-ball X,Y,Z,R; got none"
+            "--unlimited: expected regions to score, with --roi FILE.npz, --objects A,B or --target-at X,Y,Z; got none"
         )
     if not any(HeldOutView.of(source.frame(position, size), regions).shows_region for position in held_out):
         raise InvalidInputError("--unlimited: expected a held-out frame that shows the region, got none")
 
 
 def _has_task(options: argparse.Namespace) -> bool:
-    return bool(options.task or options.roi or options.objects or options.roi_ball)
+    return bool(options.task or options.roi or options.objects or options.target_at)
 
 
 def overhead_line(overhead: Overhead) -> str:

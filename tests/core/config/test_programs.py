@@ -24,7 +24,7 @@ COMMANDS = ("map", "demo", "eval", "parse")
 BENCHMARKS = ("loop", "perception", "registration", "parser")
 TEXTS = {
     "up": "0,1,0",
-    "roi-ball": "0,0,1,0.5",
+    "target-at": "0,0,1,0.5",
     "register-depth": "500,500,320,240,0,0,0,0,0,0",
     "masks": "500,500,320,240,0,0,0,0,0,0",
     "camera-correction": "lens=radtan:0.1,0,0,0,0",

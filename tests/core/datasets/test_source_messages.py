@@ -88,7 +88,7 @@ def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_regions_of_the_folder_are_used_with_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_tum(tmp_path / "fr1")
     np.savez(folder / "roi_voxels.npz", voxel_size_m=0.02, mug_1=np.zeros((1, 3), np.int32))
-    options = argparse.Namespace(source=str(folder), roi=None, objects=("mug_1",), roi_ball=[])
+    options = argparse.Namespace(source=str(folder), roi=None, objects=("mug_1",), target_at=[])
     assert len(selected_regions(options, open_source(str(folder)))) == 1
     [line] = capsys.readouterr().err.splitlines()
     assert line == f"{folder}: the ground-truth regions of roi_voxels.npz in the sequence's folder are used"

@@ -23,7 +23,7 @@ def kitchen(tmp_path: Path) -> Path:
 
 
 def mapped(kitchen: Path, out: Path, *more: str) -> Path:
-    common = ["--set", "roi-ball=0,0,2,0.4", "--set", "threads=1", "--max-gaussians", "150", "--out", str(out)]
+    common = ["--set", "target-at=0,0,2,0.4", "--set", "threads=1", "--max-gaussians", "150", "--out", str(out)]
     assert main(["map", str(kitchen), *common, *more]) == 0
     return out / "map.ply"
 

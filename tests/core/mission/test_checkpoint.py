@@ -154,7 +154,7 @@ def test_all_options_that_differ_are_named(saved: Path) -> None:
         "'uniform'), rate unset (got '4'), task 'Pick up the mug on the table' (got 'Find the chair')"
     )
     # an option that only one of them has counts as a difference, unless its value is false; resegment is no option now
-    assert ResumeConfig({"Other": {"roi_ball": [], "resegment": False, "spool": None}}).differences() == ()
+    assert ResumeConfig({"Other": {"target_at": [], "resegment": False, "spool": None}}).differences() == ()
     assert ResumeConfig({"Other": {"size": "1x2"}}).differences() == ("size '1x2' (got unset)",)
 
 

@@ -25,7 +25,7 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 
 def mapped(sequence: Path, out: Path, *more: str) -> int:
     # without estimates, because these tests count which frames are read
-    common = ["--set", "roi-ball=0,0,2,0.4", "--set", "threads=1", "--max-gaussians", "150"]
+    common = ["--set", "target-at=0,0,2,0.4", "--set", "threads=1", "--max-gaussians", "150"]
     common += ["--set", "register-depth=none", "--set", "pose-prior=none"]
     return main(["map", str(sequence), *common, "--out", str(out), *more])
 

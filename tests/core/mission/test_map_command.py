@@ -145,7 +145,7 @@ def test_without_task_and_region_mapping_is_uniform(tmp_path: Path, capsys: pyte
     assert map_command(sequence, tmp_path / "out") == 0
     assert "mapping everything equally (--policy uniform)" in capsys.readouterr().err
     assert report_of(tmp_path / "out")["policy"] == "uniform"
-    assert map_command(sequence, tmp_path / "region", "--set", "roi-ball=0,0,2,0.4") == 0
+    assert map_command(sequence, tmp_path / "region", "--set", "target-at=0,0,2,0.4") == 0
     assert report_of(tmp_path / "region")["policy"] == "task"
 
 

@@ -13,7 +13,7 @@ from gausslite.cli.main import main
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
 EMPTY_SAFETENSORS = struct.pack("<Q", 2) + b"{}"
-BALL = ("--set", "roi-ball=0,0,2,0.4")
+BALL = ("--set", "target-at=0,0,2,0.4")
 WITHOUT_ESTIMATES = ("--set", "register-depth=none", "--set", "pose-prior=none")
 
 
@@ -27,6 +27,11 @@ WITHOUT_ESTIMATES = ("--set", "register-depth=none", "--set", "pose-prior=none")
             ("--task", "Find the mug", "--set", "task-at=4:Find the chair", "--set", "task-at=4:Find the table"),
             "task-at: expected one task for a frame, got 2 for 4",
         ),
+        (
+            ("--set", "target-at=0,0,50"),
+            "target 0,0,50: expected a point on a surface that a frame shows, none shows it",
+        ),
+        (("--set", "target-at=0,0"), "target-at"),
         ((*BALL, "--set", "save-state={folder}"), "expected the name of a file, got a folder"),
         *(
             (

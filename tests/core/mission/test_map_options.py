@@ -70,7 +70,7 @@ def test_save_ply_names_the_world_frame(tmp_path: Path) -> None:
 
 def test_negative_first_coordinates_are_values(tmp_path: Path) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
-    assert map_command(sequence, tmp_path / "out", "--set", "roi-ball=-.1,-2e-1,2,0.4", "--set", "up=-1,0,0") == 0
+    assert map_command(sequence, tmp_path / "out", "--set", "target-at=-.1,-2e-1,2,0.4", "--set", "up=-1,0,0") == 0
 
 
 def test_a_missing_file_of_regions_is_not_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from gausslite.cli.main import main
 def map_command(folder: Path, out: Path, *more: str) -> list[str]:
     common = [
         "--set",
-        "roi-ball=0,0,2,0.4",
+        "target-at=0,0,2,0.4",
         "--set",
         "threads=1",
         "--max-gaussians",
@@ -35,7 +35,7 @@ def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: 
         (("--size", "32x24"), "size '"),
         (("--rate", "5"), "rate unset (got '5')"),
         (("--policy", "uniform"), "policy 'task' (got 'uniform')"),
-        (("--set", "roi-ball=0,0,1,0.4"), "roi-ball '0,0,2,0.4' (got '0,0,2,0.4,0,0,1,0.4')"),
+        (("--set", "target-at=0,0,1,0.4"), "target-at '0,0,2,0.4' (got '0,0,2,0.4,0,0,1,0.4')"),
         (("--set", "register-depth=20,20,7.5,5.5"), "register-depth unset (got '20,20,7.5,5.5,0,0,0,0,0,0')"),
         (("--set", "up=0,-1,0"), "up unset (got '0,-1,0')"),
     ):

@@ -1,0 +1,96 @@
+"""Regions that a person points at: their overlap with ground truth, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gausslite.datasets.open import open_source
+from gausslite.domain.camera import Camera, back_project
+from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import transform_points
+from gausslite.domain.relevance import Region
+from gausslite.perception.pointing import region_at, region_on_image
+
+
+@pytest.fixture(scope="module")
+def home() -> tuple[list[Frame], Region]:
+    """Frames of a simulated home, and the mug's exact region."""
+    source = open_source("sim:home")
+    return [source.frame(i) for i in range(0, len(source), 12)], source.regions()["mug"]
+
+
+def best_view(frames: list[Frame], mug: Region) -> tuple[Frame, tuple[int, int]]:
+    """Return the frame that shows most of the mug, and the row and column of a pixel in the mug's middle."""
+    frame = max(frames, key=lambda frame: np.count_nonzero(mug.mask(frame)))
+    rows, columns = np.nonzero(mug.mask(frame))
+    nearest = np.argmin((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2)
+    return frame, (int(rows[nearest]), int(columns[nearest]))
+
+
+def iou(region: Region, truth: Region, frames: list[Frame]) -> float:
+    masks = [(region.mask(frame), truth.mask(frame)) for frame in frames]
+    shared = sum(np.count_nonzero(mask & exact) for mask, exact in masks)
+    return shared / sum(np.count_nonzero(mask | exact) for mask, exact in masks)
+
+
+def test_a_click_on_one_frame_gives_the_object_in_all_frames(home) -> None:
+    frames, mug = home
+    frame, (row, column) = best_view(frames, mug)
+    region = region_on_image(frame, [(column + 0.5, row + 0.5)])
+    assert iou(region, mug, frames) > 0.7
+
+
+def test_a_box_gives_the_object_in_it(home) -> None:
+    frames, mug = home
+    frame, _ = best_view(frames, mug)
+    rows, columns = np.nonzero(mug.mask(frame))
+    box = (float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1))
+    assert iou(region_on_image(frame, boxes_px=[box]), mug, frames) > 0.6
+
+
+def test_a_point_in_the_world_gives_the_same_region_as_the_click(home) -> None:
+    frames, mug = home
+    frame, (row, column) = best_view(frames, mug)
+    p_camera = back_project(frame.depth_m, frame.camera)[row, column]
+    x, y, z = transform_points(frame.T_world_camera, p_camera[None].astype(np.float64))[0].tolist()
+    assert iou(region_at((x, y, z), frames), mug, frames) > 0.7
+
+
+def wall(depth_m: float) -> Frame:
+    return Frame(
+        7,
+        0,
+        np.full((60, 80, 3), 90, np.uint8),
+        np.full((60, 80), depth_m, np.float32),
+        Camera(90, 90, 40, 30, 80, 60),
+        np.eye(4),
+    )
+
+
+@pytest.mark.parametrize(
+    ("prompt", "depth_m", "message"),
+    [
+        ({"points_px": [(80, 10)]}, 1.0, "point 80,10: expected a pixel of the image of 80x60"),
+        ({"points_px": [(-0.5, 10)]}, 1.0, "point -0.5,10: expected a pixel of the image of 80x60"),
+        ({"points_px": [(float("nan"), 10)]}, 1.0, "point nan,10: expected a pixel of the image of 80x60"),
+        ({"points_px": [(4, 10)]}, 0.0, "point 4,10: expected a pixel with depth, frame 7 has none there"),
+        ({"boxes_px": [(4, 4, 9, 9)]}, 0.0, "box 4,4,9,9: expected pixels with depth, frame 7 has none there"),
+        (
+            {"boxes_px": [(9, 4, 4, 9)]},
+            1.0,
+            "box 9,4,4,9: expected left,top,right,bottom in the image of 80x60",
+        ),
+        ({}, 1.0, "points: expected at least one point or box, got none"),
+    ],
+)
+def test_a_point_outside_the_image_or_without_depth_is_refused(prompt, depth_m, message) -> None:
+    with pytest.raises(InvalidInputError) as error:
+        region_on_image(wall(depth_m), **prompt)
+    assert str(error.value) == message
+
+
+def test_a_point_that_no_frame_shows_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="target 0,0,2: expected a point on a surface that a frame shows"):
+        region_at((0.0, 0.0, 2.0), [wall(1.0)])
