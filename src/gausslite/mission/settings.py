@@ -53,6 +53,7 @@ FILE = {"is_file": True}
 """Metadata of a settings field that names a file: a resumed run compares the name and not the folder."""
 
 REMOVED = {
+    "roi-ball": "target-at=X,Y,Z,R maps the ball, and target-at=X,Y,Z the object at a point",
     "resegment": "masks between detections are cut by depth, which is as accurate in a third of the time",
 }
 """Options of earlier versions, and what has replaced them."""
