@@ -84,6 +84,8 @@ def _report(options: argparse.Namespace, content: MapContent, out: Path, part: s
     chosen, size = FORMATS[options.to], out.stat().st_size
     for note in content.notes:
         print_message(note)
+    if options.to in _FORMATS_OF["min_opacity"] and not content.views:
+        print_message("free space is unknown: expected a results folder with keyframes.json, got none")
     if options.json:
         counts = {"gaussians": len(content.chosen), "left_out": content.left_out, "bytes": size}
         print(as_text({"file": str(out), "format": options.to, **counts}))

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
@@ -17,8 +17,17 @@ from gausslite.codec.run_files import KeyframeView, read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians
+from gausslite.export.free_space import free_voxels
 from gausslite.export.mesh import Render, write_mesh
-from gausslite.export.occupancy import NAV2_IMAGE, OccupancySettings, write_nav2, write_octomap
+from gausslite.export.occupancy import (
+    NAV2_IMAGE,
+    NO_VOXELS,
+    OccupancySettings,
+    occupied_voxels,
+    require_voxels,
+    write_nav2,
+    write_octomap,
+)
 from gausslite.export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite.export.video import write_video
 from gausslite.process import import_extra
@@ -101,8 +110,8 @@ class MapContent:
 class ExportSettings:
     """How to write a map.
 
-    renderer: returns a function that renders a map; meshes and videos need it. occupancy: for octomap and nav2; its
-    voxel size is also the mesh's. progress: wraps the rendered views. video_s: length of a video.
+    renderer: returns a function that renders a map; all formats that use the keyframes need it. occupancy: for octomap
+    and nav2; its voxel size is also the mesh's. progress: wraps the rendered views. video_s: length of a video.
     """
 
     renderer: Callable[[Gaussians], Render]
@@ -203,6 +212,16 @@ def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
     write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
+def _free(content: MapContent, settings: ExportSettings) -> Int64[ndarray, "f 3"]:
+    """Return the free voxels in the box around the chosen Gaussians; none of them holds a Gaussian of the whole map."""
+    if not content.views:
+        return NO_VOXELS
+    occupancy = settings.occupancy
+    chosen, occupied = require_voxels(content.chosen, occupancy), occupied_voxels(content.gaussians, occupancy)
+    views, render = settings.progress(content.views), settings.renderer(content.gaussians)
+    return free_voxels(views, render, chosen, occupied, occupancy.voxel_m)
+
+
 def _video(path: Path, content: MapContent, settings: ExportSettings) -> None:
     write_video(path, content.views, settings.renderer(content.chosen), settings.video_s, settings.progress)
 
@@ -224,14 +243,14 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
         "las": Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen)),
         "octomap": Format(
             ".bt",
-            "occupied voxels of the region",
-            lambda path, map_, settings: write_octomap(path, map_.chosen, settings.occupancy),
+            "occupied and free voxels of the region",
+            lambda path, map_, settings: write_octomap(path, map_.chosen, settings.occupancy, _free(map_, settings)),
             region_only=True,
         ),
         "nav2": Format(
             ".yaml",
             "2D grid",
-            lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy),
+            lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy, _free(map_, settings)),
             companion=NAV2_IMAGE,
         ),
         "mesh": Format(".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True),

@@ -1,7 +1,7 @@
 """Find the voxels that the Gaussians occupy and write them for planners: OctoMap trees and nav2 grids.
 
-A map of Gaussians holds surfaces and no observation of free space. A voxel without a surface is therefore unknown in
-an OctoMap file, and a grid cell is free only where the map has a floor.
+A map of Gaussians holds surfaces; free space is what its keyframes see through (`free_space`). All other space is
+unknown. Without keyframes a voxel is never free, and a grid cell only where the map has a floor.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ NAV2_IMAGE = ".pgm"
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 """Grey values of nav2's trinary map images."""
 _FLOOR_PERCENTILE = 2.0
+NO_VOXELS: Int64[ndarray, "0 3"] = np.zeros((0, 3), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +75,16 @@ def occupied_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[
     return np.unique(np.concatenate(found), axis=0)
 
 
-def write_octomap(path: Path, gaussians: Gaussians, settings: OccupancySettings) -> None:
-    """Write an OctoMap binary tree (.bt) of the occupied voxels; all other space is unknown.
+def write_octomap(
+    path: Path, gaussians: Gaussians, settings: OccupancySettings, free: Int64[ndarray, "f 3"] = NO_VOXELS
+) -> None:
+    """Write an OctoMap binary tree (.bt) of the occupied and the free voxels; all other space is unknown.
 
     Raises InvalidInputError without the pyoctomap package, without an occupied voxel or if the map reaches beyond
     OctoMap's keys; StorageError.
     """
     octomap = import_extra("pyoctomap", "export", "OctoMap files")
-    voxels = _require_voxels(gaussians, settings)
+    voxels = require_voxels(gaussians, settings)
     reach = int(np.maximum(-voxels.min(), voxels.max() + 1))
     if reach > _MAX_OCTOMAP_KEY:
         raise InvalidInputError(
@@ -89,8 +92,9 @@ def write_octomap(path: Path, gaussians: Gaussians, settings: OccupancySettings)
             f"{settings.voxel_m:g}, got one up to {reach * settings.voxel_m:g} m; use larger voxels"
         )
     tree = octomap.OcTree(settings.voxel_m)
-    for centre_m in (voxels + 0.5) * settings.voxel_m:
-        tree.updateNode(centre_m, True, True)
+    for cells, occupied in ((free, False), (voxels, True)):
+        for centre_m in (cells + 0.5) * settings.voxel_m:
+            tree.updateNode(centre_m, occupied, True)
     tree.updateInnerOccupancy()
 
     def write(partial: Path) -> None:
@@ -101,13 +105,16 @@ def write_octomap(path: Path, gaussians: Gaussians, settings: OccupancySettings)
     write_atomic_with(path, write)
 
 
-def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) -> None:
+def write_nav2(
+    path: Path, gaussians: Gaussians, settings: OccupancySettings, free: Int64[ndarray, "f 3"] = NO_VOXELS
+) -> None:
     """Write a nav2 map: `path` is the YAML file, the image next to it has the suffix NAV2_IMAGE.
 
     The grid lies in x and y, so the map's z axis must point up. The floor is at the 2nd percentile of the occupied
-    heights. Raises InvalidInputError without an occupied voxel or if the grid is too large, StorageError.
+    heights. A cell is free over a floor or with a free voxel at an obstacle's height, unless an obstacle is in it.
+    Raises InvalidInputError without an occupied voxel or if the grid is too large, StorageError.
     """
-    image, origin_m = _grid(_require_voxels(gaussians, settings), settings)
+    image, origin_m = _grid(require_voxels(gaussians, settings), free, settings)
     encoded, data = cv2.imencode(".pgm", image)
     if not encoded:
         raise InvalidInputError(f"nav2: expected an image that OpenCV can encode, got {image.shape}")
@@ -125,7 +132,7 @@ def write_nav2(path: Path, gaussians: Gaussians, settings: OccupancySettings) ->
     write_atomic(path, yaml.safe_dump(description, sort_keys=False).encode())
 
 
-def _require_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[ndarray, "v 3"]:
+def require_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[ndarray, "v 3"]:
     """Return the occupied voxels, at least one. Raises InvalidInputError."""
     voxels = occupied_voxels(gaussians, settings)
     if not len(voxels):
@@ -137,7 +144,7 @@ def _require_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[
 
 
 def _grid(
-    voxels: Int64[ndarray, "v 3"], settings: OccupancySettings
+    voxels: Int64[ndarray, "v 3"], free: Int64[ndarray, "f 3"], settings: OccupancySettings
 ) -> tuple[UInt8[ndarray, "h w"], Float64[ndarray, "2"]]:
     """Return the grid image, its first row at the largest y, and the position of its lower left corner in metres."""
     first, last = voxels.min(axis=0), voxels.max(axis=0)
@@ -147,14 +154,16 @@ def _grid(
             f"nav2: expected at most {_MAX_GRID_CELLS} cells, got {width} x {height}; use a larger --voxel"
         )
     floor = np.percentile(voxels[:, 2], _FLOOR_PERCENTILE)
-    above_m = (voxels[:, 2] - floor) * settings.voxel_m
+    above_m, free_above_m = ((found[:, 2] - floor) * settings.voxel_m for found in (voxels, free))
+    low_m, high_m = settings.height_m
     image = np.full((height, width), _UNKNOWN, np.uint8)
-    for values, mask in (
-        (_FREE, above_m < settings.height_m[0]),
-        (_OCCUPIED, (above_m >= settings.height_m[0]) & (above_m <= settings.height_m[1])),
+    for value, found in (
+        (_FREE, free[(free_above_m >= low_m) & (free_above_m <= high_m)]),
+        (_FREE, voxels[above_m < low_m]),
+        (_OCCUPIED, voxels[(above_m >= low_m) & (above_m <= high_m)]),
     ):
-        cells = voxels[mask, :2] - first[:2]
-        image[height - 1 - cells[:, 1], cells[:, 0]] = values
+        cells = found[:, :2] - first[:2]
+        image[height - 1 - cells[:, 1], cells[:, 0]] = value
     return image, first[:2] * settings.voxel_m
 
 
