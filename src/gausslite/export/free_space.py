@@ -44,7 +44,8 @@ def free_voxels(
         _carve(free, first, view, render, voxel_m)
     taken = occupied - first
     free[tuple(taken[((taken >= 0) & (taken < free.shape)).all(axis=1)].T)] = False
-    return np.argwhere(free) + first
+    found: Int64[ndarray, "f 3"] = np.argwhere(free) + first
+    return found
 
 
 def _carve(
