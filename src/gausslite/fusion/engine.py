@@ -205,7 +205,7 @@ class FusionEngine:
         """
         agent_id = self.session(session_id).agent_id
         self._require_own(agent_id, subset.agent_id, grid)
-        future = self._committer.add(PendingUpdate(session_id, agent_id, StoredSubset.exact(subset)))
+        future = self._enqueue(PendingUpdate(session_id, agent_id, StoredSubset.exact(subset)))
         self._committer.commit()
         # another thread may be committing it
         return future.result()
@@ -215,7 +215,10 @@ class FusionEngine:
 
         The message is decoded when it is its agent's turn. Raises UnavailableError.
         """
-        put = self._committer.add(PendingUpdate(session.session_id, session.agent_id, message))
+        return self._enqueue(PendingUpdate(session.session_id, session.agent_id, message))
+
+    def _enqueue(self, update: PendingUpdate) -> Future[PutOutcome]:
+        put = self._committer.add(update)
         self._acknowledgements.add(put)
         return put
 

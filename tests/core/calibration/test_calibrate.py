@@ -31,6 +31,12 @@ def map_inputs(spec: str) -> MapInputs:
     return MapInputs.of(options).calibrated(StatedValues())
 
 
+def opening(note: str) -> tuple[str, str]:
+    """Return the option and the first words of a note: `map` prints neither long values nor all reasons."""
+    option, _, reasons = note.partition(": ")
+    return option.split()[0], reasons[:60]
+
+
 def require_same(spec: str, capsys: pytest.CaptureFixture[str]) -> gl.CalibratedSequence:
     """Assert that Python and `map` decide alike; return the sequence of the Python API."""
     in_python = gl.open_calibrated(spec)
@@ -38,7 +44,7 @@ def require_same(spec: str, capsys: pytest.CaptureFixture[str]) -> gl.Calibrated
     printed = capsys.readouterr().err.splitlines()
     assert mapped.mission.pose_prior == in_python.pose_prior
     notes = [line for line in printed if line.startswith(("register-depth", "camera-correction", "pose-prior"))]
-    assert notes == list(in_python.notes)
+    assert list(map(opening, notes)) == list(map(opening, in_python.notes))
     for frame, other in (
         (in_python.source.frame(i), mapped.stream.source.frame(i)) for i in (0, len(mapped.stream) - 1)
     ):
