@@ -101,7 +101,7 @@ class LiveFrames:
         self._count("received")
         latest_ns = self._pending[-1].time_ns if self._pending else self._last_taken_ns
         if self._clock_has_jumped("colour", pending.time_ns, latest_ns):
-            self._forget()
+            self._clear()
         elif pending.time_ns <= latest_ns:
             self._count("out_of_order")
             return
@@ -115,7 +115,7 @@ class LiveFrames:
         """Add a depth image, raw or compressed."""
         time_ns = stamp_ns(message.header)
         if self._clock_has_jumped("depth", time_ns, self._depths[-1][0] if self._depths else -1):
-            self._forget()
+            self._clear()
         self._newest_ns = max(self._newest_ns, time_ns)
         # the number keeps equal stamps in order, so that messages are not compared
         insort(self._depths, (time_ns, self._depths_received, message))
@@ -143,14 +143,14 @@ class LiveFrames:
             late_ns.append(time_ns)
         return latest_ns - time_ns > self._max_wait_ns or len(late_ns) >= _LATE_IN_A_ROW
 
-    def _forget(self) -> None:
-        """Forget images, depths and moving transforms, which have stamps of another clock."""
+    def _clear(self) -> None:
+        """Drop images, depths and moving transforms, which have stamps of another clock."""
         for _ in self._pending:
             self._count("out_of_order")
         self._count("clock_jumps")
         self._pending.clear()
         self._depths.clear()
-        self._transforms.forget_moving()
+        self._transforms.clear_moving()
         self._newest_ns = self._last_taken_ns = -1
         self._late_ns = {"colour": [], "depth": []}
 

@@ -212,8 +212,8 @@ class TransformWindow:
             while self._is_far(kept[0], transform):
                 kept.popleft()
 
-    def forget_moving(self) -> None:
-        """Forget the transforms that are not static."""
+    def clear_moving(self) -> None:
+        """Drop the transforms that are not static."""
         for parents in self._by_child.values():
             for kept in parents.values():
                 if kept and kept[0].time_ns is not None:

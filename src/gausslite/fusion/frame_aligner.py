@@ -133,16 +133,16 @@ class FrameAligner:
         if np.array_equal(current.declared, T_fused_agent):
             return False
         self._alignments.put(agent_id, FrameAlignment(current.order, declared=T_fused_agent))
-        self._forget_comparisons(agent_id)
+        self._drop_comparisons(agent_id)
         if agent_id in self._maps:
             own = self._maps[agent_id]
             own.epoch, own.first_seq, own.changed = self._next_epoch(), 0, max(own.changed, len(own.samples))
         return True
 
     def remove_agent(self, agent_id: str) -> None:
-        """Forget the agent. Those that contradicted it are decided again with the next run."""
+        """Delete what is known of the agent. Those that contradicted it are decided again with the next run."""
         self._maps.pop(agent_id, None)
-        self._forget_comparisons(agent_id)
+        self._drop_comparisons(agent_id)
 
     def run(self, apply: Apply, drop_earlier: Callable[[str], bool]) -> None:
         """Compare the maps of the agents with enough new data, then decide. Raises StorageError.
@@ -288,7 +288,7 @@ class FrameAligner:
                 if other in self._alignments and alignment.fit is not None:
                     self._comparisons[frozenset((name, other))] = Comparison(alignment.fit, {name: 2})
 
-    def _forget_comparisons(self, agent_id: str) -> None:
+    def _drop_comparisons(self, agent_id: str) -> None:
         self._comparisons = {pair: found for pair, found in self._comparisons.items() if agent_id not in pair}
         self._is_undecided = True
 

@@ -199,7 +199,7 @@ class FrameAlignments:
         self._by_agent[agent_id] = alignment
 
     def remove_agent(self, agent_id: str) -> None:
-        """Forget the agent; the store deletes its record with its updates."""
+        """Delete the alignment of the agent; the store deletes its record with its updates."""
         self._by_agent.pop(agent_id, None)
 
     def transforms(self) -> dict[str, Float64[ndarray, "4 4"]]:

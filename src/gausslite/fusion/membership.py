@@ -155,7 +155,7 @@ class SessionRegistry:
         return ended
 
     def remove_agent(self, agent_id: str) -> None:
-        """Forget the token of an agent; the store deletes it with the agent's updates."""
+        """Delete the token of an agent; the store deletes it with the agent's updates."""
         self._token_hashes.pop(agent_id, None)
 
     def _sessions_of(self, agent_id: str) -> list[str]:
@@ -237,7 +237,7 @@ class Membership:
         return ended
 
     def remove_agent(self, agent_id: str) -> None:
-        """Forget the token of an agent, see SessionRegistry."""
+        """Delete the token of an agent, see SessionRegistry."""
         self._sessions.remove_agent(agent_id)
 
     def open_session(self, agent_id: str, token: str) -> SessionRecord:

@@ -245,7 +245,7 @@ class TeamObjects:
         return report.objects if report is not None and report.graph.is_equivalent_to(graph) else ()
 
     def remove_agent(self, agent_id: str) -> None:
-        """Forget the agent's report; the store deletes it with the agent's updates."""
+        """Delete the agent's report; the store deletes it with the agent's updates."""
         self._reports.pop(agent_id, None)
 
     def reports(self) -> dict[str, ObjectReport]:

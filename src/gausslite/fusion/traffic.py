@@ -150,7 +150,7 @@ class TrafficLog:
         return self._by_agent.get(agent_id, TrafficCounters())
 
     def remove_agent(self, agent_id: str) -> None:
-        """Forget the agent."""
+        """Delete the counters of the agent."""
         self._is_saved &= self._by_agent.pop(agent_id, None) is None
 
 

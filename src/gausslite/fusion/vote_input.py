@@ -144,7 +144,7 @@ class VoteInput:
         return _array(changed)
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " k"]:
-        """Forget the agent's moved voxels; returns them."""
+        """Delete the agent's moved voxels; returns them."""
         moved = self._moved.pop(agent_id, None)
         return _array(() if moved is None else moved.sources_of)
 
