@@ -15,7 +15,7 @@ from rosidl_runtime_py.utilities import get_message
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.robot import AgentLink
-from gausslite_ros.robot_session import PUBLICATIONS, Delivery, NodeParameters, Outgoing, RobotSession
+from gausslite_ros.robot_session import Delivery, NodeParameters, Outgoing, RobotSession, publications
 
 _QOS = {
     # a best-effort reader also receives from reliable writers
@@ -39,16 +39,20 @@ class GaussliteNode(Node):  # type: ignore[misc]
             message_type = get_message(wanted.message_type)
             self.create_subscription(message_type, wanted.topic, wanted.callback, _QOS[wanted.delivery])
         self._writers = {
-            topic: (get_message(name), self.create_publisher(get_message(name), topic, _QOS[Delivery.TRANSFORMS]))
-            for topic, name in PUBLICATIONS.items()
+            topic: (
+                kind := get_message(written.message_type),
+                self.create_publisher(kind, topic, _QOS[written.delivery]),
+            )
+            for topic, written in publications(parameters).items()
         }
         self.create_timer(parameters.tf_period_s, lambda: self._publish(self.session.transforms(self._now_ns())))
         self.create_timer(parameters.period_s, lambda: self._publish(self.session.status(self._now_ns())))
+        self.session.follow_map(self._publish, self._now_ns)
 
     def _publish(self, messages: list[Outgoing]) -> None:
         for outgoing in messages:
-            message_type, writer = self._writers[outgoing.topic]
-            message: Any = message_type()
+            writer = self._writers[outgoing.topic]
+            message: Any = writer.msg_type()
             set_message_fields(message, outgoing.fields)
             writer.publish(message)
 

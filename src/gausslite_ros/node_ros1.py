@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from array import array
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +17,7 @@ from roslib.message import get_message_class
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.robot import AgentLink
-from gausslite_ros.robot_session import PUBLICATIONS, Fields, NodeParameters, Outgoing, RobotSession
+from gausslite_ros.robot_session import Delivery, Fields, NodeParameters, Outgoing, RobotSession, publications
 
 _QUEUE_SIZE = 100
 _BUFFER_BYTES = 1 << 26
@@ -34,6 +35,7 @@ class GaussliteNode:
     def __init__(self) -> None:
         names = NodeParameters.defaults().items()
         parameters = NodeParameters.of({name: rospy.get_param(f"~{name}", value) for name, value in names})
+        self._parameters = parameters
         client = AgentClient(parameters.agent, tls=parameters.tls())
         self.session = RobotSession(parameters, AgentLink(client, parameters.link_settings()))
         self._periods_s = parameters.tf_period_s, parameters.period_s
@@ -42,6 +44,7 @@ class GaussliteNode:
         self._writers: dict[str, Any] = {}
         self._master = Master(rospy.get_name())
         self._register()
+        self.session.follow_map(self._send, lambda: int(rospy.get_rostime().to_nsec()))
 
     def run(self) -> None:
         """Publish transforms and status until the node is shut down."""
@@ -71,8 +74,13 @@ class GaussliteNode:
             for wanted in self.session.subscriptions()
         ]
         self._writers = {
-            topic: rospy.Publisher(_name(topic), _message_class(name), queue_size=_QUEUE_SIZE)
-            for topic, name in PUBLICATIONS.items()
+            topic: rospy.Publisher(
+                _name(topic),
+                _message_class(written.message_type),
+                queue_size=_QUEUE_SIZE,
+                latch=written.delivery is Delivery.LATCHED,
+            )
+            for topic, written in publications(self._parameters).items()
         }
         self._topics += self._writers.values()
 
@@ -96,7 +104,10 @@ class GaussliteNode:
     def _publish(self, messages: Callable[[int], list[Outgoing]]) -> None:
         with self._lock:
             found = messages(rospy.get_rostime().to_nsec())
-        for outgoing in found:
+        self._send(found)
+
+    def _send(self, messages: list[Outgoing]) -> None:
+        for outgoing in messages:
             writer = self._writers[outgoing.topic]
             writer.publish(_filled(writer.data_class(), outgoing.fields))
 
@@ -119,6 +130,8 @@ def _filled(message: Any, fields: Fields) -> Any:
 
 
 def _value(kind: str, value: Any) -> Any:
+    if isinstance(value, array):
+        return value.tobytes() if kind == "uint8[]" else value.tolist()
     if kind.endswith("[]"):
         return [_value(kind.removesuffix("[]"), element) for element in value]
     if kind == "time":

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float64
-from numpy import ndarray
-
-from gausslite.datasets.folder import quat_xyzw
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.objects import ObjectLandmark, ObjectRole
-from gausslite.wire.robot import AgentLink, AgentSnapshot, LinkSettings, SentFrames
+from gausslite.export.occupancy import OccupancySettings
+from gausslite.wire.robot import AgentLink, LinkSettings
 from gausslite.wire.security import Tls
 from gausslite_ros.bag_file import BagOptions
-from gausslite_ros.live_frames import LiveCounters, LiveFrames
+from gausslite_ros.live_frames import LiveFrames
+from gausslite_ros.live_map import LiveMap
+from gausslite_ros.outgoing import (
+    Fields,
+    correction_transform,
+    diagnostics,
+    object_markers,
+    occupancy_grid,
+    point_cloud,
+)
 from gausslite_ros.topics import camera_name
 
 _AXES = ("optical", "body")
@@ -29,6 +35,8 @@ _LIMITS = (
     ("transform_tolerance_s", 0.0, 10.0),
     ("tf_period_s", 0.01, 10.0),
     ("period_s", 0.05, 60.0),
+    ("map_period_s", 0.2, 3600.0),
+    ("cell_m", 0.01, 1.0),
     ("drain_s", 0.0, 86400.0),
 )
 _ALIGNED = {"auto": "", "yes": "yes", "no": "no"}
@@ -41,7 +49,8 @@ class NodeParameters:
 
     color_info, depth_info "": the camera_info beside the images. camera "": the frame of the colour images.
     aligned "auto": by frame and topic of depth. depth_unit_mm 0: as its encoding. transform_tolerance_s: added to the
-    time of the published tf. drain_s 0: as the agent's options. Raises InvalidInputError.
+    time of the published tf. drain_s 0: as the agent's options. heights_m: the lowest and highest obstacle above the
+    floor of each occupancy grid, as low:high, separated by commas. Raises InvalidInputError.
     """
 
     agent: str = "127.0.0.1:50053"
@@ -67,6 +76,9 @@ class NodeParameters:
     handover: str = "agent"
     drain_s: float = 0.0
     period_s: float = 1.0
+    map_period_s: float = 2.0
+    cell_m: float = 0.05
+    heights_m: str = "0.1:1.8"
     tls_ca: str = ""
     tls_cert: str = ""
     tls_key: str = ""
@@ -82,6 +94,7 @@ class NodeParameters:
         for name, low, high in _LIMITS:
             if not low <= getattr(self, name) <= high:
                 raise InvalidInputError(f"parameter {name}: expected {low:g} to {high:g}, got {getattr(self, name)}")
+        self.heights()
         if self.publish_tf and self.map_frame == self.frame:
             raise InvalidInputError(
                 f"parameter map_frame: expected another frame than the poses', got {self.frame!r} for both; "
@@ -117,6 +130,19 @@ class NodeParameters:
         """Topic of depth's camera_info, which is used unless depth is aligned to colour."""
         return self.depth_info or _beside(self.depth)
 
+    def heights(self) -> tuple[tuple[float, float], ...]:
+        """Return the range of heights of each occupancy grid, in metres above the floor. Raises InvalidInputError."""
+        try:
+            ranges = [tuple(map(float, part.split(":"))) for part in self.heights_m.split(",")]
+            found = tuple((low, high) for low, high in ranges)
+        except ValueError:
+            found = ()
+        if not found or not all(0 <= low < high for low, high in found):
+            raise InvalidInputError(
+                f"parameter heights_m: expected ranges such as 0.1:1.8 or 0.1:0.5,0.5:1.8, got {self.heights_m!r}"
+            )
+        return found
+
     def topic_options(self) -> BagOptions:
         """Return what the conversion of messages needs."""
         return BagOptions(
@@ -139,6 +165,7 @@ class NodeParameters:
             lossless=self.lossless,
             handover=_HANDOVER[self.handover],
             drain_s=self.drain_s or None,
+            follow_map=True,
         )
 
     def tls(self) -> Tls | None:
@@ -152,114 +179,10 @@ def _beside(image_topic: str) -> str:
     return f"{camera_name(image_topic).rpartition('/')[0]}/camera_info"
 
 
-Fields = dict[str, Any]
-OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
-"""Levels of diagnostic_msgs/DiagnosticStatus, whose field is a byte."""
-_ADD, _DELETE_ALL = 0, 3
-_CUBE, _TEXT = 1, 9
-_COLOURS = {ObjectRole.TARGET: (0.1, 0.8, 0.2), ObjectRole.ANCHOR: (0.2, 0.5, 1.0)}
-_MIN_SIDE_M = 0.01
-_TEXT_HEIGHT_M = 0.08
-_MAX_SILENCE_S = 3.0
-
-
-def correction_transform(T_map_odometry: Float64[ndarray, "4 4"], frames: tuple[str, str], stamp_ns: int) -> Fields:
-    """Return a tf2_msgs/TFMessage with the transform from the map's frame (parent) to the odometry's (child)."""
-    x, y, z, w = quat_xyzw(T_map_odometry[:3, :3]).tolist()
-    transform = {
-        "translation": _vector(T_map_odometry[:3, 3].tolist()),
-        "rotation": {"x": x, "y": y, "z": z, "w": w},
-    }
-    return {
-        "transforms": [{"header": _header(frames[0], stamp_ns), "child_frame_id": frames[1], "transform": transform}]
-    }
-
-
-def object_markers(objects: Sequence[ObjectLandmark], frame: str, stamp_ns: int) -> Fields:
-    """Return a visualization_msgs/MarkerArray: a box and a text for each object, after the removal of earlier ones."""
-    markers: list[Fields] = [{"header": _header(frame, stamp_ns), "action": _DELETE_ALL}]
-    for number, landmark in enumerate(objects):
-        low, high = landmark.extent_m.min_m, landmark.extent_m.max_m
-        centre = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        shared = {"header": _header(frame, stamp_ns), "ns": landmark.role.value, "action": _ADD}
-        red, green, blue = _COLOURS[landmark.role]
-        sides = [max(side, _MIN_SIDE_M) for side in landmark.size_m]
-        markers += [
-            shared
-            | {
-                "id": 2 * number,
-                "type": _CUBE,
-                "pose": _pose(centre),
-                "scale": _vector(sides),
-                "color": {"r": red, "g": green, "b": blue, "a": 0.35},
-            },
-            shared
-            | {
-                "id": 2 * number + 1,
-                "type": _TEXT,
-                "pose": _pose([centre[0], centre[1], high[2] + _TEXT_HEIGHT_M]),
-                "scale": _vector([0.0, 0.0, _TEXT_HEIGHT_M]),
-                "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
-                "text": f"{landmark.noun} {landmark.confidence:.2f}",
-            },
-        ]
-    return {"markers": markers}
-
-
-def diagnostics(
-    snapshot: AgentSnapshot | None,
-    counters: tuple[LiveCounters, SentFrames],
-    problems: Iterable[str],
-    stamp_ns: int,
-    address: str,
-) -> Fields:
-    """Return a diagnostic_msgs/DiagnosticArray: ERROR without an agent or after a failure, WARN for other problems."""
-    problems = [problem for problem in problems if problem]
-    values: dict[str, Any] = {}
-    if snapshot is None:
-        level, message = ERROR, problems[0] if problems else f"waiting for the agent at {address}"
-    else:
-        failed = snapshot.state == "failed" or bool(snapshot.problem)
-        problems += [snapshot.problem] if snapshot.problem else []
-        level = ERROR if failed else WARN if problems else OK
-        message = f"{snapshot.state}: {problems[0]}" if problems else snapshot.state
-        values = {
-            "agent": snapshot.agent_id,
-            "task": snapshot.task,
-            "gaussians": snapshot.gaussians,
-            "frames mapped": snapshot.frames_mapped,
-            "frames per second": f"{snapshot.hz:.1f}",
-            "share of the region": f"{snapshot.roi_share:.3f}",
-            "median age of frames (s)": f"{snapshot.age_p50_s:.2f}",
-            "notes": "; ".join(snapshot.notes),
-        }
-    received, sent = counters
-    values |= {f"images {name.replace('_', ' ')}": number for name, number in asdict(received).items()}
-    values |= {f"sent frames {name.replace('_', ' ')}": number for name, number in asdict(sent).items()}
-    values |= {f"problem {i}": problem for i, problem in enumerate(problems, start=1)}
-    status = {
-        "level": level,
-        "name": "gausslite: mapping",
-        "message": message,
-        "hardware_id": address,
-        "values": [{"key": key, "value": str(value)} for key, value in values.items()],
-    }
-    return {"header": _header("", stamp_ns), "status": [status]}
-
-
-def _header(frame: str, stamp_ns: int) -> Fields:
-    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
-
-
-def _vector(values: Sequence[float]) -> Fields:
-    return dict(zip("xyz", map(float, values), strict=True))
-
-
-def _pose(position_m: Sequence[float]) -> Fields:
-    return {"position": _vector(position_m), "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
-
-
 TF, DIAGNOSTICS, OBJECTS, TASK = "/tf", "/diagnostics", "~/objects", "~/task"
+REGION, OCCUPANCY = "~/region", "~/occupancy"
+_MAX_SILENCE_S = 3.0
+_CLOSE_S = 10.0
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CAMERA_INFO, _TF_MESSAGE = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 _TRANSPORTS = ("/compressed", "/compressedDepth")
@@ -292,12 +215,27 @@ class Outgoing:
     fields: Fields
 
 
-PUBLICATIONS = {
-    TF: _TF_MESSAGE,
-    OBJECTS: "visualization_msgs/msg/MarkerArray",
-    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
-}
-"""Message type of each topic that the node writes."""
+@dataclass(frozen=True, slots=True)
+class Publication:
+    """A topic that the node writes."""
+
+    message_type: str
+    delivery: Delivery
+
+
+def publications(parameters: NodeParameters) -> dict[str, Publication]:
+    """Return the topics to write. Each range of heights has a grid of its own, the first one without a number."""
+    grid = Publication("nav_msgs/msg/OccupancyGrid", Delivery.LATCHED)
+    return {
+        TF: Publication(_TF_MESSAGE, Delivery.TRANSFORMS),
+        OBJECTS: Publication("visualization_msgs/msg/MarkerArray", Delivery.TRANSFORMS),
+        DIAGNOSTICS: Publication("diagnostic_msgs/msg/DiagnosticArray", Delivery.TRANSFORMS),
+        REGION: Publication("sensor_msgs/msg/PointCloud2", Delivery.LATCHED),
+    } | {_grid_topic(number): grid for number in range(len(parameters.heights()))}
+
+
+def _grid_topic(number: int) -> str:
+    return OCCUPANCY if number == 0 else f"{OCCUPANCY}_{number + 1}"
 
 
 class RobotSession:
@@ -310,6 +248,10 @@ class RobotSession:
         self._seen_images, self._seen_at_s = 0, clock()
         self._live = LiveFrames(parameters.topic_options(), parameters.max_wait_s)
         self._message_problem = ""
+        self._live_map = LiveMap(link.map, OccupancySettings(parameters.cell_m), parameters.heights())
+        self._map_problem = ""
+        self._map_thread: threading.Thread | None = None
+        self._closing = threading.Event()
         if parameters.task:
             link.assign_task(parameters.task)
 
@@ -344,11 +286,42 @@ class RobotSession:
             found.append(Outgoing(OBJECTS, object_markers(snapshot.objects, self._parameters.map_frame, now_ns)))
         return found
 
+    def follow_map(self, publish: Callable[[list[Outgoing]], None], now_ns: Callable[[], int]) -> None:
+        """Publish the task's region and the occupancy grids until `close`, on a thread of its own.
+
+        A large map takes about a second, in which images must not wait.
+        """
+
+        def run() -> None:
+            while not self._closing.wait(self._parameters.map_period_s):
+                try:
+                    publish(self._map_messages(now_ns()))
+                    self._map_problem = ""
+                except InvalidInputError as error:
+                    self._map_problem = str(error)
+
+        self._map_thread = threading.Thread(target=run, name="map", daemon=True)
+        self._map_thread.start()
+
+    def _map_messages(self, stamp_ns: int) -> list[Outgoing]:
+        """Return nothing before the agent has a map. Raises InvalidInputError for too large grids."""
+        frame, contents = self._parameters.map_frame, self._live_map.update()
+        if contents is None:
+            return []
+        grids = [
+            Outgoing(_grid_topic(number), occupancy_grid(grid, self._parameters.cell_m, frame, stamp_ns))
+            for number, grid in enumerate(contents.grids)
+        ]
+        return [Outgoing(REGION, point_cloud(contents.region, frame, stamp_ns)), *grids]
+
     def close(self) -> str:
         """Send the waiting frames, end the mission unless end_mission is false; return its summary.
 
         Raises GaussLiteError if the mission could not be ended.
         """
+        self._closing.set()
+        if self._map_thread is not None:
+            self._map_thread.join(_CLOSE_S)
         return self._link.close(self._parameters.end_mission)
 
     def _handler(self, add: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -360,6 +333,8 @@ class RobotSession:
             for frame in self._live.take():
                 self._message_problem = ""
                 self._link.send(frame, self._live.lens)
+                if self._link.snapshot is not None:
+                    self._live_map.see(frame, self._link.snapshot.T_map_odometry)
 
         return handle
 
@@ -373,7 +348,7 @@ class RobotSession:
         self._link.assign_task(str(message.data))
 
     def _problems(self) -> tuple[str, ...]:
-        return (*self._link.problems, self._silence(), self._live.problem, self._message_problem)
+        return (*self._link.problems, self._silence(), self._live.problem, self._message_problem, self._map_problem)
 
     def _silence(self) -> str:
         """Return the problem of a camera that sends no images, or no more; empty without it."""

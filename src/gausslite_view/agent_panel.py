@@ -12,9 +12,10 @@ from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert_task import object_from_message
+from gausslite.wire.map_follower import MapFollower
 from gausslite.wire.views import CameraView
 from gausslite_view.cameras import CameraPanel, with_objects, with_region
-from gausslite_view.contents import MapFollower, ViewContents
+from gausslite_view.contents import ViewContents
 from gausslite_view.map_page import MapPage, text_html
 from gausslite_view.plots import HistoryPlot, QualityPlot
 

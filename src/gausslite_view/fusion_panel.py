@@ -9,8 +9,9 @@ from typing import Any
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import Export, FusionClient
+from gausslite.wire.map_follower import MapFollower
 from gausslite_view.cameras import TeamCameras, TeamKeyframes
-from gausslite_view.contents import MapFollower, ViewContents
+from gausslite_view.contents import ViewContents, followed_contents
 from gausslite_view.map_page import MapPage, text_html
 from gausslite_view.plots import TeamPlots
 
@@ -62,7 +63,7 @@ class FusionPanel:
         objects = tuple(team_object.landmark for team_object in self._client.query_objects())
         state_ns = round(time_s * _NS_PER_S)
         fused = replace(
-            followed.contents(targets),
+            followed_contents(followed, targets),
             objects=objects,
             keyframes=self._cameras.draw(objects, state_ns),
             paths=self._keyframes.paths(),

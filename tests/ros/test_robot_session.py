@@ -23,28 +23,26 @@ from gausslite.wire.robot import AgentLink, AgentSnapshot, SentFrames
 from gausslite_ros.bag_file import BagAddress
 from gausslite_ros.bag_source import BagSource
 from gausslite_ros.live_frames import LiveCounters
+from gausslite_ros.outgoing import ERROR, OK, WARN, correction_transform, diagnostics, object_markers
 from gausslite_ros.robot_session import (
     DIAGNOSTICS,
-    ERROR,
     OBJECTS,
-    OK,
-    PUBLICATIONS,
+    OCCUPANCY,
+    REGION,
     TF,
-    WARN,
     NodeParameters,
     Outgoing,
     RobotSession,
-    correction_transform,
-    diagnostics,
-    object_markers,
+    publications,
 )
 from gausslite_ros.robot_session import TASK as TASK_TOPIC
 
 NOW_NS = 1_700_000_100_123_456_789
-PARAMETERS = NodeParameters(color=COLOUR, depth=DEPTH, period_s=0.05, lossless=True)
+PARAMETERS = NodeParameters(color=COLOUR, depth=DEPTH, period_s=0.05, map_period_s=0.2, lossless=True)
 MUG = ObjectLandmark(
     "1", "mug", ObjectRole.TARGET, (1.0, 2.0, 0.5), AxisAlignedBox((0.9, 1.9, 0.4), (1.1, 2.1, 0.6)), 0.8, 0, 1
 )
+PUBLICATIONS = publications(PARAMETERS)
 SNAPSHOT = AgentSnapshot("husky", "mapping", TASK, 10, 3, 0, 0, 0, 4.0, 0.1, 0.2, "", (), np.eye(4), (MUG,))
 
 
@@ -62,7 +60,7 @@ def published(messages: list[Outgoing], topic: str) -> Any:
     typesys = pytest.importorskip("rosbags.typesys", reason="messages need the extra ros")
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     [fields] = [message.fields for message in messages if message.topic == topic]
-    name = PUBLICATIONS[topic]
+    name = PUBLICATIONS[topic].message_type
     data = store.serialize_cdr(build(store, name, fields), name)
     return store.deserialize_cdr(data, name)
 
@@ -82,7 +80,9 @@ def build(store: Any, name: str, fields: dict[str, Any]) -> Any:
             if element_kind.name == "NAME":
                 values[field] = [build(store, element, each) for each in value or []]
             else:
-                values[field] = np.array(value or [], element[0] if element[0] != "byte" else np.uint8)
+                values[field] = np.array(
+                    [] if value is None else value, element[0] if element[0] != "byte" else np.uint8
+                )
     return store.types[name](**values)
 
 
@@ -125,6 +125,13 @@ def test_a_replayed_bag_is_mapped_as_the_bag_source_gives_it(tmp_path: Path, del
         )
         assert (status.level, status.message, values["frames mapped"]) == (OK[0], "mapping", "5")
         assert len(published(session.status(NOW_NS), OBJECTS).markers) == 1
+        maps: list[list[Outgoing]] = []
+        session.follow_map(maps.append, lambda: NOW_NS)
+        wait_until(lambda: any(maps))
+        last = next(filter(None, maps))
+        cells = np.array(published(last, OCCUPANCY).data)
+        assert {0, 100} <= set(cells.tolist()) <= {-1, 0, 100}
+        assert published(last, REGION).header.frame_id == "map"
         assert "5 frames" in session.close()
         assert running.client.status().frames_mapped == len(source)
 
@@ -201,6 +208,11 @@ def test_objects_become_a_box_and_a_text_in_the_maps_frame() -> None:
     assert text.pose.position.z > 0.6
 
 
+def test_each_range_of_heights_has_a_grid() -> None:
+    parameters = replace(PARAMETERS, heights_m="0.1:0.5,0.5:1.8")
+    assert [topic for topic in publications(parameters) if topic.startswith(OCCUPANCY)] == [OCCUPANCY, "~/occupancy_2"]
+
+
 def test_the_correction_is_a_transform_from_map_to_odometry() -> None:
     T = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
     outgoing = Outgoing(TF, correction_transform(T, ("map", "odom"), NOW_NS))
@@ -219,6 +231,8 @@ def test_the_correction_is_a_transform_from_map_to_odometry() -> None:
         ({"tolerance_ms": -1}, "parameter tolerance_ms: expected 0 to 10000, got -1.0"),
         ({"period_s": float("nan")}, "parameter period_s: expected 0.05 to 60, got nan"),
         ({"publish_tf": 1}, "parameter publish_tf: expected bool, got 1"),
+        ({"heights_m": "1.8:0.1"}, "parameter heights_m: expected ranges such as 0.1:1.8"),
+        ({"heights_m": "0.1"}, "parameter heights_m: expected ranges such as 0.1:1.8"),
         ({"task": None}, "parameter task: expected str, got None"),
         ({"frame": "map"}, "parameter map_frame: expected another frame than the poses'"),
     ],

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from gausslite_ros.robot_session import PUBLICATIONS, NodeParameters
+from gausslite_ros.robot_session import NodeParameters, publications
 
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "gausslite_ros"
 MODULES = PACKAGE.parents[1] / "src" / "gausslite_ros"
@@ -44,7 +44,9 @@ def test_only_the_nodes_and_the_launch_file_import_ros() -> None:
 def test_the_manifest_declares_what_is_imported_and_published() -> None:
     used = set().union(*(imports(path) & ROS_MODULES for path in python_files())) - AMENT
     session = (MODULES / "robot_session.py").read_text()
-    messages = set(re.findall(r'"(\w+)/msg/\w+"', session)) | {name.partition("/")[0] for name in PUBLICATIONS.values()}
+    messages = set(re.findall(r'"(\w+)/msg/\w+"', session)) | {
+        written.message_type.partition("/")[0] for written in publications(NodeParameters()).values()
+    }
     assert used | messages == declared()
 
 

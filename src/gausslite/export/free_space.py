@@ -1,15 +1,16 @@
-"""Find the voxels that the keyframes see through: free space between a camera and the rendered surface."""
+"""Find the voxels that cameras see through: free space between a camera and the surface."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.export.mesh import Render
 
@@ -51,18 +52,33 @@ def free_voxels(
 def _carve(
     free: Bool[ndarray, "x y z"], first: Int64[ndarray, "3"], view: KeyframeView, render: Render, voxel_m: float
 ) -> None:
-    """Mark the voxels before the surface of one view, in steps of half a voxel along all rays at once."""
-    width_px = min(_WIDTH_PX, view.camera.width_px)
-    camera = view.camera.resized(width_px, max(1, round(view.camera.height_px * width_px / view.camera.width_px)))
-    depth_m = render(camera, view.T_world_camera).expected_depth_m().astype(np.float64)
+    """Mark the voxels before the surface of one view."""
+    camera = narrower(view.camera, _WIDTH_PX)
+    depth_m = render(camera, view.T_world_camera).expected_depth_m()
+    for points_m in seen_through(camera, depth_m, view.T_world_camera, voxel_m):
+        cells = np.floor(points_m / voxel_m).astype(np.int64) - first
+        cells = cells[((cells >= 0) & (cells < free.shape)).all(axis=1)]
+        free[tuple(cells.T)] = True
+
+
+def narrower(camera: Camera, width_px: int) -> Camera:
+    """Return the camera of the same image in a width of at most width_px."""
+    width_px = min(width_px, camera.width_px)
+    return camera.resized(width_px, max(1, round(camera.height_px * width_px / camera.width_px)))
+
+
+def seen_through(
+    camera: Camera, depth_m: Float32[ndarray, "h w"], T_world_camera: Float64[ndarray, "4 4"], voxel_m: float
+) -> Iterator[Float64[ndarray, "c 3"]]:
+    """Yield the points of all rays at the same distance, in steps of half a voxel, up to the measured surface.
+
+    A ray without depth (0) has none.
+    """
     rows, columns = np.nonzero(depth_m > 0)
     x, y = camera.slopes(columns + 0.5, rows + 0.5)
     rays = np.stack([x, y, np.ones(len(x))], axis=1)
     lengths = np.linalg.norm(rays, axis=1)
-    ends_m = depth_m[rows, columns] * lengths - _MARGIN_VOXELS * voxel_m
-    rays = rays / lengths[:, None] @ view.T_world_camera[:3, :3].T
+    ends_m = depth_m[rows, columns].astype(np.float64) * lengths - _MARGIN_VOXELS * voxel_m
+    rays = rays / lengths[:, None] @ T_world_camera[:3, :3].T
     for distance_m in np.arange(0.0, ends_m.max(initial=0.0), voxel_m / 2):
-        points_m = view.T_world_camera[:3, 3] + distance_m * rays[ends_m > distance_m]
-        cells = np.floor(points_m / voxel_m).astype(np.int64) - first
-        cells = cells[((cells >= 0) & (cells < free.shape)).all(axis=1)]
-        free[tuple(cells.T)] = True
+        yield T_world_camera[:3, 3] + distance_m * rays[ends_m > distance_m]

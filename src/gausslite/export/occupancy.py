@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Int8, Int64
 from numpy import ndarray
 
 from gausslite.codec.state_file import write_atomic, write_atomic_with
@@ -28,8 +28,11 @@ _MAX_OCTOMAP_KEY = 1 << 15
 """OctoMap keys are 16-bit integers with the origin in the middle."""
 NAV2_IMAGE = ".pgm"
 """Suffix of the image beside a nav2 map."""
-_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
-"""Grey values of nav2's trinary map images."""
+UNKNOWN, FREE, OCCUPIED = -1, 0, 100
+"""Values of a cell, as in nav_msgs/OccupancyGrid."""
+_GREY_VALUES = np.zeros(256, np.uint8)
+_GREY_VALUES[[UNKNOWN, FREE, OCCUPIED]] = 205, 254, 0
+"""Of nav2's trinary map images, by the value of a cell."""
 _FLOOR_PERCENTILE = 2.0
 NO_VOXELS: Int64[ndarray, "0 3"] = np.zeros((0, 3), np.int64)
 
@@ -114,7 +117,8 @@ def write_nav2(
     heights. A cell is free over a floor or with a free voxel at an obstacle's height, unless an obstacle is in it.
     Raises InvalidInputError without an occupied voxel or if the grid is too large, StorageError.
     """
-    image, origin_m = _grid(require_voxels(gaussians, settings), free, settings)
+    cells, first = planar_grid(require_voxels(gaussians, settings), free, settings)
+    image, origin_m = _GREY_VALUES[cells[::-1]], first * settings.voxel_m
     encoded, data = cv2.imencode(".pgm", image)
     if not encoded:
         raise InvalidInputError(f"nav2: expected an image that OpenCV can encode, got {image.shape}")
@@ -143,10 +147,15 @@ def require_voxels(gaussians: Gaussians, settings: OccupancySettings) -> Int64[n
     return voxels
 
 
-def _grid(
+def planar_grid(
     voxels: Int64[ndarray, "v 3"], free: Int64[ndarray, "f 3"], settings: OccupancySettings
-) -> tuple[UInt8[ndarray, "h w"], Float64[ndarray, "2"]]:
-    """Return the grid image, its first row at the largest y, and the position of its lower left corner in metres."""
+) -> tuple[Int8[ndarray, "h w"], Int64[ndarray, "2"]]:
+    """Return a grid in x and y, its first row at the lowest y, and the indices (x, y) of its first cell.
+
+    It spans the occupied voxels. The floor is at the 2nd percentile of their heights. A cell is OCCUPIED by a voxel at
+    an obstacle's height, else FREE over a floor or with a free voxel at an obstacle's height, else UNKNOWN. Raises
+    InvalidInputError, before memory is taken, for too many cells.
+    """
     first, last = voxels.min(axis=0), voxels.max(axis=0)
     width, height = (int(n) for n in (last - first + 1)[:2])
     if width * height > _MAX_GRID_CELLS:
@@ -156,15 +165,16 @@ def _grid(
     floor = np.percentile(voxels[:, 2], _FLOOR_PERCENTILE)
     above_m, free_above_m = ((found[:, 2] - floor) * settings.voxel_m for found in (voxels, free))
     low_m, high_m = settings.height_m
-    image = np.full((height, width), _UNKNOWN, np.uint8)
+    inside = ((free >= first) & (free <= last))[:, :2].all(axis=1)
+    grid = np.full((height, width), UNKNOWN, np.int8)
     for value, found in (
-        (_FREE, free[(free_above_m >= low_m) & (free_above_m <= high_m)]),
-        (_FREE, voxels[above_m < low_m]),
-        (_OCCUPIED, voxels[(above_m >= low_m) & (above_m <= high_m)]),
+        (FREE, free[inside & (free_above_m >= low_m) & (free_above_m <= high_m)]),
+        (FREE, voxels[above_m < low_m]),
+        (OCCUPIED, voxels[(above_m >= low_m) & (above_m <= high_m)]),
     ):
-        cells = found[:, :2] - first[:2]
-        image[height - 1 - cells[:, 1], cells[:, 0]] = value
-    return image, first[:2] * settings.voxel_m
+        x, y = (found[:, :2] - first[:2]).T
+        grid[y, x] = value
+    return grid, first[:2]
 
 
 def _ellipsoid_samples(count: Int64[ndarray, "3"]) -> Float32[ndarray, "k 3"]:

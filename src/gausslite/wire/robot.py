@@ -22,6 +22,7 @@ from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert import transform_from_message
 from gausslite.wire.convert_task import object_from_message
+from gausslite.wire.map_follower import FollowedMap, MapFollower
 
 _STATES = {number: name.removeprefix("AGENT_STATE_").lower() for name, number in pb.AgentState.items()}
 
@@ -203,7 +204,7 @@ class LinkSettings:
     """poll_s: time between status queries. lossless: colour as PNG in place of JPEG.
 
     handover: also send the map outside the region when the mission ends. drain_s: longest time to send then. None: as
-    the agent's options.
+    the agent's options. follow_map: read the agent's map while it grows.
     """
 
     poll_s: float = 1.0
@@ -211,6 +212,7 @@ class LinkSettings:
     lossless: bool = False
     handover: bool | None = None
     drain_s: float | None = None
+    follow_map: bool = False
 
 
 class AgentLink:
@@ -224,6 +226,7 @@ class AgentLink:
         self._snapshot: AgentSnapshot | None = None
         self._closing = self._woken = False
         self._changed = threading.Condition()
+        self._follower = MapFollower(client.watch_map) if self._settings.follow_map else None
         self._thread = threading.Thread(target=self._run, name="agent link", daemon=True)
         self._thread.start()
 
@@ -236,6 +239,10 @@ class AgentLink:
     def sent_frames(self) -> SentFrames:
         """Frames by outcome so far."""
         return self._sender.counters
+
+    def map(self) -> FollowedMap | None:
+        """Return the agent's map; None before the first revision and without `follow_map`."""
+        return None if self._follower is None else self._follower.newest()
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -270,6 +277,8 @@ class AgentLink:
             return self._client.end_mission(self._settings.handover, self._settings.drain_s).summary
         finally:
             self._client.close()
+            if self._follower is not None:
+                self._follower.close()
             self._thread.join(_CLOSE_S)
 
     def _waits_for_task(self) -> bool:

@@ -17,12 +17,13 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, group_by_voxel
 from gausslite.task.rules import RuleParser
-from gausslite_view.contents import ColourMode, FollowedMap, MapFollower, legend_of
+from gausslite_view.contents import ColourMode, legend_of
 from gausslite_view.pages import live_page
 
 pytest.importorskip("viser")
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import encode_mask, frame_to_message
+from gausslite.wire.map_follower import FollowedMap, MapFollower
 from gausslite_view.fusion_panel import FusionPanel
 from gausslite_view.pages import open_page
 
