@@ -33,7 +33,8 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 _GREY_VALUES = np.zeros(256, np.uint8)
 _GREY_VALUES[[UNKNOWN, FREE, OCCUPIED]] = 205, 254, 0
 """Of nav2's trinary map images, by the value of a cell."""
-_FLOOR_PERCENTILE = 2.0
+_FLOOR_SHARE = 0.25
+"""Of the fullest layer of voxels. Ellipsoids of the floor reach below it, but few of them."""
 NO_VOXELS: Int64[ndarray, "0 3"] = np.zeros((0, 3), np.int64)
 
 
@@ -113,9 +114,8 @@ def write_nav2(
 ) -> None:
     """Write a nav2 map: `path` is the YAML file, the image next to it has the suffix NAV2_IMAGE.
 
-    The grid lies in x and y, so the map's z axis must point up. The floor is at the 2nd percentile of the occupied
-    heights. A cell is free over a floor or with a free voxel at an obstacle's height, unless an obstacle is in it.
-    Raises InvalidInputError without an occupied voxel or if the grid is too large, StorageError.
+    The map's z axis must point up. Raises InvalidInputError without an occupied voxel or if the grid is too large,
+    StorageError.
     """
     cells, first = planar_grid(require_voxels(gaussians, settings), free, settings)
     image, origin_m = _GREY_VALUES[cells[::-1]], first * settings.voxel_m
@@ -152,7 +152,7 @@ def planar_grid(
 ) -> tuple[Int8[ndarray, "h w"], Int64[ndarray, "2"]]:
     """Return a grid in x and y, its first row at the lowest y, and the indices (x, y) of its first cell.
 
-    It spans the occupied voxels. The floor is at the 2nd percentile of their heights. A cell is OCCUPIED by a voxel at
+    It spans the occupied voxels. The floor is their lowest full layer. A cell is OCCUPIED by a voxel at
     an obstacle's height, else FREE over a floor or with a free voxel at an obstacle's height, else UNKNOWN. Raises
     InvalidInputError, before memory is taken, for too many cells.
     """
@@ -162,7 +162,7 @@ def planar_grid(
         raise InvalidInputError(
             f"nav2: expected at most {_MAX_GRID_CELLS} cells, got {width} x {height}; use a larger --voxel"
         )
-    floor = np.percentile(voxels[:, 2], _FLOOR_PERCENTILE)
+    floor = _floor(voxels)
     above_m, free_above_m = ((found[:, 2] - floor) * settings.voxel_m for found in (voxels, free))
     low_m, high_m = settings.height_m
     inside = ((free >= first) & (free <= last))[:, :2].all(axis=1)
@@ -175,6 +175,16 @@ def planar_grid(
         x, y = (found[:, :2] - first[:2]).T
         grid[y, x] = value
     return grid, first[:2]
+
+
+def _floor(voxels: Int64[ndarray, "v 3"]) -> int:
+    """Return the height of the floor: the fullest of the layers that rise from the lowest full one."""
+    lowest = voxels[:, 2].min()
+    layers = np.bincount(voxels[:, 2] - lowest)
+    floor = int(np.argmax(layers >= _FLOOR_SHARE * layers.max()))
+    while floor + 1 < len(layers) and layers[floor + 1] > layers[floor]:
+        floor += 1
+    return int(lowest) + floor
 
 
 def _ellipsoid_samples(count: Int64[ndarray, "3"]) -> Float32[ndarray, "k 3"]:

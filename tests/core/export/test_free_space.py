@@ -90,3 +90,20 @@ def test_octomap_has_free_voxels_and_none_of_them_holds_an_opaque_gaussian(tmp_p
     for centre_m in (occupied_voxels(region, SETTINGS) + 0.5) * VOXEL_M:
         node = tree.search(centre_m)
         assert node is None or node.getLogOdds() > 0
+
+
+def test_a_floor_whose_ellipsoids_reach_below_and_above_it_is_free(tmp_path):
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-HALF_M, HALF_M, 0.05), np.arange(-HALF_M, HALF_M, 0.05)))
+    walls = room()
+    floor = walls.take(np.arange(len(x)) % len(walls))
+    noise_m = np.random.default_rng(0).normal(0, 0.005, len(x))
+    floor = dataclasses.replace(
+        floor,
+        means_m=np.stack([x, y, noise_m], axis=1).astype(np.float32),
+        scales_m=np.full((len(x), 3), 0.05, np.float32),
+    )
+    columns = {f.name: np.concatenate([getattr(m, f.name) for m in (walls, floor)]) for f in dataclasses.fields(walls)}
+    gaussians = Gaussians(**columns)
+    cells, origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians)))
+    inside = slice(int((-1.7 - origin[0]) / VOXEL_M), int((1.7 - origin[0]) / VOXEL_M))
+    assert (cells[inside, inside] == 254).mean() > 0.95
