@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
 from gausslite.fusion import store_maintenance
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fit_process import FitProcess
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import rasterizer_of_backend
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -123,13 +124,15 @@ def _open_store(settings: ServerSettings) -> FusionStore:
 
 async def _serve(settings: ServerSettings) -> None:
     store = _open_store(settings)
-    with contextlib.closing(store):
-        engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame)
+    with contextlib.closing(store), contextlib.closing(FitProcess()) as fit:
+        engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, fit=fit)
         refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
         servicer = FusionServicer(engine, refinement)
         try:
             await _serve_mission(settings, engine, servicer)
         finally:
+            # else the servicer waits for a comparison
+            fit.close()
             servicer.close()
             # a full disk is in the log already
             with contextlib.suppress(StorageError):

@@ -118,7 +118,8 @@ _WORKERS = 4
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
 _ALIGN_PAUSE = 4.0
-"""Shortest pause after a comparison of frames, in its durations: it takes a fifth of a core at most."""
+"""Shortest pause after a comparison of an agent, in its durations: all together take a fifth of a core at most."""
+_ALIGN_RETRY_S = 30.0
 
 _Result = TypeVar("_Result")
 
@@ -404,7 +405,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 raise InvalidInputError(f"strategy: expected VOTE, CONCATENATION or REFINED, got {other}")
 
     def _align_in_background(self) -> None:
-        """Estimate the agents' frames soon, unless an estimate is pending or running. Use on the event loop."""
+        """Compare an agent's frame soon, unless a comparison is pending or running. Use on the event loop."""
         self._align_again = True
         if not self._aligning:
             self._aligning = True
@@ -420,21 +421,23 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def _align_due(self) -> bool:
         start_s = time.monotonic()
         try:
-            return self._engine.align_due()
+            return self._engine.align_due(at_most=1)
         finally:
             self._align_pause_s = max(_ALIGN_DELAY_S, _ALIGN_PAUSE * (time.monotonic() - start_s))
+            self._align_again |= self._engine.is_alignment_due
 
     def _after_aligning(self, future: asyncio.Future[bool]) -> None:
         self._aligning = False
-        if future.cancelled():
+        if future.cancelled() or not self._gate.is_open:
             return
-        if self._align_again and self._gate.is_open:
-            # messages that arrived meanwhile
-            self._align_in_background()
         if future.exception() is not None:
-            _log.error("frames are not estimated: %s", future.exception())
-        elif future.result():
+            _log.error("frames are not compared, again in %.0f s: %s", _ALIGN_RETRY_S, future.exception())
+            self._align_pause_s = _ALIGN_RETRY_S
+        if future.exception() is not None or future.result():
             self._map_changes.notify()
+        if self._align_again:
+            # messages that arrived meanwhile, or the next agent
+            self._align_in_background()
 
     async def _work(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
         """Run the function in a worker thread. Raises UnavailableError if the server drains."""

@@ -6,8 +6,9 @@ and by colour, because the optimum of a registration alone is 15 to 30 mm off ev
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import small_gicp
@@ -66,6 +67,24 @@ class FrameFit:
     is_better: bool
     is_apart: bool
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fit as plain values, from which `from_json` makes one with the same bits."""
+        return {
+            "motion": self.motion.reshape(-1).tolist(),
+            "misfits": [self.before.distance_m, self.before.colour, self.after.distance_m, self.after.colour],
+            "rest": [self.shift_m, self.rotation_deg, self.compared, self.is_better, self.is_apart],
+        }
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> FrameFit:
+        """Return the fit of plain values. Raises KeyError, TypeError, ValueError."""
+        motion = np.array(value["motion"], np.float64).reshape(4, 4)
+        misfits = [float(number) for number in value["misfits"]]
+        shift_m, rotation_deg, compared, *flags = value["rest"]
+        is_better, is_apart = (bool(flag) for flag in flags)
+        sizes = float(shift_m), float(rotation_deg), int(compared)
+        return cls(motion, Misfit(*misfits[:2]), Misfit(*misfits[2:]), *sizes, is_better, is_apart)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceSamples:
@@ -107,6 +126,10 @@ def opaque_rows(batch: VoxelBatch) -> Int64[ndarray, " n"]:
     rows = order[gather_rows(batch.offsets[:-1], np.minimum(batch.counts, _SAMPLES_PER_VOXEL))]
     chosen: Int64[ndarray, " n"] = rows[batch.gaussians.opacities[rows] >= _MIN_OPACITY]
     return chosen
+
+
+Fit = Callable[[SurfaceSamples, SurfaceSamples], FrameFit | None]
+"""`fit_frame`, in this process or in another one. Raises UnavailableError."""
 
 
 class _Target:

@@ -20,6 +20,7 @@ from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
+from gausslite.fusion.alignment import Fit, fit_frame
 from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.fused_map import FusedMapLayers, save_refinement
 from gausslite.fusion.keyframes import (
@@ -92,7 +93,7 @@ class FusionEngine:
 
     Updates, sessions, keyframes, objects, counters and the refined map persist with the store.
     first_revision must exceed the revisions from before a restart; by default it is the time in microseconds.
-    decode_keyframe reads keyframes as they were received; only a refinement needs it.
+    decode_keyframe reads keyframes as they were received; only a refinement needs it. fit compares two agents' maps.
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
@@ -102,6 +103,7 @@ class FusionEngine:
         settings: FusionSettings,
         first_revision: int | None = None,
         decode_keyframe: FrameDecoder = no_decoder,
+        fit: Fit = fit_frame,
     ) -> None:
         self._lock = RLock()
         self._store = store
@@ -111,7 +113,7 @@ class FusionEngine:
         self._merged_objects = MergedObjects()
         if first_revision is None:
             first_revision = time.time_ns() // 1000
-        self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe)
+        self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe, fit)
         self._committer = UpdateCommitter(
             store, self._lock, self._decode_update, self._check_update, self._record_updates
         )
@@ -226,14 +228,20 @@ class FusionEngine:
         """Commit the queued updates. Call it after each `enqueue_update`."""
         self._committer.commit()
 
-    def align_due(self) -> bool:
+    def align_due(self, at_most: int | None = None) -> bool:
         """Compare the frames of the agents with enough new updates; returns whether the fused map changed.
 
-        It takes up to seconds, without the lock but for slices. Call it from one thread at a time. Raises StorageError.
+        It takes up to seconds, without the lock but for slices. at_most: number of agents. Call it from one thread at a
+        time. Raises StorageError, UnavailableError if an agent could not be compared.
         """
         before = self.revision
-        self._mission.aligner.run(self._apply_frame, self._drop_contradicted)
+        self._mission.aligner.run(self._apply_frame, self._drop_contradicted, at_most)
         return self.revision != before
+
+    @property
+    def is_alignment_due(self) -> bool:
+        """Return whether `align_due` would compare an agent."""
+        return self._mission.aligner.is_due
 
     def alignment(self, agent_id: str) -> FrameAlignment:
         """Return how the agent's frame fits the fused map."""

@@ -6,7 +6,7 @@ All work is on bounded samples of the maps: the engine's lock is held for a slic
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from threading import RLock
 
@@ -15,9 +15,10 @@ from jaxtyping import Float64, Int64, UInt64
 from numpy import ndarray
 
 from gausslite.domain.checks import quote_name
+from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
-from gausslite.fusion.alignment import MIN_SAMPLES, FrameFit, SurfaceSamples, fit_frame, opaque_rows
+from gausslite.fusion.alignment import MIN_SAMPLES, Fit, FrameFit, SurfaceSamples, opaque_rows
 from gausslite.fusion.frames import (
     AlignmentSettings,
     Comparison,
@@ -35,6 +36,8 @@ _SAMPLE_BLOCK = 8
 _MAX_WITNESSES = 4
 _PLACE_GRID = VoxelGrid(0.5)
 _MIN_RECENT = 200
+_Witness = tuple[str, int, SurfaceSamples]
+"""Name, epoch and samples of an agent that another one is compared with."""
 Apply = Callable[[str], None]
 """Moves an agent's map to the frame and state that it has now."""
 
@@ -43,12 +46,14 @@ Apply = Callable[[str], None]
 class _AgentMap:
     """What is known of one agent's map: samples of at most 4096 voxels, and the voxels that have to be read again.
 
-    epoch: a number that no other map has had. first_seq: of the updates since the last correction.
+    epoch: a number that no other map has had. first_seq: of the updates since the last correction. compared: number of
+    the latest comparison, 0 before the first.
     """
 
     epoch: int
     unread: set[int] = field(default_factory=set)
     changed: int = 0
+    compared: int = 0
     first_seq: int = 0
     samples: dict[int, tuple[int, ndarray]] = field(default_factory=dict)
     limit: int = int(np.iinfo(np.uint64).max)
@@ -105,13 +110,14 @@ class FrameAligner:
         lock: RLock,
         grid: VoxelGrid,
         settings: AlignmentSettings | None,
+        fit: Fit,
     ) -> None:
         """Without settings, frames are used as declared and nothing is compared."""
         self._store, self._alignments, self._lock, self._grid = store, alignments, lock, grid
-        self._settings = settings
+        self._settings, self._fit = settings, fit
         self._maps: dict[str, _AgentMap] = {}
         self._comparisons: dict[frozenset[str], Comparison] = {}
-        self._epochs = 0
+        self._epochs = self._compared = 0
         self._is_undecided = True
         if settings is not None:
             self._restore()
@@ -144,19 +150,33 @@ class FrameAligner:
         self._maps.pop(agent_id, None)
         self._drop_comparisons(agent_id)
 
-    def run(self, apply: Apply, drop_earlier: Callable[[str], bool]) -> None:
-        """Compare the maps of the agents with enough new data, then decide. Raises StorageError.
+    @property
+    def is_due(self) -> bool:
+        """Return whether an agent has enough new data for a comparison."""
+        with self._lock:
+            return bool(self._due())
 
-        drop_earlier: deletes the earlier map of an agent, if that is the only one that it contradicts.
+    def run(self, apply: Apply, drop_earlier: Callable[[str], bool], at_most: int | None = None) -> None:
+        """Compare the maps of the agents with enough new data, then decide. Raises StorageError, UnavailableError.
+
+        drop_earlier: deletes the earlier map of an agent, if that is the only one that it contradicts. at_most: number
+        of agents to compare, those first whose latest comparison is the oldest. UnavailableError: an agent could not be
+        compared, and is due again.
         """
         if self._settings is None:
             return
         with self._lock:
-            due = [name for name, own in self._maps.items() if self._is_due(name, own)]
+            due = self._due()[:at_most]
+        failure: UnavailableError | None = None
         for agent_id in due:
-            self._compare(agent_id, self._settings, apply)
+            try:
+                self._compare(agent_id, self._settings, apply)
+            except UnavailableError as error:
+                failure = UnavailableError(f"agent {quote_name(agent_id)}: {error}")
         if due or self._is_undecided:
             self._decide(apply, drop_earlier)
+        if failure is not None:
+            raise failure
 
     def _compare(self, agent_id: str, settings: AlignmentSettings, apply: Apply) -> None:
         """Compare the agent with its witnesses, and correct its frame if that fits the earlier ones better."""
@@ -165,7 +185,8 @@ class FrameAligner:
             alignment = self._alignments.get(agent_id)
             if own is None:
                 return
-            own.changed = 0
+            self._compared += 1
+            changed, own.changed, own.compared = own.changed, 0, self._compared
             epoch, first_seq = own.epoch, own.first_seq
             highest_seq = self._store.totals(agent_id).highest_update_seq
         self._read(agent_id, own)
@@ -173,19 +194,17 @@ class FrameAligner:
         if len(source) < MIN_SAMPLES:
             return
         witnesses = list(self._witnesses(agent_id, source))
-        fits = [(name, witness_epoch, fit_frame(source, samples)) for name, witness_epoch, samples in witnesses]
-        earlier = [
-            samples
-            for (name, _, samples), (_, _, fit) in zip(witnesses, fits, strict=True)
-            if self._alignments.get(name).is_used
-            and self._alignments.get(name).order < alignment.order
-            and not (fit is not None and settings.contradicts(fit))
-        ]
-        joint = fit_frame(source, SurfaceSamples.concatenate(earlier)) if earlier else None
+        try:
+            fits = [self._fit(source, samples) for _, _, samples in witnesses]
+            joint = self._joint_fit(source, alignment, witnesses, fits)
+        except UnavailableError:
+            with self._lock:
+                own.changed += changed
+            raise
         with self._lock:
             if self._alignments.get(agent_id) is not alignment or self._epoch(agent_id) != epoch:
                 return
-            for name, witness_epoch, fit in fits:
+            for (name, witness_epoch, _), fit in zip(witnesses, fits, strict=True):
                 if self._epoch(name) == witness_epoch:
                     self._note(agent_id, name, fit, settings)
             own.first_seq = highest_seq + 1
@@ -196,6 +215,26 @@ class FrameAligner:
             self._alignments.put(agent_id, after)
         if corrected:
             apply(agent_id)
+
+    def _joint_fit(
+        self,
+        source: SurfaceSamples,
+        alignment: FrameAlignment,
+        witnesses: Sequence[_Witness],
+        fits: Sequence[FrameFit | None],
+    ) -> FrameFit | None:
+        """Return the fit to all earlier witnesses together that are used and that the agent does not contradict."""
+        assert self._settings is not None
+        earlier = [
+            (samples, fit)
+            for (name, _, samples), fit in zip(witnesses, fits, strict=True)
+            if self._alignments.get(name).is_used
+            and self._alignments.get(name).order < alignment.order
+            and not (fit is not None and self._settings.contradicts(fit))
+        ]
+        if len(earlier) == 1:
+            return earlier[0][1]
+        return self._fit(source, SurfaceSamples.concatenate([samples for samples, _ in earlier])) if earlier else None
 
     def _note(self, agent_id: str, name: str, fit: FrameFit | None, settings: AlignmentSettings) -> None:
         pair = frozenset((agent_id, name))
@@ -243,7 +282,7 @@ class FrameAligner:
             if agent_id in pair and comparison.contradicting and name not in quarantined
         }
 
-    def _witnesses(self, agent_id: str, source: SurfaceSamples) -> Iterator[tuple[str, int, SurfaceSamples]]:
+    def _witnesses(self, agent_id: str, source: SurfaceSamples) -> Iterator[_Witness]:
         """Yield the agents to compare with: those that share most with it, and those that it contradicts."""
         places = np.unique(_PLACE_GRID.keys(source.points_m.astype(np.float32)))
         with self._lock:
@@ -269,10 +308,15 @@ class FrameAligner:
             batch = self._store.batch(agent_id, part)
             own.put(part, batch, self._store.stored(agent_id, batch.keys).update_seqs)
 
-    def _is_due(self, agent_id: str, own: _AgentMap) -> bool:
-        assert self._settings is not None
-        voxels = self._store.totals(agent_id).voxels
-        return len(self._maps) > 1 and own.changed > 0 and own.changed >= self._settings.refit_share * voxels
+    def _due(self) -> list[str]:
+        """Return the agents with enough new data, those first whose latest comparison is the oldest."""
+        if self._settings is None or len(self._maps) < 2:
+            return []
+        share = self._settings.refit_share
+        due = [
+            name for name, own in self._maps.items() if own.changed >= max(1, share * self._store.totals(name).voxels)
+        ]
+        return sorted(due, key=lambda name: self._maps[name].compared)
 
     def _restore(self) -> None:
         """Read every agent's map with the next run; who was quarantined is tested again, and stays so until then."""

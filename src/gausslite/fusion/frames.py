@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import CodecError, GaussLiteError
 from gausslite.domain.pose import inverse, require_rigid, rotation_angle_deg
-from gausslite.fusion.alignment import FrameFit, Misfit
+from gausslite.fusion.alignment import FrameFit
 from gausslite.fusion.store import FusionStore
 
 RECORD = "alignment"
@@ -223,13 +223,7 @@ def _encode(alignment: FrameAlignment) -> bytes:
         "declared": alignment.declared.reshape(-1).tolist(),
         "message": alignment.message,
         "against": list(alignment.against),
-        "fit": None
-        if fit is None
-        else {
-            "motion": fit.motion.reshape(-1).tolist(),
-            "misfits": [fit.before.distance_m, fit.before.colour, fit.after.distance_m, fit.after.colour],
-            "rest": [fit.shift_m, fit.rotation_deg, fit.compared, fit.is_better, fit.is_apart],
-        },
+        "fit": None if fit is None else fit.as_json(),
     }
     return json.dumps(value).encode()
 
@@ -241,16 +235,9 @@ def _decode(data: bytes) -> FrameAlignment:
         if "against" not in value:
             # of an earlier version: what it estimated is estimated again
             return FrameAlignment(int(value["order"]), declared=_matrix(value["declared"]))
-        stored = value["fit"]
-        fit = None
-        if stored is not None:
-            misfits = [float(number) for number in stored["misfits"]]
-            shift_m, rotation_deg, compared, *flags = stored["rest"]
-            before, after = Misfit(*misfits[:2]), Misfit(*misfits[2:])
-            motion = _matrix(stored["motion"])
-            is_better, is_apart = (bool(flag) for flag in flags)
-            sizes = float(shift_m), float(rotation_deg), int(compared)
-            fit = FrameFit(motion, before, after, *sizes, is_better, is_apart)
+        fit = None if value["fit"] is None else FrameFit.from_json(value["fit"])
+        if fit is not None:
+            require_rigid("stored motion", fit.motion)
         return FrameAlignment(
             int(value["order"]),
             AlignmentState(value["state"]),

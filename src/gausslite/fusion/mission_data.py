@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from threading import RLock
 
 from gausslite.fusion.agent_data import AgentData
+from gausslite.fusion.alignment import Fit
 from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frames import FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers, load_refinement
@@ -37,7 +38,13 @@ class MissionData:
 
     @classmethod
     def open(
-        cls, store: FusionStore, settings: FusionSettings, lock: RLock, first_revision: int, decode: FrameDecoder
+        cls,
+        store: FusionStore,
+        settings: FusionSettings,
+        lock: RLock,
+        first_revision: int,
+        decode: FrameDecoder,
+        fit: Fit,
     ) -> MissionData:
         """Read the data. Raises MismatchError, CodecError for damaged records, StorageError."""
         grid, quotas = settings.grid, settings.quotas
@@ -47,7 +54,7 @@ class MissionData:
         traffic = TrafficLog(store)
         alignments = FrameAlignments(store)
         votes = VoteInput(store, alignments, grid)
-        aligner = FrameAligner(store, alignments, lock, grid, settings.alignment)
+        aligner = FrameAligner(store, alignments, lock, grid, settings.alignment, fit)
         refined = load_refinement(store)
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
         of_agents = members, checks, traffic, keyframes, objects

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import signal
@@ -58,9 +59,15 @@ class ServerProcess:
         return resident_mib(self._process.pid)
 
     def cpu_s(self) -> float:
-        """Return the processor time that the process has used."""
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
-        return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+        """Return the processor time that the process and its children have used."""
+        ticks = 0
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            # a process may end between two reads
+            with contextlib.suppress(OSError):
+                fields = stat.read_text().rpartition(")")[2].split()
+                if str(self._process.pid) in (stat.parent.name, fields[1]):
+                    ticks += sum(map(int, fields[11:13]))
+        return ticks / os.sysconf("SC_CLK_TCK")
 
     def close(self) -> None:
         """End the process."""

@@ -12,11 +12,12 @@ import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.errors import UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
-from gausslite.fusion.alignment import FrameFit, SurfaceSamples, fit_frame
+from gausslite.fusion.alignment import Fit, FrameFit, SurfaceSamples, fit_frame
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import (
     RECORD,
@@ -57,9 +58,9 @@ def send(engine: FusionEngine, agent_id: str, gaussians: Gaussians, seq: int = 1
     engine.contribute(session, RoiSubset(agent_id, "", seq, seq, group_by_voxel(gaussians, GRID)), GRID)
 
 
-def team(T_agent_fused: np.ndarray, store: FusionStore | None = None) -> FusionEngine:
+def team(T_agent_fused: np.ndarray, store: FusionStore | None = None, fit: Fit = fit_frame) -> FusionEngine:
     """An engine with ant, in the fused frame, and bee, whose frame is wrong and whose kappa wins."""
-    engine = FusionEngine(store or MemoryStore(), SETTINGS)
+    engine = FusionEngine(store or MemoryStore(), SETTINGS, fit=fit)
     send(engine, "ant", corner(0))
     send(engine, "bee", move_gaussians(corner(1, kappa=9), T_agent_fused))
     return engine
@@ -324,22 +325,56 @@ def test_moved_voxels_are_those_of_a_new_engine_whatever_the_order_of_messages(s
     assert engine.maps.size() == again.maps.size()
 
 
-def test_messages_are_stored_during_a_comparison_and_its_result_is_dropped_with_the_agents_data(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0))
-
-    def fit_while_others_work(*arguments: SurfaceSamples) -> FrameFit | None:
+def test_messages_are_stored_during_a_comparison_and_its_result_is_dropped_with_the_agents_data() -> None:
+    def fit_while_others_work(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
         with ThreadPoolExecutor(1) as executor:
             executor.submit(send, engine, "ant", corner(2), 2).result(timeout=60)
             if any(status.agent_id == "bee" for status in engine.status().agents):
                 executor.submit(engine.evict, "bee").result(timeout=60)
-        return fit_frame(*arguments)
+        return fit_frame(source, target)
 
-    monkeypatch.setattr("gausslite.fusion.frame_aligner.fit_frame", fit_while_others_work)
+    engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0), fit=fit_while_others_work)
     engine.align_due()
     assert [status.agent_id for status in engine.status().agents] == ["ant"]
     assert state_of(engine, "ant") is AlignmentState.REFERENCE
+
+
+def test_an_agent_that_cannot_be_compared_stays_due_and_the_others_are_compared() -> None:
+    failures = [UnavailableError("killed")]
+
+    def fail_once(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
+        if failures:
+            raise failures.pop()
+        return fit_frame(source, target)
+
+    engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0), fit=fail_once)
+    with pytest.raises(UnavailableError, match="agent 'ant': killed"):
+        engine.align_due()
+    assert state_of(engine, "bee") is AlignmentState.CORRECTED
+    assert engine.is_alignment_due
+    engine.align_due()
+    assert not engine.is_alignment_due
+
+
+def test_agents_take_turns_and_a_single_earlier_agent_is_compared_once() -> None:
+    pairs = []
+
+    def count(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
+        pairs.append((len(source), len(target)))
+        return fit_frame(source, target)
+
+    engine = team(np.eye(4), fit=count)
+    compared = []
+    for seq in range(2, 6):
+        engine.align_due(at_most=1)
+        compared.append(pairs[-1][0])
+        # both are due again
+        send(engine, "ant", corner(0), seq)
+        send(engine, "bee", corner(1, kappa=9), seq)
+    ant, bee = compared[:2]
+    assert ant != bee
+    assert compared == [ant, bee, ant, bee]
+    assert len(pairs) == len(compared)
 
 
 def test_later_updates_of_a_drifting_agent_get_their_own_correction() -> None:
