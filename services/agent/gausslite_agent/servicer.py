@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gausslite.codec.subset_codec import split_batch
-from gausslite.domain.errors import InvalidInputError, RevisionGoneError
+from gausslite.domain.errors import InvalidInputError, MismatchError, RevisionGoneError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph
@@ -142,6 +143,29 @@ class AgentMapReader:
 _OUTCOMES_AHEAD = 16
 
 
+class NewestTask:
+    """Assigns one task at a time on a thread of its own; of the calls that wait, a newer one supersedes the older.
+
+    Use it on the event loop.
+    """
+
+    def __init__(self) -> None:
+        self._executor = ThreadPoolExecutor(1, "task")
+        self._newest: Future[TaskGraph] | None = None
+
+    async def assign(self, assign: Callable[[], TaskGraph]) -> TaskGraph:
+        """Return the result of the function. Raises MismatchError if a newer call comes before it begins."""
+        future = self._executor.submit(assign)
+        if self._newest is not None:
+            # without effect on one that has begun
+            self._newest.cancel()
+        self._newest = future
+        await asyncio.wait([asyncio.wrap_future(future)])
+        if future.cancelled():
+            raise MismatchError("task: superseded by a newer AssignTask before it was assigned")
+        return future.result()
+
+
 class AgentServicer(pb_grpc.AgentServiceServicer):
     """Serves one robot. changes: notified after each change of the map."""
 
@@ -156,6 +180,9 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         self._agent_id, self._worker, self._mission = agent_id, worker, mission
         self._parser, self._changes = parser, changes
         self._encoded_parts = EncodedPartCache()
+        self._newest_task = NewestTask()
+        # a thread of its own: calls that wait for the mapper must not delay a frame
+        self._decoder = ThreadPoolExecutor(1, "decode")
         # used on the worker thread only
         self._change_logs = {roi_only: MapChangeLog(worker.grid, roi_only) for roi_only in (False, True)}
 
@@ -166,8 +193,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
     async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:  # noqa: N802
         """Assign a task, given as text or as a graph."""
-        graph = await self._read_task(request)
-        graph = await asyncio.to_thread(self._mission.assign, graph)
+        graph = await self._newest_task.assign(lambda: self._mission.assign(self._read_task(request)))
         return pb.AssignTaskResponse(graph=graph_to_message(graph))
 
     async def IngestFrames(  # noqa: N802
@@ -243,10 +269,10 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         async for block in blocks:
             yield pb.WatchMapResponse(block=block)
 
-    async def _read_task(self, request: pb.AssignTaskRequest) -> TaskGraph:
+    def _read_task(self, request: pb.AssignTaskRequest) -> TaskGraph:
         match request.WhichOneof("task"):
             case "text":
-                return await asyncio.to_thread(self._parser.parse, request.text)
+                return self._parser.parse(request.text)
             case "graph":
                 return graph_from_message(request.graph)
             case _:
@@ -268,7 +294,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
     async def _submit(self, request: pb.IngestFramesRequest) -> asyncio.Future[FrameReport]:
         try:
-            frame = await asyncio.to_thread(_decode_frame, request)
+            frame = await asyncio.get_running_loop().run_in_executor(self._decoder, _decode_frame, request)
         except InvalidInputError as error:
             rejected: asyncio.Future[FrameReport] = asyncio.get_running_loop().create_future()
             rejected.set_result(self._worker.reject(request.frame.index, str(error)))

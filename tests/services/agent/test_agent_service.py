@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from agent_running import TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
+from waiting import wait_until
 
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import (
@@ -80,6 +81,39 @@ def test_assign_task_raises_the_error_of_the_estimator() -> None:
 def test_frames_need_a_task_first() -> None:
     with agent() as a, pytest.raises(MismatchError, match="AssignTask"):
         list(a.client.ingest([frame(0)]))
+
+
+def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() -> None:
+    begun, opened = threading.Event(), threading.Event()
+
+    def build(graph: TaskGraph) -> RelevanceEstimator:
+        begun.set()
+        assert opened.wait(20)
+        return ball_estimator(graph)
+
+    def is_refused(call: grpc.Future) -> bool:
+        return bool(call.done() and call.code() is grpc.StatusCode.FAILED_PRECONDITION)
+
+    damaged = pb.IngestFramesRequest(frame=convert.frame_to_message(frame(7)))
+    damaged.frame.t_world_camera.row_major[0] = float("nan")
+    with agent(build) as a:
+        first = a.stub.AssignTask.future(pb.AssignTaskRequest(text=TASK))
+        assert begun.wait(20)
+        storm = [
+            a.stub.AssignTask.future(pb.AssignTaskRequest(text=f"Find the chair and the box {number}"))
+            for number in range(40)
+        ]
+        # while the first is still being assigned, all but one are refused, and a frame is decoded
+        wait_until(lambda: sum(map(is_refused, storm)) == len(storm) - 1)
+        [answer] = a.stub.IngestFrames(iter([damaged]))
+        assert answer.outcome == pb.FRAME_OUTCOME_REJECTED
+        assert not first.done()
+        opened.set()
+        assert first.result(20).graph.text == TASK
+        [newest] = [call for call in storm if not is_refused(call)]
+        assert a.client.status().graph.text == newest.result(20).graph.text
+    refused = next(call for call in storm if is_refused(call))
+    assert refused.details() == "task: superseded by a newer AssignTask before it was assigned"
 
 
 def test_each_frame_has_its_outcome_in_order() -> None:
