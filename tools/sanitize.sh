@@ -8,9 +8,12 @@ fail() { echo "sanitize: $1" >&2; exit 1; }
 kind=${1:-}
 case $kind in
   # One SIMD variant besides the portable one: instrumenting all takes many minutes and finds no more errors in the stages.
-  address) sanitizers=address,undefined runtimes="libasan.so libubsan.so" variants="avx2;neon" tests="kernels choices bindings" ;;
+  address)
+    sanitizers=address,undefined runtimes="libasan.so libubsan.so" variants="avx2;neon"
+    tests=(tests/core/render/test_cpu_{kernels,choices,bindings}.py tests/core/codec/test_unpack.py)
+    ;;
   # The variants share the work among threads by the same code.
-  thread) sanitizers=thread runtimes=libtsan.so variants=portable tests="kernels bindings" ;;
+  thread) sanitizers=thread runtimes=libtsan.so variants=portable tests=(tests/core/render/test_cpu_{kernels,bindings}.py) ;;
   *) fail "expected address or thread, got '$kind'" ;;
 esac
 python=$(command -v "${2:-python3}") || fail "no such Python: ${2:-python3}"
@@ -47,8 +50,9 @@ cmake --build "$build" --parallel "$(nproc)" >/dev/null
 rm -rf "$build/package"
 mkdir "$build/package"
 cp -r "$root/src/." "$build/package/"
-rm -f "$build"/package/gausslite/render/_kernels*.so
+rm -f "$build"/package/gausslite/{render/_kernels,codec/_unpack}*.so
 cp "$build"/_kernels*.so "$build/package/gausslite/render/"
+cp "$build"/_unpack*.so "$build/package/gausslite/codec/"
 # An editable install would be found before PYTHONPATH, with kernels that are not instrumented.
 echo 'import sys; sys.meta_path[:] = [each for each in sys.meta_path if not type(each).__module__.startswith("_editable")]' \
   > "$build/package/sitecustomize.py"
@@ -56,6 +60,6 @@ export PYTHONPATH=$build/package PYTHONDONTWRITEBYTECODE=1
 cd "$root"
 run_checked -c "import sys, gausslite.render._kernels as kernels; sys.exit(not kernels.__file__.startswith('$build/package'))" ||
   fail "Python does not import the instrumented kernels; nothing was checked"
-[ $# -gt 0 ] || for name in $tests; do set -- "$@" "tests/core/render/test_cpu_$name.py"; done
+[ $# -gt 0 ] || set -- "${tests[@]}"
 # Uncaptured: a sanitizer writes its report and ends the process; pytest would lose the report.
 run_checked -m pytest -q --capture=no -p no:cacheprovider "$@"

@@ -42,6 +42,13 @@ class BodyLayout:
         kappa_bytes = 1 if largest < 1 << 8 else 2 if largest < 1 << 16 else 4
         return cls(len(batch), len(batch.gaussians), kappa_bytes, 1 if narrow else 2, precision)
 
+    @property
+    def widths(self) -> tuple[int, int, int, int, int, int]:
+        """The fields as `_unpack` takes them."""
+        precision = self.precision
+        counts = self.voxels, self.gaussians
+        return *counts, self.kappa_bytes, self.target_bytes, precision.coarse_bits, precision.scale_code
+
     def voxel_columns(self) -> list[Column]:
         """Differences of keys, Σkappa minus that of the voxel's Gaussians, and counts."""
         return [Column(dtype, (self.voxels,)) for dtype in ("<u8", "<u8", "<u4")]

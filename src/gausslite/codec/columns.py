@@ -30,33 +30,12 @@ from numpy.typing import NDArray
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
 
-_WINDOW_BYTES = 3
-
 
 def pack_bits(values: Int64[ndarray, " n"], widths: Int64[ndarray, " n"]) -> bytes:
     """Return the low widths[i] bits of values[i], one value after the other; the last byte is filled with zeros."""
     bit_indices = np.arange(int(widths.max(initial=0)))
     bits = (values[:, None] >> bit_indices & 1).astype(np.uint8)
     return np.packbits(bits[bit_indices < widths[:, None]], bitorder="little").tobytes()
-
-
-def unpack_bits(data: bytes, widths: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
-    """Return the values of these widths, each at most 17 bits.
-
-    Raises CodecError if the data has another size or a bit after the last.
-    """
-    ends = np.cumsum(widths)
-    total = int(ends[-1]) if len(ends) else 0
-    if len(data) != (total + 7) // 8:
-        raise CodecError(f"subset: expected {(total + 7) // 8} bytes of bit fields, got {len(data)}")
-    if total % 8 and data[-1] >> total % 8:
-        raise CodecError("subset: expected zeros after the last bit field, got other bits")
-    starts = ends - widths
-    first, padded = starts >> 3, np.frombuffer(data + bytes(_WINDOW_BYTES), np.uint8).astype(np.int64)
-    # a field of 17 bits that begins at the last bit of a byte ends in the second byte after it
-    window = padded[first] | padded[first + 1] << 8 | padded[first + 2] << 16
-    values: Int64[ndarray, " n"] = window >> (starts & 7) & (np.int64(1) << widths) - 1
-    return values
 
 
 _ZSTD_LEVEL = 3
@@ -93,19 +72,24 @@ def compress_columns(arrays: Sequence[NDArray[Any]], columns: Sequence[Column]) 
 def decompress_columns(frame: bytes, columns: Sequence[Column]) -> list[NDArray[Any]]:
     """Return the arrays. Raises CodecError, before memory is allocated, if the frame declares another size."""
     sizes = [column.byte_count for column in columns]
-    size = sum(sizes)
-    try:
-        header = zstandard.get_frame_parameters(frame)
-        if header.content_size != size or header.window_size > max(size, _MIN_WINDOW_BYTES):
-            raise CodecError(f"subset: expected a body of {size} bytes, got {header.content_size}")
-        raw = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size, allow_extra_data=False)
-    except zstandard.ZstdError as error:
-        raise CodecError(f"subset: body is not one zstd frame: {error}") from error
+    raw = decompress(frame, sum(sizes))
     arrays, start = [], 0
     for column, byte_count in zip(columns, sizes, strict=True):
         arrays.append(_unshuffle(raw[start : start + byte_count], column))
         start += byte_count
     return arrays
+
+
+def decompress(frame: bytes, size: int) -> bytes:
+    """Return the content of a frame. Raises CodecError, before memory is allocated, if it declares another size."""
+    try:
+        header = zstandard.get_frame_parameters(frame)
+        if header.content_size != size or header.window_size > max(size, _MIN_WINDOW_BYTES):
+            raise CodecError(f"subset: expected a body of {size} bytes, got {header.content_size}")
+        raw: bytes = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise CodecError(f"subset: body is not one zstd frame: {error}") from error
+    return raw
 
 
 def _shuffle(array: NDArray[Any]) -> bytes:
@@ -167,6 +151,8 @@ def _steps_by_spread() -> Int64[ndarray, " 256"]:
 
 
 _STEPS_BY_SPREAD = _steps_by_spread()
+QUAT_STEPS = _STEPS_BY_SPREAD.astype(np.uint8).tobytes()
+"""The steps by the difference between the largest and the smallest code of a scale, a byte each."""
 
 
 def encode_quats(
@@ -195,19 +181,6 @@ def decode_quats(
     full[rows[:, None], _OTHERS[largest]] = offsets
     quats_wxyz: Float32[ndarray, "n 4"] = (full / np.linalg.norm(full, axis=1, keepdims=True)).astype(np.float32)
     return quats_wxyz
-
-
-def require_codes(
-    largest: UInt8[ndarray, " n"], others: UInt8[ndarray, "n 3"], steps: Int64[ndarray, " n"],
-    opacities: UInt8[ndarray, " n"], rgb: UInt8[ndarray, "n 3"],
-) -> None:  # fmt: skip
-    """Raise CodecError for codes out of range."""
-    if (largest > 3).any() or (np.abs(others.astype(np.int64) - QUAT_ZERO) > steps[:, None]).any():
-        raise CodecError("subset quats: expected an index of 0 to 3 and components up to the largest, got others")
-    if (opacities >= OPACITY_BINS).any():
-        raise CodecError(f"subset opacities: expected codes below {OPACITY_BINS}, got a larger one")
-    if (rgb > _MAX_COLOUR_CODE).any():
-        raise CodecError(f"subset rgb: expected codes up to {_MAX_COLOUR_CODE}, got a larger one")
 
 
 def encode_opacities(opacities: Float32[ndarray, " n"]) -> UInt8[ndarray, " n"]:
@@ -296,12 +269,6 @@ def cells_of(
     return clipped
 
 
-def cell_centres(cells: Int64[ndarray, "n 3"], bits: Int64[ndarray, " n"]) -> Int64[ndarray, "n 3"]:
-    """Return the centre of each cell in its voxel, in 65536ths of the voxel's size."""
-    fractions: Int64[ndarray, "n 3"] = (2 * cells + 1) << (MAX_FINE_BITS - bits)[:, None]
-    return fractions
-
-
 def points_of(
     fractions: NDArray[np.integer[Any]], voxel: Int64[ndarray, "n 3"], grid: VoxelGrid
 ) -> Float32[ndarray, "n 3"]:
@@ -338,36 +305,3 @@ def encode_positions(
     low = cells & ((np.int64(1) << fine) - 1)[:, None]
     widths = np.concatenate([np.maximum(lengths - 1, 0), fine, fine, fine])
     return lengths.astype(np.uint8), pack_bits(np.concatenate([deltas, *low.T]), widths)
-
-
-def decode_positions(
-    lengths: UInt8[ndarray, " n"], packed: bytes, bits: Int64[ndarray, " n"], starts: Int64[ndarray, " v"],
-    coarse_bits: int,
-) -> Int64[ndarray, "n 3"]:  # fmt: skip
-    """Return the cells. Raises CodecError for a Morton code out of range and other sizes of the packed bits."""
-    n, wide = len(lengths), lengths.astype(np.int64)
-    if (wide > 3 * coarse_bits).any():
-        raise CodecError(f"subset positions: expected differences of up to {3 * coarse_bits} bits, got a longer one")
-    fine = bits - coarse_bits
-    values = unpack_bits(packed, np.concatenate([np.maximum(wide - 1, 0), fine, fine, fine]))
-    # the highest bit of a difference is always one, so it is not stored
-    deltas = values[:n] | (np.int64(1) << wide) >> 1
-    totals = np.concatenate([np.zeros(1, np.int64), np.cumsum(deltas)])
-    codes = totals[1:] - np.repeat(totals[starts], np.diff(starts, append=n))
-    if (codes >> 3 * coarse_bits).any():
-        raise CodecError("subset positions: expected cells inside their voxels, got one outside")
-    cells: Int64[ndarray, "n 3"] = values[n:].reshape(3, n).T | _COARSE_CELLS[codes] << fine[:, None]
-    return cells
-
-
-def _coarse_cells() -> Int64[ndarray, "c 3"]:
-    """Return the three indices that each Morton code interleaves."""
-    codes = np.arange(1 << 3 * MAX_COARSE_BITS)
-    cells = np.zeros((len(codes), 3), np.int64)
-    for place in range(MAX_COARSE_BITS):
-        for axis in range(3):
-            cells[:, axis] |= (codes >> (3 * place + 2 - axis) & 1) << place
-    return cells
-
-
-_COARSE_CELLS = _coarse_cells()

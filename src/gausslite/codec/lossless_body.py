@@ -36,8 +36,8 @@ def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
     return compress_columns([*encode_voxels(batch), *values, *encode_labels(batch.gaussians, layout)], _columns(layout))
 
 
-def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int) -> StoredVoxels:
-    """Return the voxels of a body. Raises CodecError, InvalidInputError."""
+def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int, stated_sums: bool) -> StoredVoxels:
+    """Return the voxels of a body; Σkappa as stated, or computed. Raises CodecError, InvalidInputError."""
     raw = decompress_columns(body, _columns(layout))
     keys, offsets = decode_voxels(raw[:3], layout)
     active, kappa, target = decode_labels(raw[-3:])
@@ -56,7 +56,8 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int) ->
     batch = VoxelBatch(keys, decode_kappa_sums(raw[:3], kappa, offsets), raw[2].astype(np.uint32), gaussians)
     if not _are_inside(batch, grid):
         raise CodecError("subset means_m: expected every mean inside its voxel, got one outside")
-    return StoredVoxels.exact(batch, update_seq)
+    voxels = StoredVoxels.exact(batch, update_seq)
+    return voxels if stated_sums else voxels.with_computed_sums()
 
 
 def _columns(layout: BodyLayout) -> list[Column]:

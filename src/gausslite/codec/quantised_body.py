@@ -15,21 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gausslite.codec import columns
+from gausslite.codec import _unpack, columns
 from gausslite.codec.body_layout import (
     MAX_LABEL_BYTES,
     VOXEL_BYTES,
     BodyLayout,
-    decode_differences,
-    decode_kappa_sums,
-    decode_labels,
-    decode_voxels,
     encode_differences,
     encode_labels,
     encode_voxels,
 )
-from gausslite.codec.columns import Column, compress_columns, decompress_columns
-from gausslite.codec.stored_voxels import CODES, MAX_TARGET, OPACITY_BITS, TARGET_BITS, StoredVoxels, voxel_table
+from gausslite.codec.columns import Column, compress_columns, decompress
+from gausslite.codec.stored_voxels import CODES, VOXELS, StoredVoxels
 from gausslite.domain.errors import CodecError
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 
@@ -71,29 +67,23 @@ def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
     return _FRAME_SIZE.pack(len(frame)) + frame + packed
 
 
-def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int) -> StoredVoxels:
-    """Return the voxels of a body, with its codes. Raises CodecError, InvalidInputError."""
+def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int, stated_sums: bool) -> StoredVoxels:
+    """Return the voxels of a body, with its codes; Σkappa as stated, or as computed from the Gaussians.
+
+    Raises CodecError, InvalidInputError.
+    """
     frame, packed = _split(body)
-    raw = decompress_columns(frame, _columns(layout))
-    of_voxels, (lengths, first, second, third, largest, *rest), labels = raw[:3], raw[3:-3], raw[-3:]
-    keys, offsets = decode_voxels(of_voxels, layout)
-    scales, quats = _scale_codes(first, second, third), np.stack(rest[:3], axis=1)
-    bits, rgb = layout.precision.bits(scales), decode_differences(np.stack(rest[4:], axis=1))
-    columns.require_codes(largest, quats, columns.quat_steps(scales), rest[3], rgb)
-    starts = offsets[:-1][raw[2] > 0]
-    cells = columns.decode_positions(lengths, packed, bits, starts, layout.precision.coarse_bits)
-    active, kappa, target = decode_labels(labels)
-    codes = np.empty(layout.gaussians, CODES)
-    codes["fractions"] = columns.cell_centres(cells, bits)
-    codes["scales"], codes["quats"], codes["rgb"], codes["kappa"] = scales, quats, rgb, kappa
-    codes["largest_and_opacity"] = largest << OPACITY_BITS | rest[3]
-    label = np.clip(target, -1, MAX_TARGET) + 1
-    codes["active_and_target"] = active.astype(np.uint8) << TARGET_BITS | label.astype(np.uint8)
-    table = voxel_table(keys, update_seq, decode_kappa_sums(of_voxels, kappa, offsets), raw[2])
-    voxels = StoredVoxels(table, codes, grid.size_m)
-    if (label != target + 1).any():
+    shared = sum(column.byte_count for column in (*layout.voxel_columns(), *layout.label_columns()))
+    raw = decompress(frame, shared + _SYMBOL_BYTES * layout.gaussians)
+    try:
+        table, codes, targets = _unpack.unpack(raw, packed, layout.widths, columns.QUAT_STEPS, update_seq, stated_sums)
+    except ValueError as error:
+        raise CodecError(f"subset: {error}") from error
+    voxels = StoredVoxels(np.frombuffer(table, VOXELS), np.frombuffer(codes, CODES), grid.size_m)
+    if targets:
         batch = voxels.batch()
-        return StoredVoxels.exact(replace(batch, gaussians=replace(batch.gaussians, target=target)), update_seq)
+        gaussians = replace(batch.gaussians, target=np.frombuffer(targets, "<i2").astype(np.int16))
+        return StoredVoxels.exact(replace(batch, gaussians=gaussians), update_seq)
     return voxels
 
 
@@ -115,8 +105,3 @@ def _split(body: bytes) -> tuple[bytes, bytes]:
 def _scale_symbols(codes: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     first = codes[:, 0]
     return encode_differences(first), codes[:, 1] - first, codes[:, 2] - first
-
-
-def _scale_codes(first: NDArray[np.uint8], second: NDArray[np.uint8], third: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    codes = decode_differences(first)
-    return np.stack([codes, codes + second, codes + third], axis=1)

@@ -96,15 +96,18 @@ def decode_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[Ro
 
     Raises CodecError if the bytes are not a valid message or exceed the limits, ChecksumError if they are damaged.
     """
-    stored, session_id, grid = _decode(data, limits)
+    stored, session_id, grid = _decode(data, limits, stated_sums=True)
     with _codec_errors():
         batch = stored.voxels.batch()
         return RoiSubset(stored.agent_id, session_id, stored.message_seq, stored.update_seq, batch), grid
 
 
 def decode_stored(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[StoredSubset, VoxelGrid]:
-    """Check a message and return it as a store keeps it, without decoding its Gaussians. Raises as decode_subset."""
-    stored, _, grid = _decode(data, limits)
+    """Check a message and return it as a store keeps it, without decoding its Gaussians. Raises as decode_subset.
+
+    Σkappa is computed from the Gaussians (Sec. III-E), whatever the message states.
+    """
+    stored, _, grid = _decode(data, limits, stated_sums=False)
     return stored, grid
 
 
@@ -117,12 +120,12 @@ def declared_bytes(data: bytes) -> int:
     return int(voxels * VOXELS.itemsize + gaussians * CODES.itemsize)
 
 
-def _decode(data: bytes, limits: CodecLimits) -> tuple[StoredSubset, str, VoxelGrid]:
+def _decode(data: bytes, limits: CodecLimits, stated_sums: bool) -> tuple[StoredSubset, str, VoxelGrid]:
     envelope, body = _open_envelope(data, limits)
     with _codec_errors():
         grid = VoxelGrid(envelope.size_m)
         coder = lossless_body if envelope.coding is SubsetCoding.LOSSLESS else quantised_body
-        voxels = coder.decode(body, grid, envelope.layout, envelope.update_seq)
+        voxels = coder.decode(body, grid, envelope.layout, envelope.update_seq, stated_sums)
         agent_id, session_id = envelope.agent.decode(), envelope.session.decode()
         return StoredSubset(agent_id, envelope.message_seq, envelope.update_seq, voxels), session_id, grid
 

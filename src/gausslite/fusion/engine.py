@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from threading import RLock
 from typing import NamedTuple
 
@@ -207,7 +208,9 @@ class FusionEngine:
         """
         agent_id = self.session(session_id).agent_id
         self._require_own(agent_id, subset.agent_id, grid)
-        future = self._enqueue(PendingUpdate(session_id, agent_id, StoredSubset.exact(subset)))
+        stored = StoredSubset.exact(subset)
+        stored = replace(stored, voxels=stored.voxels.with_computed_sums())
+        future = self._enqueue(PendingUpdate(session_id, agent_id, stored))
         self._committer.commit()
         # another thread may be committing it
         return future.result()
@@ -373,7 +376,7 @@ class FusionEngine:
             return self._mission.agents.drop_contradicted(agent_id)
 
     def _decode_update(self, update: PendingUpdate) -> StoredSubset:
-        """Return the message as it is stored. Raises GaussLiteError."""
+        """Return the message as it is stored, with computed sums. Raises GaussLiteError."""
         if not isinstance(update.message, bytes):
             return update.message
         subset, grid = decode_stored(update.message)
@@ -387,15 +390,13 @@ class FusionEngine:
         if grid != self.grid:
             raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
 
-    def _check_update(self, update: PendingUpdate) -> StoredSubset:
-        """Return the message with computed sums; only its first part is checked. Raises GaussLiteError."""
+    def _check_update(self, update: PendingUpdate) -> None:
+        """Raise GaussLiteError for a message that may not be stored; only its first part is checked."""
         self._mission.members.session(update.session_id)
-        if update.outcomes:
-            return update.subset
-        subset = self._mission.checks.check(update.subset)
-        require_storable(subset)
-        require_within_quotas(subset, self._store, self._settings.quotas)
-        return subset
+        if not update.outcomes:
+            self._mission.checks.require_plausible(update.subset)
+            require_storable(update.subset)
+            require_within_quotas(update.subset, self._store, self._settings.quotas)
 
     def _record_updates(self, stored: Sequence[tuple[str, Int64[ndarray, " _"]]]) -> None:
         """Update the fused map after a commit of these accepted voxels of different agents."""

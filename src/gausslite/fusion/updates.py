@@ -46,24 +46,21 @@ class UpdateChecks:
             self._store.save_record(agent_id, RECORD, _JOINED.pack(now_s))
             self._first_joined_s[agent_id] = now_s
 
-    def check(self, subset: StoredSubset) -> StoredSubset:
-        """Return the message with Σkappa computed from its Gaussians, whatever it declares.
+    def require_plausible(self, subset: StoredSubset) -> None:
+        """Raise InvalidInputError for a sequence number too far above the stored ones, QuotaError for a kappa.
 
-        Raises InvalidInputError for a sequence number too far above the stored ones, QuotaError for a kappa that no
-        robot can have reached yet: the bound grows with the time since its first join.
+        No robot can have reached a kappa above the bound, which grows with the time since its first join.
         """
         name, highest = quote_name(subset.agent_id), self._store.totals(subset.agent_id).highest_update_seq
         if subset.update_seq > highest + MAX_SEQ_STEP:
             raise InvalidInputError(
                 f"agent {name}: expected an update_seq of at most {highest + MAX_SEQ_STEP}, got {subset.update_seq}"
             )
-        voxels = subset.voxels
-        largest, bound = int(voxels.gaussians["kappa"].max(initial=0)), self._kappa_bound(subset.agent_id)
+        largest, bound = int(subset.voxels.gaussians["kappa"].max(initial=0)), self._kappa_bound(subset.agent_id)
         if largest > bound:
             raise QuotaError(
                 f"agent {name}: expected a kappa of at most {bound} this long after its first join, got {largest}"
             )
-        return replace(subset, voxels=voxels.with_computed_sums())
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete what is known of the agent; the store deletes its records."""
@@ -233,8 +230,8 @@ def _encoded_bytes(update: PendingUpdate) -> int:
 _GROUP_BYTES = 2 << 20
 Decode = Callable[[PendingUpdate], StoredSubset]
 """Returns the decoded message. Raises GaussLiteError to refuse it."""
-Check = Callable[[PendingUpdate], StoredSubset]
-"""Returns the message as it is stored. Raises GaussLiteError to refuse it."""
+Check = Callable[[PendingUpdate], None]
+"""Raises GaussLiteError to refuse a message."""
 Record = Callable[[Sequence[tuple[str, Int64[ndarray, " _"]]]], None]
 """Notes the voxels of each agent that a commit has stored."""
 
@@ -295,7 +292,7 @@ class UpdateCommitter:
         with self._lock:
             for update in group:
                 try:
-                    update.message = self._check(update)
+                    self._check(update)
                     checked.append((update, update.next_slice()))
                 except GaussLiteError as error:
                     _fail(update, error)

@@ -30,6 +30,11 @@ def require_same(voxels: StoredVoxels, expected: VoxelBatch) -> None:
         assert getattr(batch, name).tolist() == getattr(expected, name).tolist()
 
 
+def with_computed_sums(batch: VoxelBatch) -> VoxelBatch:
+    totals = np.concatenate([np.zeros(1, np.uint64), np.cumsum(batch.gaussians.kappa, dtype=np.uint64)])
+    return replace(batch, kappa_sums=totals[batch.offsets[1:]] - totals[batch.offsets[:-1]])
+
+
 def with_few_targets(batch: VoxelBatch) -> VoxelBatch:
     return replace(batch, gaussians=replace(batch.gaussians, target=batch.gaussians.target % np.int16(127)))
 
@@ -39,7 +44,7 @@ def test_every_bit_of_a_message_comes_back_from_its_rows(case: tuple[float, floa
     size_m, centre_m, seed, n = case
     grid = VoxelGrid(size_m)
     message = encode_subset(RoiSubset("ant", "s", 7, 9, make_batch(seed, n, grid, centre_m=centre_m)), grid, coding)
-    expected, stored = decode_subset(message)[0].batch, decode_stored(message)[0]
+    expected, stored = with_computed_sums(decode_subset(message)[0].batch), decode_stored(message)[0]
     assert (stored.agent_id, stored.message_seq, stored.update_seq) == ("ant", 7, 9)
     require_same(stored.voxels, expected)
     parts = [StoredVoxels.from_row(part.to_row()) for part in stored.voxels.by_tile()]
@@ -68,16 +73,14 @@ def test_received_gaussians_take_21_bytes(case: tuple[float, float, int, int]) -
     assert len(voxels.to_row()) == HEAD_BYTES + VOXELS.itemsize * len(batch) + 21 * n
 
 
-def test_sums_are_computed_from_the_codes() -> None:
+@pytest.mark.parametrize("coding", SubsetCoding)
+def test_sums_are_computed_whatever_a_message_states(coding: SubsetCoding) -> None:
     grid = VoxelGrid(0.1)
-    voxels = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, make_batch(3, 60, grid)), grid))[0].voxels
-    batch, computed = voxels.batch(), voxels.with_computed_sums()
-    expected = [
-        int(batch.gaussians.kappa[start:stop].astype(np.uint64).sum())
-        for start, stop in zip(batch.offsets, batch.offsets[1:], strict=False)
-    ]
-    assert computed.voxels["kappa_sums"].tolist() == expected
-    assert voxels.voxels["kappa_sums"].tolist() != expected
+    batch = make_batch(3, 60, grid)
+    voxels = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid, coding))[0].voxels
+    assert voxels.voxels["kappa_sums"].tolist() == with_computed_sums(batch).kappa_sums.tolist()
+    assert StoredVoxels.exact(batch, 1).with_computed_sums().voxels.tolist() == voxels.voxels.tolist()
+    assert voxels.voxels["kappa_sums"].tolist() != batch.kappa_sums.tolist()
 
 
 def test_voxels_that_do_not_ascend_are_refused() -> None:

