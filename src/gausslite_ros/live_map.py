@@ -72,7 +72,7 @@ class LiveMap:
         free = self._grid.indices(self._free)
         return MapContents(
             gaussians.take(gaussians.active),
-            tuple(self._planar(voxels, free, replace(self._settings, height_m=each)) for each in self._heights),
+            tuple(self._planar(voxels, free, replace(self._settings, height_m=range_m)) for range_m in self._heights),
         )
 
     def _carve(self) -> None:
