@@ -15,7 +15,7 @@ from numpy import ndarray
 from gausslite.datasets.camera_files import FolderCamera
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, InvalidInputError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import ClockJumps, Frame
 from gausslite_ros.bag_file import BagOptions
 from gausslite_ros.cameras import FrameConverter, join_cameras, optical_pose, require_own_camera
 from gausslite_ros.messages import TransformMessage, camera_of, frame_name, stamp_ns
@@ -25,8 +25,6 @@ from gausslite_ros.transforms import MAX_GAP_S, TransformWindow, transforms_of
 MAX_WAIT_S = 1.5
 """Localisation nodes publish map → odom once a second."""
 _MAX_IMAGES = 64
-_LATE_IN_A_ROW = 5
-"""So many ascending stamps, each before those of earlier images, come from a clock that was set back."""
 _PLACE = "topics"
 
 
@@ -61,9 +59,8 @@ class LiveFrames:
 
     options: the topics (their names state whether images are rectified); frame: the world frame in tf. A colour image
     waits until a depth image and transforms of its time or later have arrived, at most max_wait_s by the images'
-    stamps. Depth that is not aligned to colour, see `is_aligned`, is registered to it. If the stamps of images go back,
-    by more than max_wait_s or several times in a row, the clock has jumped: a playback began again, a simulator was
-    reset, or a stamp was of the future. Then everything of the old clock is forgotten.
+    stamps. Depth that is not aligned to colour, see `is_aligned`, is registered to it. If the stamps of images go back
+    as `ClockJumps` describes, everything of the old clock is forgotten.
     """
 
     def __init__(self, options: BagOptions, max_wait_s: float = MAX_WAIT_S) -> None:
@@ -76,7 +73,7 @@ class LiveFrames:
         self._depths: list[tuple[int, int, Any]] = []
         self._depths_received = 0
         self._newest_ns = self._last_taken_ns = -1
-        self._late_ns: dict[str, list[int]] = {"colour": [], "depth": []}
+        self._colour_clock, self._depth_clock = ClockJumps(max_wait_s), ClockJumps(max_wait_s)
         self._counters = LiveCounters()
         self._problem = ""
 
@@ -100,7 +97,7 @@ class LiveFrames:
         pending = _Pending(self._counters.received, stamp_ns(message.header), message)
         self._count("received")
         latest_ns = self._pending[-1].time_ns if self._pending else self._last_taken_ns
-        if self._clock_has_jumped("colour", pending.time_ns, latest_ns):
+        if self._colour_clock.has_jumped(pending.time_ns, latest_ns):
             self._clear()
         elif pending.time_ns <= latest_ns:
             self._count("out_of_order")
@@ -114,7 +111,7 @@ class LiveFrames:
     def add_depth(self, message: Any) -> None:
         """Add a depth image, raw or compressed."""
         time_ns = stamp_ns(message.header)
-        if self._clock_has_jumped("depth", time_ns, self._depths[-1][0] if self._depths else -1):
+        if self._depth_clock.has_jumped(time_ns, self._depths[-1][0] if self._depths else -1):
             self._clear()
         self._newest_ns = max(self._newest_ns, time_ns)
         # the number keeps equal stamps in order, so that messages are not compared
@@ -134,15 +131,6 @@ class LiveFrames:
         """Add the transforms of one tf message; static: of /tf_static. Raises DatasetError for too long names."""
         self._transforms.add(transforms_of(messages, static))
 
-    def _clock_has_jumped(self, stream: str, time_ns: int, latest_ns: int) -> bool:
-        """True if a stamp is far before the latest of its stream, or the last of several ascending ones before it."""
-        late_ns = self._late_ns[stream]
-        if time_ns > latest_ns or (late_ns and time_ns <= late_ns[-1]):
-            late_ns.clear()
-        if time_ns <= latest_ns:
-            late_ns.append(time_ns)
-        return latest_ns - time_ns > self._max_wait_ns or len(late_ns) >= _LATE_IN_A_ROW
-
     def _clear(self) -> None:
         """Drop images, depths and moving transforms, which have stamps of another clock."""
         for _ in self._pending:
@@ -152,7 +140,8 @@ class LiveFrames:
         self._depths.clear()
         self._transforms.clear_moving()
         self._newest_ns = self._last_taken_ns = -1
-        self._late_ns = {"colour": [], "depth": []}
+        self._colour_clock.reset()
+        self._depth_clock.reset()
 
     def take(self) -> list[Frame]:
         """Return the frames that have become complete, in the order of their stamps."""

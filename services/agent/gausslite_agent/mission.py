@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from gausslite.codec.json import graph_as_json, noun_as_json, object_as_json
-from gausslite.domain.errors import GaussLiteError, MismatchError, StorageError
-from gausslite.domain.frame import Frame
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, StorageError
+from gausslite.domain.frame import ClockJumps, Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import match_warnings
 from gausslite.domain.task import LIMITS, TaskGraph
@@ -86,6 +86,7 @@ def mission_report(
 
 _log = logging.getLogger(__name__)
 _INTERRUPTED = "interrupted"
+_BEFORE_ALL_NS = -1
 NO_DETECTOR = (
     "this agent cannot find the objects of a task, because it has no detector; start it with --detector FILE.onnx"
 )
@@ -108,6 +109,7 @@ class AgentMission:
         self._state_machine = MissionStateMachine()
         self._start_s = time.monotonic()
         self._corrupt = CorruptFrames(_log.warning)
+        self._clock, self._latest_ns = ClockJumps(), _BEFORE_ALL_NS
         self._pending: Future[FrameReport] | None = None
         # set while no source is replayed
         self._replay_ended = threading.Event()
@@ -173,8 +175,13 @@ class AgentMission:
             self.assign(self._parser.parse(task))
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
-        """Queue a frame and return the future of its report. Raises MismatchError unless the mission is mapping."""
+        """Queue a frame and return the future of its report. Call it from one thread.
+
+        Raises MismatchError unless the mission is mapping, InvalidInputError for a frame that is not later than the one
+        before, unless the clock has jumped.
+        """
         self._state_machine.require_mapping()
+        self._require_later(frame.capture_time_ns)
         return self._worker.submit(frame)
 
     def run(self, stream: FrameStream) -> None:
@@ -243,9 +250,21 @@ class AgentMission:
         """Do the same, unless the mission is not mapping now."""
         return self.save() if self._state_machine.state is MissionState.MAPPING else 0.0
 
+    def _require_later(self, time_ns: int) -> None:
+        latest_ns = self._latest_ns
+        if self._clock.has_jumped(time_ns, latest_ns):
+            back_s = (latest_ns - time_ns) / 1e9
+            _log.warning("the frames' capture times went back by %.3f s: their clock was set, or began again", back_s)
+        elif time_ns <= latest_ns:
+            raise InvalidInputError(
+                f"frame capture_time_ns: expected more than {latest_ns}, that of the frame before, got {time_ns}"
+            )
+        self._latest_ns = time_ns
+
     def _begin(self) -> None:
         if self._state_machine.state is not MissionState.MAPPING:
             self._summary = None
+            self._latest_ns = _BEFORE_ALL_NS
             self._state_machine.enter(MissionState.MAPPING)
 
     def _replay(self, stream: FrameStream) -> GaussLiteError | None:

@@ -295,11 +295,11 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     async def _submit(self, request: pb.IngestFramesRequest) -> asyncio.Future[FrameReport]:
         try:
             frame = await asyncio.get_running_loop().run_in_executor(self._decoder, _decode_frame, request)
+            return asyncio.wrap_future(self._mission.submit(frame))
         except InvalidInputError as error:
             rejected: asyncio.Future[FrameReport] = asyncio.get_running_loop().create_future()
             rejected.set_result(self._worker.reject(request.frame.index, str(error)))
             return rejected
-        return asyncio.wrap_future(self._mission.submit(frame))
 
 
 def _decode_frame(request: pb.IngestFramesRequest) -> Frame:

@@ -37,6 +37,36 @@ def without_depth_edges(depth_m: Float32[ndarray, "h w"], distance_px: int) -> F
     return np.where(near_jumps > 0, np.float32(0.0), depth_m)
 
 
+_LATE_IN_A_ROW = 5
+
+
+class ClockJumps:
+    """Tells a clock that was set back from stamps that arrive out of order.
+
+    The clock has jumped if a stamp is more than max_late_s before the latest one, or the last of five ascending ones
+    before it: a playback began again, a simulator was reset, or a stamp was of the future.
+    """
+
+    def __init__(self, max_late_s: float = 1.5) -> None:
+        self._max_late_ns = round(max_late_s * 1e9)
+        self._late_ns: list[int] = []
+
+    def has_jumped(self, time_ns: int, latest_ns: int) -> bool:
+        """Return whether the clock has jumped from the latest stamp to this one. Call it for each stamp."""
+        if time_ns > latest_ns or (self._late_ns and time_ns <= self._late_ns[-1]):
+            self._late_ns.clear()
+        if time_ns <= latest_ns:
+            self._late_ns.append(time_ns)
+        has_jumped = latest_ns - time_ns > self._max_late_ns or len(self._late_ns) >= _LATE_IN_A_ROW
+        if has_jumped:
+            self.reset()
+        return has_jumped
+
+    def reset(self) -> None:
+        """Forget the late stamps."""
+        self._late_ns.clear()
+
+
 MAX_COORDINATE_M = 10_000.0
 """Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
 

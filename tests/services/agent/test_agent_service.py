@@ -142,6 +142,30 @@ def test_each_frame_has_its_outcome_in_order() -> None:
     assert status.hz > 0
 
 
+def test_a_frame_that_is_not_later_is_refused_unless_the_clock_has_jumped() -> None:
+    def outcomes(*times_ms: int) -> str:
+        frames = (replace(frame(0), capture_time_ns=time_ms * 1_000_000) for time_ms in times_ms)
+        answers = list(a.client.ingest(frames))
+        reasons.extend(answer.reason for answer in answers if answer.reason)
+        return "".join("m" if answer.outcome == pb.FRAME_OUTCOME_MAPPED else "r" for answer in answers)
+
+    reasons: list[str] = []
+    with agent() as a:
+        a.client.assign_task(TASK)
+        # also on another stream; equal times are no order either
+        assert outcomes(9000, 9000, 8990, 9001) == "mrrm"
+        assert outcomes(9001, 9002) == "rm"
+        # far back, and several ascending times in a row: a clock that was set
+        assert outcomes(7000, 6999, 7001) == "mrm"
+        assert outcomes(6980, 6985, 6990, 6991, 6995, 6996) == "rrrrmm"
+        a.client.end_mission()
+        a.client.assign_task("Find the chair")
+        assert outcomes(6990) == "m"
+    assert reasons[0] == (
+        "frame capture_time_ns: expected more than 9000000000, that of the frame before, got 9000000000"
+    )
+
+
 def test_the_status_has_the_odometrys_correction() -> None:
     with agent() as a:
         a.client.assign_task(TASK)
