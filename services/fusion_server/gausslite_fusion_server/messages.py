@@ -114,7 +114,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     frame = frame_from_message(message)
     region_from_png(message.region_png, frame.camera)
     data = message.SerializeToString()
-    keyframe = EncodedKeyframe(agent_id, frame.index, frame.depth_m.size, data)
+    keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
     engine.add_keyframe(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])
 
 

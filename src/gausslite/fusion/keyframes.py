@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -13,6 +15,7 @@ from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputErro
 from gausslite.domain.frame import MAX_COORDINATE_M, Frame
 from gausslite.fusion.store import FusionStore
 
+ORDER_RECORD = "keyframe-order"
 FrameDecoder = Callable[[bytes], Frame]
 """Decodes a keyframe as it was received. Raises InvalidInputError."""
 
@@ -33,10 +36,11 @@ class AgentKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class EncodedKeyframe:
-    """A keyframe as received: its frame index, its number of pixels, and bytes that the engine's decoder reads."""
+    """A keyframe as received: its index, time, number of pixels, and bytes that the engine's decoder reads."""
 
     agent_id: str
     index: int
+    capture_time_ns: int
     pixels: int
     data: bytes
 
@@ -60,18 +64,26 @@ class KeyframeLimits:
                 raise QuotaError(f"keyframe {index}: expected at most {limit} {unit}, got {value}")
 
 
+class _Stored(NamedTuple):
+    capture_time_ns: int
+    size_bytes: int
+
+
 class KeyframePool:
     """Keeps the keyframes of each agent in the store, within the limits; a repeated index replaces the earlier one.
 
-    Only indices and sizes are in memory. Not thread-safe; FusionEngine holds a lock.
+    The newest keyframe is the one that was received last: the indices and the clock of an agent begin again with each
+    mission. One that is received again, because its pose was corrected, keeps its place. Only indices, times and sizes
+    are in memory. Not thread-safe; FusionEngine holds a lock.
     """
 
     def __init__(self, store: FusionStore, limits: KeyframeLimits, decode: FrameDecoder = no_decoder) -> None:
+        """Raises CodecError for a damaged record, StorageError."""
         self._store, self._limits, self._decode = store, limits, decode
-        self._sizes_bytes = store.keyframe_sizes()
+        self._stored = _in_order(store.keyframe_sizes(), store.records(ORDER_RECORD))
 
     def __len__(self) -> int:
-        return sum(len(sizes) for sizes in self._sizes_bytes.values())
+        return sum(len(stored) for stored in self._stored.values())
 
     def add(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store the keyframe; delete the agent's keyframes that are not selected, and its oldest above the limits.
@@ -80,56 +92,62 @@ class KeyframePool:
         """
         self._limits.require_within(keyframe.index, keyframe.pixels, len(keyframe.data))
         self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data)
-        sizes = self._sizes_bytes.setdefault(keyframe.agent_id, {})
-        sizes[keyframe.index] = len(keyframe.data)
+        stored = self._stored.setdefault(keyframe.agent_id, {})
+        before = stored.get(keyframe.index)
+        if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
+            del stored[keyframe.index]
+        stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data))
         kept = self._newest_within_limits(
-            {index: size for index, size in sizes.items() if not selected or index in {*selected, keyframe.index}}
+            {index: own for index, own in stored.items() if not selected or index in {*selected, keyframe.index}}
         )
-        if len(kept) < len(sizes):
-            self._store.remove_keyframes(keyframe.agent_id, sorted(sizes.keys() - kept.keys()))
-            self._sizes_bytes[keyframe.agent_id] = kept
+        if len(kept) < len(stored):
+            self._store.remove_keyframes(keyframe.agent_id, sorted(stored.keys() - kept.keys()))
+            self._stored[keyframe.agent_id] = kept
+        order = [(index, own.capture_time_ns) for index, own in kept.items()]
+        self._store.save_record(keyframe.agent_id, ORDER_RECORD, json.dumps(order).encode())
 
     def count(self, agent_id: str) -> int:
         """Return the number of keyframes of this agent."""
-        return len(self._sizes_bytes.get(agent_id, ()))
+        return len(self._stored.get(agent_id, ()))
 
     def indices(self, agent_id: str) -> tuple[int, ...]:
-        """Return the frame indices of this agent's keyframes, ascending."""
-        return tuple(sorted(self._sizes_bytes.get(agent_id, ())))
+        """Return the frame indices of this agent's keyframes, the newest last."""
+        return tuple(self._stored.get(agent_id, ()))
 
     def find(self, agent_id: str, index: int | None = None) -> bytes:
         """Return the agent's encoded keyframe, the newest one without an index; empty if it has none.
 
         Raises InvalidInputError if the agent has keyframes but none of this index.
         """
-        indices = self.indices(agent_id)
-        if not indices:
+        stored = self._stored.get(agent_id)
+        if not stored:
             return b""
-        if index is not None and index not in indices:
-            raise InvalidInputError(f"index: expected a keyframe of {agent_id}, such as {indices[-1]}, got {index}")
-        return self._store.keyframe(agent_id, indices[-1] if index is None else index)
+        newest = next(reversed(stored))
+        if index is not None and index not in stored:
+            raise InvalidInputError(f"index: expected a keyframe of {agent_id}, such as {newest}, got {index}")
+        return self._store.keyframe(agent_id, newest if index is None else index)
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete an agent's keyframes."""
-        self._store.remove_keyframes(agent_id, sorted(self._sizes_bytes.pop(agent_id, ())))
+        self._store.remove_keyframes(agent_id, sorted(self._stored.pop(agent_id, ())))
 
-    def _newest_within_limits(self, sizes_bytes: dict[int, int]) -> dict[int, int]:
-        """Return the frames with the highest indices that are within the limits together."""
-        kept: dict[int, int] = {}
+    def _newest_within_limits(self, stored: dict[int, _Stored]) -> dict[int, _Stored]:
+        """Return the keyframes received last that are within the limits together, in their order."""
+        kept: list[int] = []
         spent_bytes = 0
-        for index in sorted(sizes_bytes, reverse=True)[: self._limits.frames]:
-            spent_bytes += sizes_bytes[index]
+        for index in list(reversed(stored))[: self._limits.frames]:
+            spent_bytes += stored[index].size_bytes
             if spent_bytes > self._limits.bytes_in_all:
                 break
-            kept[index] = sizes_bytes[index]
-        return kept
+            kept.append(index)
+        return {index: stored[index] for index in reversed(kept)}
 
     def encoded(self) -> list[tuple[str, bytes]]:
         """Return the agent id and the bytes of all keyframes, sorted by agent id and frame index."""
         return [
             (agent_id, self._store.keyframe(agent_id, index))
-            for agent_id in sorted(self._sizes_bytes)
-            for index in sorted(self._sizes_bytes[agent_id])
+            for agent_id in sorted(self._stored)
+            for index in sorted(self._stored[agent_id])
         ]
 
     def decode(self, encoded: Iterable[tuple[str, bytes]]) -> list[AgentKeyframe]:
@@ -138,6 +156,21 @@ class KeyframePool:
             return [AgentKeyframe(agent_id, self._decode(data)) for agent_id, data in encoded]
         except GaussLiteError as error:
             raise CodecError(f"stored keyframe: {error}") from error
+
+
+def _in_order(
+    sizes_bytes: Mapping[str, Mapping[int, int]], orders: Mapping[str, bytes]
+) -> dict[str, dict[int, _Stored]]:
+    """Return the keyframes in the order in which they were received; those without a place are the last."""
+    stored = {}
+    for agent_id, sizes in sizes_bytes.items():
+        try:
+            times_ns = {int(index): int(time_ns) for index, time_ns in json.loads(orders.get(agent_id, b"[]"))}
+        except (TypeError, ValueError, RecursionError) as error:
+            raise CodecError(f"stored order of keyframes: expected its JSON, got other bytes ({error})") from error
+        ordered = [*(index for index in times_ns if index in sizes), *sorted(sizes.keys() - times_ns.keys())]
+        stored[agent_id] = {index: _Stored(times_ns.get(index, -1), sizes[index]) for index in ordered}
+    return stored
 
 
 def in_fused_frame(keyframe: AgentKeyframe, frames: Mapping[str, Float64[ndarray, "4 4"]]) -> AgentKeyframe | None:

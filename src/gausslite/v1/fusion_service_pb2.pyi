@@ -580,7 +580,7 @@ class GetKeyframeResponse(_message.Message):
 
     @_builtins.property
     def indices(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
-        """The indices of all keyframes that the server has of the agent, ascending."""
+        """The indices of all keyframes that the server has of the agent, as received: the newest last."""
 
     def __init__(
         self,

@@ -166,8 +166,8 @@ class ChangeNotifier:
 class StoredKeyframe:
     """A keyframe with its frame index. T_world_camera: in the fused map's frame, None if the agent's does not fit.
 
-    indices: of all keyframes that the server has of the agent, ascending. roi: True in the task's region, None if the
-    agent did not send it.
+    indices: of all keyframes that the server has of the agent, the newest last. roi: True in the task's region, None if
+    the agent did not send it.
     """
 
     index: int

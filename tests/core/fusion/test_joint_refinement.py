@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe, KeyframeLimits, KeyframePool
+from gausslite.fusion.keyframes import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframeLimits, KeyframePool
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineProgress, RefineSettings, refine
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mapping.settings import ONLINE_RATES, DensitySettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings
@@ -144,8 +146,8 @@ def test_an_empty_or_too_large_map_is_refused() -> None:
             RefineSettings(**wrong)
 
 
-def encoded(agent_id: str, index: int, data: bytes = b"") -> EncodedKeyframe:
-    return EncodedKeyframe(agent_id, index, 18 * 24, data)
+def encoded(agent_id: str, index: int, data: bytes = b"", time_ns: int | None = None) -> EncodedKeyframe:
+    return EncodedKeyframe(agent_id, index, index if time_ns is None else time_ns, 18 * 24, data)
 
 
 def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> None:
@@ -166,6 +168,41 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
         KeyframePool(store, KeyframeLimits(pixels=1)).add(encoded("ant", 1))
     with pytest.raises(InvalidInputError, match="expected at least 1"):
         KeyframeLimits(frames=0)
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_the_newest_keyframe_is_of_the_second_mission_whose_indices_begin_again(restarts: bool, tmp_path: Path) -> None:
+    limits = KeyframeLimits(frames=4)
+    store = SqliteStore(tmp_path / "store.sqlite")
+    pool = KeyframePool(store, limits)
+    for index in (7, 8, 9):
+        pool.add(encoded("ant", index, b"first mission"))
+    for index in (7, 0, 1):
+        pool.add(encoded("ant", index, b"second %d" % index, time_ns=100 + index))
+    # of the same time: its pose was corrected
+    pool.add(encoded("ant", 7, b"corrected", time_ns=107))
+    if restarts:
+        store.close()
+        store = SqliteStore(tmp_path / "store.sqlite")
+        pool = KeyframePool(store, limits)
+    assert pool.indices("ant") == (9, 7, 0, 1)
+    assert (pool.find("ant"), pool.find("ant", 7)) == (b"second 1", b"corrected")
+    with pytest.raises(InvalidInputError, match="such as 1, got 5"):
+        pool.find("ant", 5)
+    pool.add(encoded("ant", 2, b"second 2", time_ns=102))
+    assert pool.indices("ant") == (7, 0, 1, 2)
+    store.close()
+
+
+def test_a_keyframe_stored_without_its_place_is_the_newest_and_a_damaged_order_is_named() -> None:
+    store = MemoryStore()
+    KeyframePool(store, KeyframeLimits()).add(encoded("ant", 5, b"5"))
+    # the server was killed before it stored the order
+    store.save_keyframe("ant", 2, b"2")
+    assert KeyframePool(store, KeyframeLimits()).find("ant") == b"2"
+    store.save_record("ant", ORDER_RECORD, b"{")
+    with pytest.raises(CodecError, match="stored order of keyframes"):
+        KeyframePool(store, KeyframeLimits())
 
 
 def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> None:
