@@ -224,7 +224,7 @@ class FusionEngine:
 
     def _enqueue(self, update: PendingUpdate) -> Future[PutOutcome]:
         put = self._committer.add(update)
-        self._acknowledgements.add(put)
+        self._acknowledgements.add(update.agent_id, put)
         return put
 
     def commit_updates(self) -> None:

@@ -144,12 +144,13 @@ class SessionRegistry:
         self._lease_ends_s.pop(agent_id, None)
 
     def end_unused(self, kept: Collection[str]) -> list[str]:
-        """End the sessions whose lease has ended, or the oldest one; returns the agents. Those in `kept` keep theirs.
+        """End the sessions whose lease has ended, except for the agents in `kept`; returns these agents.
 
         Raises StorageError.
         """
-        unused = [agent_id for agent_id in self._lease_ends_s if agent_id not in kept]
-        ended = [agent_id for agent_id in unused if self._remaining_s(agent_id) <= 0] or unused[:1]
+        ended = [
+            agent_id for agent_id in self._lease_ends_s if agent_id not in kept and self._remaining_s(agent_id) <= 0
+        ]
         for agent_id in ended:
             self.end_agent(agent_id)
         return ended
@@ -279,16 +280,19 @@ class Membership:
         return bool(frozenset(self._store.agents()) or self._sessions.live_agents - {agent_id})
 
     def _make_room(self, agent_id: str) -> list[str]:
-        """End sessions of agents without updates if the mission is full, so that names alone never fill it.
+        """End the sessions of agents without updates whose lease has ended, if the mission is full; returns them.
 
-        Returns the agents. Raises QuotaError, StorageError.
+        No join ends the lease of another agent that uses it. Raises QuotaError, StorageError.
         """
         limit = self._settings.quotas.agents
         if agent_id in self._agents() or len(self._agents()) < limit:
             return []
         ended = self._sessions.end_unused(kept=frozenset(self._store.agents()))
         if len(self._agents()) >= limit:
-            raise QuotaError(f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it")
+            raise QuotaError(
+                f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it; names without "
+                "data are free again when their leases end, or with gausslite evict"
+            )
         return ended
 
     def _agents(self) -> frozenset[str]:

@@ -11,6 +11,7 @@ from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
 from threading import Lock
 
+from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, StorageError, UnavailableError
 from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome
@@ -49,31 +50,46 @@ _LONGEST_WAIT_S = 5.0
 
 
 class Acknowledgements:
-    """The times from the arrival of a message to its answer. Thread-safe. clock_s: the time in seconds."""
+    """The times from the arrival of a message to its answer. Thread-safe. clock_s: the time in seconds.
+
+    An agent waits since the arrival of its first message without an answer, or since its last answer: how many messages
+    it has sent ahead says nothing about the server.
+    """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._lock = Lock()
-        # the oldest first
-        self._arrived_s: dict[Future[PutOutcome], float] = {}
+        # of each agent that waits: the number of its messages, and since when
+        self._waiting: dict[str, tuple[int, float]] = {}
+        self._prompt_s = -float("inf")
         self._counts = [0] * (len(ACKNOWLEDGEMENT_BOUNDS_S) + 1)
         self._total_s = 0.0
 
-    def add(self, put: Future[PutOutcome]) -> None:
-        """Note a message that has arrived; its future ends with the answer."""
+    def add(self, agent_id: str, put: Future[PutOutcome]) -> None:
+        """Note a message of an agent that has arrived; its future ends with the answer."""
+        now_s = self._clock_s()
         with self._lock:
-            self._arrived_s[put] = self._clock_s()
-        put.add_done_callback(self._end)
+            count, since_s = self._waiting.get(agent_id, (0, now_s))
+            self._waiting[agent_id] = count + 1, since_s
+        put.add_done_callback(lambda _: self._end(agent_id, now_s))
 
     def check(self) -> None:
-        """Raise UnavailableError while a message waits for its answer for more than 5 s."""
+        """Raise UnavailableError while an agent waits for more than 5 s, and in that time none was answered sooner.
+
+        Others' answers show that the server works, and that this agent has sent more than its share.
+        """
         with self._lock:
-            waiting = len(self._arrived_s)
-            longest_s = self._clock_s() - next(iter(self._arrived_s.values())) if waiting else 0.0
-        if longest_s > _LONGEST_WAIT_S:
+            now_s, prompt_s = self._clock_s(), self._prompt_s
+            messages = sum(count for count, _ in self._waiting.values())
+            name, since_s = min(
+                ((name, since_s) for name, (_, since_s) in self._waiting.items()),
+                key=lambda waiting: waiting[1],
+                default=("", now_s),
+            )
+        if now_s - max(since_s, prompt_s) > _LONGEST_WAIT_S:
             raise UnavailableError(
-                f"{waiting} messages wait for their acknowledgement, the oldest for {longest_s:.0f} s; expected at "
-                f"most {_LONGEST_WAIT_S:g} s"
+                f"{messages} messages wait for their acknowledgement, agent {quote_name(name)} for "
+                f"{now_s - since_s:.0f} s; expected at most {_LONGEST_WAIT_S:g} s"
             )
 
     def histogram(self) -> tuple[tuple[int, ...], float]:
@@ -81,9 +97,15 @@ class Acknowledgements:
         with self._lock:
             return tuple(self._counts), self._total_s
 
-    def _end(self, put: Future[PutOutcome]) -> None:
+    def _end(self, agent_id: str, arrived_s: float) -> None:
         with self._lock:
-            taken_s = self._clock_s() - self._arrived_s.pop(put)
+            now_s = self._clock_s()
+            count, since_s = self._waiting.pop(agent_id)
+            if count > 1:
+                self._waiting[agent_id] = count - 1, now_s
+            if now_s - since_s <= _LONGEST_WAIT_S:
+                self._prompt_s = now_s
+            taken_s = now_s - arrived_s
             self._counts[bisect_left(ACKNOWLEDGEMENT_BOUNDS_S, taken_s)] += 1
             self._total_s += taken_s
 

@@ -186,31 +186,35 @@ def test_the_name_of_a_live_robot_is_taken_over_only_with_its_token_or_after_its
 
 
 def test_names_that_never_contributed_do_not_fill_a_mission() -> None:
-    engine = new_engine(quotas=Quotas(agents=3), lease_s=0.0)
+    store = MemoryStore()
+    engine = new_engine(store, quotas=Quotas(agents=3), lease_s=0.0)
     engine.contribute(join(engine, "good"), make_subset("good", 1, {0: [1]}), GRID)
     for number in range(10):
         join(engine, f"junk-{number}")
-    assert join(engine, "late")
+    late = join(engine, "late")
     assert {agent.agent_id for agent in engine.status().agents} >= {"good", "late"}
-
-
-def test_names_that_hold_their_leases_without_updates_make_room_the_oldest_first() -> None:
-    store = MemoryStore()
-    crowded = new_engine(store, quotas=Quotas(agents=3))
-    for name in ("good", "junk-0", "junk-1"):
-        session = join(crowded, name)
-        if name == "good":
-            crowded.contribute(session, make_subset(name, 1, {0: [1]}), GRID)
-    # who joins again is not younger
-    join(crowded, "junk-0")
-    late = join(crowded, "late")
-    assert {agent.agent_id for agent in crowded.status().agents} == {"good", "junk-1", "late"}
     assert not any("junk-0" in records for records in all_records(store).values())
-    crowded.contribute(late, make_subset("late", 1, {1: [1]}), GRID)
-    last = join(crowded, "last")
-    crowded.contribute(last, make_subset("last", 1, {2: [1]}), GRID)
+    engine.contribute(late, make_subset("late", 1, {1: [1]}), GRID)
+    engine.contribute(join(engine, "last"), make_subset("last", 1, {2: [1]}), GRID)
     with pytest.raises(QuotaError, match="at most 3 in this mission"):
-        join(crowded, "later")
+        join(engine, "later")
+
+
+def test_no_flood_of_names_ends_a_live_lease() -> None:
+    crowded = new_engine(quotas=Quotas(agents=3))
+    join(crowded, "honest")
+    crowded.contribute(join(crowded, "with-data"), make_subset("with-data", 1, {0: [1]}), GRID)
+    join(crowded, "junk-0")
+    for number in range(1, 9):
+        with pytest.raises(QuotaError, match=r"at most 3 in this mission.*gausslite evict"):
+            join(crowded, f"junk-{number}")
+    # it can still join again, and contribute
+    honest = join(crowded, "honest")
+    assert len(crowded.contribute(honest, make_subset("honest", 1, {1: [1]}), GRID).accepted)
+    # an operator ends what is live
+    crowded.evict("junk-0")
+    join(crowded, "late")
+    assert {agent.agent_id for agent in crowded.status().agents} == {"honest", "with-data", "late"}
 
 
 @pytest.mark.parametrize("how", ["leave", "evict", "unban"])

@@ -164,15 +164,47 @@ def test_acknowledgements_are_late_after_five_seconds_and_counted_by_their_time(
     now_s = 0.0
     times = Acknowledgements(lambda: now_s)
     first, second = Future[PutOutcome](), Future[PutOutcome]()
-    times.add(first)
+    times.add("ant", first)
     now_s = 4.0
-    times.add(second)
+    times.add("bee", second)
     times.check()
     now_s = 5.5
-    with pytest.raises(UnavailableError, match="2 messages wait for their acknowledgement, the oldest for 6 s"):
+    with pytest.raises(UnavailableError, match="2 messages wait for their acknowledgement, agent 'ant' for 6 s"):
         times.check()
     first.set_exception(StorageError("full"))
     times.check()
     second.cancel()
     counts, total_s = times.histogram()
     assert (counts[8], counts[10], sum(counts), total_s) == (1, 1, 2, 7.0)
+
+
+def test_the_messages_that_one_agent_has_sent_ahead_are_no_illness_of_the_server() -> None:
+    now_s = 0.0
+    times = Acknowledgements(lambda: now_s)
+    ahead = [Future[PutOutcome]() for _ in range(4)]
+    for put in ahead:
+        times.add("eve", put)
+    # alone: each waits longer than the one before, but the agent has an answer every 4 s
+    for put in ahead[:3]:
+        now_s += 4.0
+        times.check()
+        put.set_exception(StorageError("full"))
+    # beside a robot that is answered at once, a message may wait for its share
+    for _ in range(3):
+        now_s += 4.0
+        put = Future[PutOutcome]()
+        times.add("ant", put)
+        put.set_exception(StorageError("full"))
+        times.check()
+    now_s += 4.0
+    waits = Future[PutOutcome]()
+    times.add("ant", waits)
+    # nobody has been answered for more than 5 s
+    now_s += 4.0
+    with pytest.raises(UnavailableError, match="2 messages wait for their acknowledgement, agent 'eve' for 20 s"):
+        times.check()
+    # a late answer is no sign of health
+    now_s += 4.0
+    waits.set_exception(StorageError("full"))
+    with pytest.raises(UnavailableError, match="1 messages wait"):
+        times.check()
