@@ -70,8 +70,8 @@ class StoredVoxels:
         """Return the voxels of all parts, in order; they have one size_m, and there is at least one."""
         if len(parts) == 1:
             return parts[0]
-        gaussians = np.concatenate([part.gaussians for part in parts])
-        return cls(np.concatenate([part.voxels for part in parts]), gaussians, parts[0].size_m)
+        gaussians = join_elements([part.gaussians for part in parts])
+        return cls(join_elements([part.voxels for part in parts]), gaussians, parts[0].size_m)
 
     @property
     def keys(self) -> Int64[ndarray, " v"]:
@@ -87,7 +87,8 @@ class StoredVoxels:
         """Return the voxels at these indices, in their order."""
         counts = self.voxels["counts"].astype(np.int64)
         rows = gather_rows((np.cumsum(counts) - counts)[places], counts[places])
-        return StoredVoxels(self.voxels[places], self.gaussians[rows], self.size_m)
+        # `take` copies elements as they are, an index copies them field by field
+        return StoredVoxels(self.voxels.take(places), self.gaussians.take(rows), self.size_m)
 
     def slice(self, start: int, stop: int) -> StoredVoxels:
         """Return the voxels with the indices start to stop - 1, or fewer at the end."""
@@ -102,6 +103,12 @@ class StoredVoxels:
         voxels = self.voxels.copy()
         voxels["kappa_sums"] = np.diff(totals[ends], prepend=np.uint64(0))
         return StoredVoxels(voxels, self.gaussians, self.size_m)
+
+    def content(self) -> list[bytes]:
+        """Return the Gaussians of each voxel as they are stored."""
+        data, size = self.gaussians.tobytes(), self.gaussians.itemsize
+        ends = (np.cumsum(self.voxels["counts"], dtype=np.int64) * size).tolist()
+        return [data[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
     def batch(self) -> VoxelBatch:
         """Return the voxels with their Gaussians as floats. Raises CodecError, InvalidInputError for other bytes."""
@@ -142,6 +149,12 @@ class StoredVoxels:
         if int(table["counts"].sum(dtype=np.int64)) != len(gaussians):
             raise StorageError(f"stored row: expected another number of Gaussians than {len(gaussians)}; it is damaged")
         return cls(table, gaussians, size_m)
+
+
+def join_elements(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return the elements of all parts, which have one type, as they are."""
+    dtype = parts[0].dtype
+    return np.concatenate([part.view(f"V{dtype.itemsize}") for part in parts]).view(dtype)
 
 
 def voxel_table(

@@ -6,7 +6,7 @@ The index is derived from the rows of a store. The store owns it, and changes it
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import repeat
 from operator import or_
@@ -18,7 +18,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec.stored import RECORD, to_records
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
@@ -26,8 +26,8 @@ from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
 _FIRST_CAPACITY = 64
 _DTYPES = (np.int64, np.int64, np.uint64, np.uint32, np.int64)
 _NO_COLUMNS: tuple[NDArray[Any], ...] = tuple(np.zeros(0, dtype) for dtype in _DTYPES)
-ReadBatch = Callable[[str, Int64[ndarray, " k"]], VoxelBatch]
-"""Returns an agent's stored updates of some voxels."""
+ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[StoredVoxels]]
+"""Returns an agent's stored updates of some voxels in parts, each with ascending keys."""
 
 
 class ScoreIndex:
@@ -115,7 +115,7 @@ class ScoreIndex:
         return reduce(or_, map(self._holders.get, keys.tolist(), repeat(0)), 0)
 
 
-def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadBatch) -> Bool[ndarray, " v"]:
+def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadVoxels) -> Bool[ndarray, " v"]:
     """Return a mask of the message's voxels that replace the stored ones.
 
     The higher sequence number wins; between equal ones the larger (Σkappa, count, records) does, so that the outcome
@@ -130,11 +130,19 @@ def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadBatch) -> Bo
         same_sum = stored.kappa_sums == sums
         newer |= same_seq & ((sums > stored.kappa_sums) | (same_sum & (counts > stored.counts)))
         equal = np.flatnonzero(same_seq & same_sum & (counts == stored.counts) & (counts > 0))
-        if len(equal):
-            received = voxel_records(update.voxels.take(equal).batch())
-            stored_records = voxel_records(read(update.agent_id, keys[equal]))
-            newer[equal] = [own > other for own, other in zip(received, stored_records, strict=True)]
+        for part in read(update.agent_id, keys[equal]) if len(equal) else ():
+            places = np.searchsorted(keys, part.keys)
+            newer[places] = _are_larger(update.voxels.take(places), part)
     return newer
+
+
+def _are_larger(received: StoredVoxels, stored: StoredVoxels) -> list[bool]:
+    """Return which of the received voxels have larger records than the same voxels in the store."""
+    if received.size_m == stored.size_m and received.content() == stored.content():
+        # a duplicate, without decoding any Gaussian
+        return [False] * len(received)
+    pairs = zip(voxel_records(received.batch()), voxel_records(stored.batch()), strict=True)
+    return [own > other for own, other in pairs]
 
 
 def voxel_records(batch: VoxelBatch) -> list[bytes]:

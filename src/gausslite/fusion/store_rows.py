@@ -20,7 +20,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
+from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels, join_elements
 from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels
@@ -98,7 +98,7 @@ class UpdateLog:
         change = LogChange(deleted=list(self._outdated))
         self._empty_segments(change, read)
         for update in updates:
-            newer = newer_voxels(self.index, update, lambda name, keys: self._batch(name, keys, read))
+            newer = newer_voxels(self.index, update, lambda name, keys: self._stored(name, keys, read))
             keys = update.voxels.keys
             change.outcomes.append(PutOutcome(keys[newer], keys[~newer]))
             accepted = update.voxels if newer.all() else update.voxels.take(np.flatnonzero(newer))
@@ -143,8 +143,9 @@ class UpdateLog:
         columns = self.index.columns(agent_id, None if keys is None else np.unique(keys))
         return columns[0], columns[4]
 
-    def _batch(self, agent_id: str, keys: Int64[ndarray, " k"], read: ReadRows) -> VoxelBatch:
-        return read_batches(lambda: {agent_id: self.places(agent_id, keys)}, read)[agent_id]
+    def _stored(self, agent_id: str, keys: Int64[ndarray, " k"], read: ReadRows) -> list[StoredVoxels]:
+        keys, rows = self.places(agent_id, keys)
+        return _voxels_of(keys, rows, read(np.unique(rows).tolist()))
 
     def _add(self, change: LogChange, agent_id: str, voxels: StoredVoxels) -> None:
         """Add rows with these voxels, whose keys ascend."""
@@ -157,7 +158,7 @@ class UpdateLog:
             numbers.append(self._next_number(size))
             change.rows.append((numbers[-1], agent_id, row_checksum(numbers[-1], agent_id, data), data))
             change.sizes.append(size)
-        table = parts[0].voxels if len(parts) == 1 else np.concatenate([part.voxels for part in parts])
+        table = join_elements([part.voxels for part in parts])
         rows = np.repeat(np.array(numbers, np.int64), [len(part) for part in parts])
         change.puts.append((agent_id, *_scores(table, rows)))
 
@@ -255,6 +256,15 @@ def data_checksum(owner: str, name: str | int, data: bytes) -> int:
 
 def _batch_of(keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mapping[int, bytes]) -> VoxelBatch:
     """Return the voxels with these ascending keys, each from its row."""
+    try:
+        batches = [voxels.batch() for voxels in _voxels_of(keys, rows, data)]
+    except GaussLiteError as error:
+        raise StorageError(f"stored voxel: {error}; the store is damaged") from error
+    return merge_batches(*batches) if len(batches) > 1 else batches[0] if batches else empty_batch()
+
+
+def _voxels_of(keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mapping[int, bytes]) -> list[StoredVoxels]:
+    """Return the voxels with these keys, each from its row: a part for each size_m, with ascending keys."""
     parts: dict[float, list[StoredVoxels]] = {}
     order = np.argsort(rows, kind="stable")
     starts = np.flatnonzero(np.diff(rows[order], prepend=-1))
@@ -262,11 +272,7 @@ def _batch_of(keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mapp
         voxels = StoredVoxels.from_row(data[int(rows[order[start]])])
         places = np.searchsorted(voxels.keys, keys[order[start:stop]])
         parts.setdefault(voxels.size_m, []).append(voxels if len(places) == len(voxels) else voxels.take(places))
-    try:
-        batches = [_in_order(StoredVoxels.concatenate(own)).batch() for own in parts.values()]
-    except GaussLiteError as error:
-        raise StorageError(f"stored voxel: {error}; the store is damaged") from error
-    return merge_batches(*batches) if len(batches) > 1 else batches[0] if batches else empty_batch()
+    return [_in_order(StoredVoxels.concatenate(own)) for own in parts.values()]
 
 
 def _in_order(voxels: StoredVoxels) -> StoredVoxels:

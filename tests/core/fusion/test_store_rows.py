@@ -6,6 +6,7 @@ import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import google_crc32c
 import numpy as np
@@ -14,7 +15,7 @@ from support.sample_batches import make_batch
 from test_fusion_stores import OpenStore, make_subset, opener
 
 from gausslite.codec.stored import to_records
-from gausslite.codec.stored_voxels import CODES, StoredSubset
+from gausslite.codec.stored_voxels import CODES, StoredSubset, StoredVoxels
 from gausslite.codec.subset_codec import decode_stored, decode_subset, encode_subset
 from gausslite.domain.errors import StorageError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
@@ -100,6 +101,19 @@ def test_each_voxel_has_its_latest_update_after_any_messages(open_store: OpenSto
             store.close()
             store = open_store()
             require_latest(store, latest)
+    store.close()
+
+
+def test_a_duplicate_is_found_without_decoding_its_gaussians(
+    open_store: OpenStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = VoxelGrid(0.5)
+    message = encode_subset(RoiSubset("ant", "", 3, 3, make_batch(5, 40, grid)), grid)
+    store, stored = open_store(), decode_stored(message)[0]
+    keys = stored.voxels.keys.tolist()
+    assert store.put_all([stored])[0].accepted.tolist() == keys
+    monkeypatch.setattr(StoredVoxels, "batch", Mock(side_effect=AssertionError("decoded")))
+    assert store.put_all([stored])[0].stale.tolist() == keys
     store.close()
 
 
