@@ -14,14 +14,26 @@ from gausslite_bench.server.server_process import DEFAULT_COMMAND, ServerProcess
 
 def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("bench", "server", "--held", "20000", "--agents", "2,3", "--seconds", "1", "--watchers", "2")
-    assert main([*arguments, "--hostile", "--json"]) == 0
+    assert main([*arguments, "--json"]) == 0
     (result,) = json.loads(capsys.readouterr().out)
     assert [load["agents"] for load in result["loads"]] == [2, 3]
     assert [load["messages"] for load in result["loads"]] == [8, 12]
-    assert all(load["missing"] == 0 for load in [*result["loads"], result["hostile"]])
+    assert all((load["missing"], load["refused"]) == (0, 0) for load in result["loads"])
     assert result["held"] == 20000
     assert min(result[name] for name in ("snapshot_s", "status_ms", "restart_s", "rss_mib")) > 0
     assert result["server"] == "fusion server, default options, store in a file"
+
+
+def test_good_agents_are_measured_beside_an_attack(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("bench", "server", "--held", "0", "--seconds", "1", "--hostile", "tombstones,half-open")
+    assert main([*arguments, "--json"]) == 0
+    results = json.loads(capsys.readouterr().out)
+    assert [result["attack"] for result in results] == ["tombstones", "half-open"]
+    for result in results:
+        assert [load["messages"] for load in (result["quiet"], result["attacked"])] == [16, 16]
+        assert result["quiet"]["missing"] == result["attacked"]["missing"] == 0
+        assert result["rss_mib"] > 0
+    assert main(["bench", "server", "--hostile", "unknown"]) == 2
 
 
 def test_another_configuration_is_in_the_title(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,10 +8,13 @@ from collections.abc import AsyncIterator, Sequence
 import grpc
 
 from gausslite.domain.errors import CodecError
+from gausslite.domain.objects import ObjectReport
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2, parser_service_pb2
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.v1.geometry_pb2 import EncodedFrame
 from gausslite.wire.channel import proxy_options, require_callable
+from gausslite.wire.convert_task import report_to_message
 
 ENDED_WHILE_SENDING = "ENDED_WHILE_SENDING"
 _LOCAL_ERROR = "Internal error from Core"
@@ -138,3 +141,19 @@ class UpdateStreams:
     def open(self, session_id: str) -> UpdateStream:
         """Return a new stream of a session."""
         return UpdateStream(self._stub, session_id)
+
+    async def report_objects(self, session_id: str, report: ObjectReport) -> bool:
+        """Replace the agent's task and objects; returns whether the server has stored them."""
+        try:
+            await self._stub.ReportObjects(report_to_message(session_id, report))
+        except grpc.RpcError:
+            return False
+        return True
+
+    async def send_keyframe(self, session_id: str, keyframe: EncodedFrame) -> bool:
+        """Send one keyframe; returns whether the server has stored it."""
+        request = pb.ContributeKeyframesRequest(session_id=session_id, keyframe=keyframe)
+        try:
+            return bool((await self._stub.ContributeKeyframes(iter([request]))).accepted)
+        except grpc.RpcError:
+            return False

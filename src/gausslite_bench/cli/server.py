@@ -12,6 +12,7 @@ from gausslite.cli.progress import progress_bar
 from gausslite.domain.errors import InvalidInputError
 from gausslite_bench.server.agent_load import RATE_HZ, LoadResult
 from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
+from gausslite_bench.server.hostile import ATTACKS, AttackResult, measure_attack
 from gausslite_bench.server.server_process import DEFAULT_COMMAND
 from gausslite_bench.server.stages import measure_stages
 
@@ -20,7 +21,12 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench server`."""
     add = parser.add_argument
     add("--held", default="0,1000000", metavar="N,N", help="Gaussians that the server holds (default: %(default)s)")
-    add("--agents", default="8,16,32,64", metavar="N,N", help="agents that send at 4 Hz (default: %(default)s)")
+    add(
+        "--agents",
+        default="8,16,32,64",
+        metavar="N,N",
+        help="agents that send updates at 4 Hz, and objects and keyframes as real agents do (default: %(default)s)",
+    )
     add("--seconds", type=float, default=10.0, metavar="S", help="duration of each load (default: %(default)s)")
     add("--store", choices=["sqlite", "memory"], default="sqlite", help="store of the server (default: %(default)s)")
     add("--watchers", type=int, default=20, metavar="N", help="watchers that stop reading (default: %(default)s)")
@@ -32,8 +38,8 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--hostile",
-        action="store_true",
-        help="also measure 8 agents beside one that resends a message of 200000 tombstones",
+        metavar="ATTACK,ATTACK",
+        help=f"only measure 4 agents under these attacks, each on a new server: all, or some of {', '.join(ATTACKS)}",
     )
     parser.add_argument(
         "--stages",
@@ -48,6 +54,8 @@ def run_server(options: argparse.Namespace) -> int:
     """Measure a server for each number of Gaussians held."""
     if not options.seconds > 0:
         raise InvalidInputError(f"--seconds: expected more than 0, got {options.seconds:g}")
+    if options.hostile:
+        return _run_attacks(options)
     if options.stages:
         return _run_stages(max(int(options.seconds * RATE_HZ), 1), options.json)
     settings = ServerBenchSettings(
@@ -57,12 +65,11 @@ def run_server(options: argparse.Namespace) -> int:
         command=options.server,
         store=options.store,
         watchers=options.watchers,
-        hostile=options.hostile,
     )
     with progress_bar(len(settings.held), "server", "server") as progress:
         results = []
         if not options.json:
-            progress.write(_title(settings))
+            progress.write(_title(settings.command, settings.store))
         for held in settings.held:
             results.append(measure(settings, held, progress.set_description))
             progress.update()
@@ -90,6 +97,38 @@ def _run_stages(count: int, is_json: bool) -> int:
     return 0
 
 
+def _run_attacks(options: argparse.Namespace) -> int:
+    names = list(ATTACKS) if options.hostile == "all" else options.hostile.split(",")
+    unknown = [name for name in names if name not in ATTACKS]
+    if unknown:
+        raise InvalidInputError(f"--hostile: expected all, or some of {', '.join(ATTACKS)}, got {unknown[0]!r}")
+    held = _numbers("--held", options.held, 0)[0]
+    results = []
+    with progress_bar(len(names), "attacks", "attack") as progress:
+        if not options.json:
+            progress.write(f"{_title(options.server, options.store)}, {held} Gaussians held")
+        for name in names:
+            progress.set_description(name)
+            results.append(measure_attack(name, options.server, options.store, held, options.seconds))
+            progress.update()
+            if not options.json:
+                progress.write("\n".join(_attack_lines(results[-1])))
+    if options.json:
+        sys.stdout.write(json.dumps([asdict(result) for result in results], indent=1) + "\n")
+    return 0
+
+
+def _attack_lines(result: AttackResult) -> Iterator[str]:
+    quiet, attacked = result.quiet, result.attacked
+    yield f"{result.attack}: {ATTACKS[result.attack][0]}"
+    yield (
+        f"  p99 {quiet.p99_ms:.1f} -> {attacked.p99_ms:.1f} ms, {attacked.missing} of {attacked.messages} not "
+        f"acknowledged, {attacked.refused} reports refused, {result.rss_mib:.0f} {result.rss_growth_mib:+.0f} MiB"
+    )
+    yield f"  health: {result.unhealthy:.0%} not SERVING, slowest answer {result.slowest_health_ms:.0f} ms"
+    yield f"  log: {len(result.log)} lines{', the last: ' if result.log else ''}{result.log[-1] if result.log else ''}"
+
+
 def _numbers(name: str, text: str, least: int) -> list[int]:
     try:
         numbers = [int(part) for part in text.split(",")]
@@ -100,14 +139,14 @@ def _numbers(name: str, text: str, least: int) -> list[int]:
     return numbers
 
 
-def _title(settings: ServerBenchSettings) -> str:
+def _title(command: str, store: str) -> str:
     """Return the configuration of the server."""
-    command = "default options" if settings.command == DEFAULT_COMMAND else settings.command
-    return f"fusion server, {command}, store in {'memory' if settings.store == 'memory' else 'a file'}"
+    options = "default options" if command == DEFAULT_COMMAND else command
+    return f"fusion server, {options}, store in {'memory' if store == 'memory' else 'a file'}"
 
 
 def _values(settings: ServerBenchSettings, result: StoredSizeResult) -> dict[str, object]:
-    return {"server": _title(settings)} | asdict(result) | {"largest_team": result.largest_team}
+    return {"server": _title(settings.command, settings.store)} | asdict(result) | {"largest_team": result.largest_team}
 
 
 def _lines(result: StoredSizeResult) -> Iterator[str]:
@@ -115,8 +154,6 @@ def _lines(result: StoredSizeResult) -> Iterator[str]:
     yield f"  largest team with p99 < {P99_LIMIT_MS:g} ms: {result.largest_team} agents"
     for load in result.loads:
         yield f"{_load_line(load)}, server {load.server_cpu_ms:.1f} ms of CPU per message"
-    if result.hostile is not None:
-        yield f"{_load_line(result.hostile)}, beside a hostile agent"
     yield (
         f"  snapshot {result.snapshot_s:.2f} s, status {result.status_ms:.1f} ms, restart {result.restart_s:.1f} s, "
         f"memory {result.rss_mib:.0f} MiB, watchers that do not read {result.watchers_mib:.0f} MiB"
@@ -125,4 +162,5 @@ def _lines(result: StoredSizeResult) -> Iterator[str]:
 
 def _load_line(load: LoadResult) -> str:
     times = f"p50 {load.p50_ms:.1f} ms, p99 {load.p99_ms:.1f} ms"
-    return f"  {load.agents} agents: {times}, {load.missing} of {load.messages} not acknowledged"
+    refused = f", {load.refused} reports refused" if load.refused else ""
+    return f"  {load.agents} agents: {times}, {load.missing} of {load.messages} not acknowledged{refused}"

@@ -1,20 +1,24 @@
-"""Send updates at a fixed rate from many agents, and measure the time to each acknowledgement."""
+"""Send what real agents send, at a fixed rate from many agents, and measure the time to each acknowledgement."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gausslite.task.rules import RuleParser
 from gausslite.wire.async_calls import UpdateStream, UpdateStreams
 from gausslite.wire.clients import FusionClient
-from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, tombstone_message
+from gausslite.wire.convert import frame_to_message
+from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, keyframe, object_report
 
 RATE_HZ = 4.0
-HOSTILE_TOMBSTONES = 200_000
+_OBJECTS_PERIOD_S, _KEYFRAME_PERIOD_S = 1.0, 3.0
+"""Of the demo's agents on two cores: a report a second at most, and 49 to 59 keyframes of 81 kB in 146 to 187 s."""
+_OBJECTS = 20
 _FILL_AGENTS = 16
 _TOKEN = "bench"  # noqa: S105 - the same in all loads, so that the agents can join again
 _SETTLE_S = 60.0
@@ -25,6 +29,7 @@ _SETTLE_S = 60.0
 class LoadResult:
     """Acknowledgement times of one load; missing: messages that were not acknowledged.
 
+    refused: reports of objects and keyframes that the server did not store.
     server_cpu_ms: processor time of the server per message, which other programs on the machine hardly change.
     """
 
@@ -33,6 +38,7 @@ class LoadResult:
     p50_ms: float
     p99_ms: float
     missing: int
+    refused: int = 0
     server_cpu_ms: float = float("nan")
 
 
@@ -56,19 +62,18 @@ class AgentLoad:
                 asyncio.run(self._send_all(session_id, messages))
                 self._next_seq = len(messages) + 1
 
-    def run(self, agents: int, seconds: float, hostile: bool = False) -> LoadResult:
-        """Send deltas from these agents; hostile: one more agent resends a message of 200 000 tombstones."""
+    def run(self, agents: int, seconds: float) -> LoadResult:
+        """Send updates, objects and keyframes from these agents."""
         count = max(int(seconds * RATE_HZ), 1)
-        names, hostile_name = [_name(number) for number in range(agents)], _name(agents)
+        names = [_name(number) for number in range(agents)]
         with FusionClient(self._address, deadline_s=60.0, token=_TOKEN) as client:
             sessions = [client.join(name, GRID).session_id for name in names]
-            hostile_session = client.join(hostile_name, GRID).session_id if hostile else ""
         messages = [delta_messages(name, number, count, self._next_seq) for number, name in enumerate(names)]
         self._next_seq += count
-        hostile_data = tombstone_message(hostile_name, HOSTILE_TOMBSTONES, self._next_seq) if hostile else b""
-        times_s, missing = asyncio.run(self._send(sessions, messages, hostile_session, hostile_data))
+        times_s, refused = asyncio.run(self._send(sessions, messages))
         p50, p99 = np.percentile(times_s or [np.inf], [50, 99]) * 1000
-        return LoadResult(agents, agents * count, float(p50), float(p99), missing)
+        total = agents * count
+        return LoadResult(agents, total, float(p50), float(p99), total - len(times_s), refused)
 
     async def _send_all(self, session_id: str, messages: Sequence[bytes]) -> None:
         async with UpdateStreams(self._address) as streams:
@@ -77,34 +82,23 @@ class AgentLoad:
                 await stream.send(data)
             await stream.close()
 
-    async def _send(
-        self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]], hostile_session: str, hostile_data: bytes
-    ) -> tuple[list[float], int]:
+    async def _send(self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]]) -> tuple[list[float], int]:
         times_s: list[float] = []
         async with UpdateStreams(self._address) as streams:
-            hostile = [
-                asyncio.ensure_future(streams.open(session).resend_forever(hostile_data))
-                for session in (hostile_session,)
-                if session
-            ]
             begin_s = time.monotonic() + 0.5
+            begins_s = [begin_s + number / len(sessions) / RATE_HZ for number in range(len(sessions))]
             tasks = [
-                asyncio.ensure_future(
-                    _send_agent(
-                        streams.open(session),
-                        own,
-                        begin_s + number / len(sessions) / RATE_HZ,
-                        times_s,
-                    )
-                )
-                for number, (session, own) in enumerate(zip(sessions, messages, strict=True))
+                asyncio.ensure_future(_send_agent(streams.open(session), own, own_begin_s, times_s))
+                for session, own, own_begin_s in zip(sessions, messages, begins_s, strict=True)
             ]
+            refused: list[str] = []
+            others = [asyncio.ensure_future(_send_others(streams, sessions, begin_s, refused))]
             duration_s = len(messages[0]) / RATE_HZ
             _, late = await asyncio.wait(tasks, timeout=duration_s + _SETTLE_S)
-            for task in (*late, *hostile):
+            for task in (*late, *others):
                 task.cancel()
-            await asyncio.gather(*tasks, *hostile, return_exceptions=True)
-        return times_s, sum(map(len, messages)) - len(times_s)
+            await asyncio.gather(*tasks, *others, return_exceptions=True)
+        return times_s, len(refused)
 
 
 def _name(number: int) -> str:
@@ -119,3 +113,32 @@ async def _send_agent(stream: UpdateStream, messages: Sequence[bytes], begin_s: 
         await stream.send(data)
         times_s.append(time.monotonic() - due_s)
     await stream.close()
+
+
+async def _send_others(streams: UpdateStreams, sessions: Sequence[str], begin_s: float, refused: list[str]) -> None:
+    """Send the objects and keyframes of all agents, evenly spread over their periods; refused: gets their sessions."""
+    graph = RuleParser().parse("Pick up the mug on the table")
+    # encoded once: the robots' processors encode them, not this one
+    image = frame_to_message(keyframe(0), compact=True)
+
+    async def report(session_id: str, index: int) -> bool:
+        return await streams.report_objects(session_id, object_report(graph, "mug", _OBJECTS, index))
+
+    async def send_keyframe(session_id: str, index: int) -> bool:
+        image.index, image.capture_time_ns = index, time.time_ns()
+        return await streams.send_keyframe(session_id, image)
+
+    async def repeat(send: Callable[[str, int], Awaitable[bool]], session: int, period_s: float) -> None:
+        for index in range(1 << 31):
+            due_s = begin_s + (session / len(sessions) + index) * period_s
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+            if not await send(sessions[session], index):
+                refused.append(sessions[session])
+
+    await asyncio.gather(
+        *(
+            repeat(send, session, period_s)
+            for session in range(len(sessions))
+            for send, period_s in ((report, _OBJECTS_PERIOD_S), (send_keyframe, _KEYFRAME_PERIOD_S))
+        )
+    )

@@ -19,7 +19,6 @@ from gausslite_bench.server.synthetic_updates import GAUSSIANS_PER_VOXEL
 
 P99_LIMIT_MS = 100.0
 _STATUS_CALLS = 5
-_HOSTILE_AGENTS = 8
 _WATCH_PAUSE_S = 2.0
 
 
@@ -33,7 +32,6 @@ class ServerBenchSettings:
     command: str
     store: str
     watchers: int
-    hostile: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +40,6 @@ class StoredSizeResult:
 
     held: int
     loads: tuple[LoadResult, ...]
-    hostile: LoadResult | None
     fill_s: float
     snapshot_s: float
     status_ms: float
@@ -83,10 +80,6 @@ def _measure(
         cpu_s = server.cpu_s()
         result = load.run(agents, settings.seconds)
         loads.append(replace(result, server_cpu_ms=1000 * (server.cpu_s() - cpu_s) / result.messages))
-    hostile = None
-    if settings.hostile:
-        on_progress(f"{held} Gaussians: hostile agent")
-        hostile = load.run(_HOSTILE_AGENTS, settings.seconds, hostile=True)
     on_progress(f"{held} Gaussians: snapshot, status, restart")
     snapshot_s, status_ms = _snapshot_s(server.address), _status_ms(server.address)
     rss_mib = server.rss_mib()
@@ -95,7 +88,6 @@ def _measure(
     return StoredSizeResult(
         held=held,
         loads=tuple(loads),
-        hostile=hostile,
         fill_s=fill_s,
         snapshot_s=snapshot_s,
         status_ms=status_ms,

@@ -1,0 +1,275 @@
+"""Attack a fusion server from a process of its own, while good agents send and their acknowledgements are timed.
+
+`python -m gausslite_bench.server.hostile ATTACK ADDRESS` attacks until its standard input ends.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from gausslite.codec.subset_codec import encode_subset
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.voxels import RoiSubset
+from gausslite.task.rules import RuleParser
+from gausslite.wire.async_calls import UpdateStreams
+from gausslite.wire.channel import require_serving
+from gausslite.wire.clients import FusionClient
+from gausslite.wire.convert import frame_to_message
+from gausslite_bench.server.agent_load import AgentLoad, LoadResult
+from gausslite_bench.server.server_process import ServerProcess
+from gausslite_bench.server.synthetic_updates import (
+    GAUSSIANS_PER_VOXEL,
+    GRID,
+    keyframe,
+    object_report,
+    tombstone_message,
+    voxels_batch,
+)
+
+GOOD_AGENTS = 4
+_SEQ = 1 << 20
+_SAMPLE_S = 0.2
+_STORM_THREADS = 8
+_BEGIN_S = 3.0
+"""Until the attackers have joined."""
+_NOUN = "mug"
+
+
+def _join(address: str, count: int) -> list[tuple[str, str]]:
+    """Return the names of these attackers and their sessions."""
+    with FusionClient(address, deadline_s=60.0) as client:
+        return [(name, client.join(name, GRID).session_id) for name in (f"bad-{number}" for number in range(count))]
+
+
+def _resend(address: str, count: int, make: Callable[[str], bytes]) -> None:
+    """Send a message of each of these agents again and again, as fast as flow control lets it pass."""
+
+    async def run() -> None:
+        joined = _join(address, count)
+        messages = [make(name) for name, _ in joined]
+        async with UpdateStreams(address) as streams:
+
+            async def repeat(session_id: str, message: bytes) -> None:
+                while True:
+                    with contextlib.suppress(Exception):
+                        await streams.open(session_id).resend_forever(message)
+                    await asyncio.sleep(0.05)
+
+            await asyncio.gather(
+                *(repeat(session_id, message) for (_, session_id), message in zip(joined, messages, strict=True))
+            )
+
+    asyncio.run(run())
+
+
+def _storm(address: str, call: Callable[[FusionClient, int], object]) -> None:
+    """Call from several threads, each again as soon as it is answered, whatever the answer."""
+
+    def repeat(thread: int) -> None:
+        with FusionClient(address, deadline_s=60.0) as client:
+            for number in itertools.count(thread, _STORM_THREADS):
+                with contextlib.suppress(GaussLiteError):
+                    call(client, number)
+
+    threads = [threading.Thread(target=repeat, args=(thread,), daemon=True) for thread in range(_STORM_THREADS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def _voxels(name: str, voxels: int) -> bytes:
+    return encode_subset(RoiSubset(name, "", _SEQ, _SEQ, voxels_batch(range(voxels), 7)), GRID)
+
+
+def _storm_of_queries(address: str) -> None:
+    report = object_report(RuleParser().parse(f"Pick up the {_NOUN}"), _NOUN, 200, 1)
+    with FusionClient(address, deadline_s=60.0) as client:
+        for _, session_id in _join(address, 48):
+            client.report_objects(session_id, report)
+    _storm(address, lambda client, _: client.query_objects(_NOUN))
+
+
+def _storm_of_views(address: str) -> None:
+    frame = keyframe(0, 320, 240)
+    camera = Camera(256.0, 256.0, 160.0, 120.0, 320, 240)
+    _storm(address, lambda client, _: client.render(camera, frame.T_world_camera))
+
+
+def _large_keyframes(address: str) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (1080, 1920, 3), dtype=np.uint8)
+    frame = keyframe(0, 1920, 1080)
+    frame.rgb[:] = noise
+    image = frame_to_message(frame, lossless=True)
+    sessions = [session_id for _, session_id in _join(address, _STORM_THREADS)]
+
+    def send(client: FusionClient, number: int) -> None:
+        image.index = number
+        client.contribute_encoded_keyframes(sessions[number % len(sessions)], [image])
+
+    _storm(address, send)
+
+
+def _slow_readers(address: str) -> None:
+    clients = [FusionClient(address, deadline_s=600.0) for _ in range(64)]
+    streams = [client.watch() for client in clients]
+    for stream in streams:
+        with contextlib.suppress(GaussLiteError):
+            next(stream)
+    threading.Event().wait()
+
+
+def _half_open(address: str) -> None:
+    """Connections without a byte, and streams without a message."""
+    path = address.removeprefix("unix:")
+    sockets = []
+    for _ in range(300):
+        connection = socket.socket(socket.AF_UNIX)
+        connection.connect(path)
+        sockets.append(connection)
+
+    async def run() -> None:
+        sessions = _join(address, 48)
+        async with UpdateStreams(address) as streams:
+            held = [streams.open(session_id) for _, session_id in sessions for _ in range(8)]
+            await asyncio.sleep(1e6)
+            held.clear()
+
+    asyncio.run(run())
+
+
+ATTACKS: Mapping[str, tuple[str, Callable[[str], None]]] = {
+    "large": ("48 streams of messages of 300 kB", lambda to: _resend(to, 48, lambda name: _voxels(name, 850))),
+    "tiny": ("16 streams of messages of one voxel", lambda to: _resend(to, 16, lambda name: _voxels(name, 1))),
+    "tombstones": (
+        "a stream of messages of 200 000 tombstones",
+        lambda to: _resend(to, 1, lambda name: tombstone_message(name, 200_000, _SEQ)),
+    ),
+    "names": ("8 threads that join under new names", lambda to: _storm(to, lambda c, n: c.join(f"name-{n}", GRID))),
+    "queries": ("8 threads that query 48 x 200 objects", _storm_of_queries),
+    "views": ("8 threads that render 320 x 240", _storm_of_views),
+    "keyframes": ("8 threads of keyframes of 1920 x 1080, noise as PNG", _large_keyframes),
+    "slow-readers": ("64 watchers that read one block", _slow_readers),
+    "half-open": ("300 silent connections, 384 silent streams", _half_open),
+}
+"""What each attack does, and the function that does it without end."""
+
+
+@dataclass(frozen=True, slots=True)
+class AttackResult:
+    """The good agents' acknowledgements without and under an attack, and what the server says of itself.
+
+    rss_mib: memory before the attack, rss_growth_mib: its largest growth. unhealthy: share of the health checks that
+    were not SERVING, slowest_health_ms: of their answers. log: lines that the server wrote.
+    """
+
+    attack: str
+    quiet: LoadResult
+    attacked: LoadResult
+    rss_mib: float
+    rss_growth_mib: float
+    unhealthy: float
+    slowest_health_ms: float
+    log: tuple[str, ...]
+
+
+def measure_attack(attack: str, command: str, store: str, held: int, seconds: float) -> AttackResult:
+    """Start a server, fill it, and measure it without and under an attack."""
+    with TemporaryDirectory() as folder, closing(ServerProcess(command, Path(folder), store)) as server:
+        load = AgentLoad(server.address)
+        load.fill(held, GAUSSIANS_PER_VOXEL)
+        quiet = load.run(GOOD_AGENTS, seconds)
+        rss_mib, logged = server.rss_mib(), len(_lines(server.log))
+        with _watched(server) as samples, _attacking(attack, server.address):
+            attacked = load.run(GOOD_AGENTS, seconds)
+        lines = _lines(server.log)[logged:]
+    return AttackResult(
+        attack,
+        quiet,
+        attacked,
+        rss_mib=rss_mib,
+        rss_growth_mib=max(sample.rss_mib for sample in samples) - rss_mib,
+        unhealthy=sum(not sample.serving for sample in samples) / len(samples),
+        slowest_health_ms=1000 * max(sample.health_s for sample in samples),
+        log=tuple(lines),
+    )
+
+
+def _lines(log: Path) -> list[str]:
+    return log.read_text(errors="replace").splitlines()
+
+
+@contextmanager
+def _attacking(attack: str, address: str) -> Iterator[None]:
+    """Attack from another process; it has a low priority, as if it ran on another machine."""
+    command = [sys.executable, "-m", __name__, attack, address]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:  # noqa: S603 - this program
+        try:
+            time.sleep(_BEGIN_S)
+            yield
+        finally:
+            process.kill()
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    rss_mib: float
+    serving: bool
+    health_s: float
+
+
+@contextmanager
+def _watched(server: ServerProcess) -> Iterator[list[_Sample]]:
+    """Yield samples of the server's memory and health, as a supervisor sees them."""
+    samples: list[_Sample] = []
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(_SAMPLE_S) or not samples:
+            begin_s = time.monotonic()
+            try:
+                require_serving(server.address, None)
+                serving = True
+            except GaussLiteError:
+                serving = False
+            samples.append(_Sample(server.rss_mib(), serving, time.monotonic() - begin_s))
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield samples
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _run(arguments: Sequence[str]) -> None:
+    attack, address = arguments
+    os.nice(10)
+
+    def exit_with_input() -> None:
+        sys.stdin.read()
+        os._exit(0)
+
+    threading.Thread(target=exit_with_input, daemon=True).start()
+    ATTACKS[attack][1](address)
+
+
+if __name__ == "__main__":
+    _run(sys.argv[1:])
