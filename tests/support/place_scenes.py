@@ -13,7 +13,7 @@ from gausslite.render.rasterizer import Rendering, gaussians_to_rows
 
 ROOM_M = (4.0, 3.0, 2.4)
 SPACING_M = 0.06
-CAMERA = Camera.centred(130.0, 160, 120)
+CAMERA = Camera.centred(200.0, 240, 180)
 
 
 def _face(origin: np.ndarray, u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
