@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.nouns import are_one_kind
+from gausslite.domain.nouns import are_one_kind, is_thing, kinds_among, nearest_above, synonymous_classes
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 
@@ -149,11 +149,44 @@ def is_convex(phrase: str) -> bool:
     return head_of(phrase) not in words()["nouns"]["non_convex"]
 
 
+@functools.cache
+def lengths_m() -> dict[str, float]:
+    """Return the longest side of each kind in `sizes.txt`. The file is read once."""
+    text = resources.files("gausslite.domain").joinpath("sizes.txt").read_text(encoding="utf-8")
+    rows = (line.split("|") for line in text.splitlines() if not line.startswith("#"))
+    return {_as_one_word(kind): float(length_m) for kind, length_m in rows}
+
+
+def _as_one_word(kind: str) -> str:
+    """Return "houseplant" for "house plant" if only that is a noun."""
+    joined = kind.replace(" ", "")
+    return joined if is_thing(joined) and not is_thing(kind) else kind
+
+
+@functools.cache
+def usual_length_m(phrase: str) -> float | None:
+    """Return the longest side that things of this kind have; None if it is unknown.
+
+    The kind, its synonyms and its kinds count; without any of them what it is a kind of.
+    """
+    known = lengths_m()
+    for noun in dict.fromkeys((normalised_noun(phrase), head_of(phrase))):
+        row = {noun, *(name for name in known if noun in synonyms() and synonyms().get(name) == synonyms()[noun])}
+        if kinds := {*row & known.keys(), *synonymous_classes(noun, known), *kinds_among(noun, known)}:
+            return max(known[kind] for kind in kinds)
+        if above := nearest_above(noun, known):
+            return usual_length_m(above[0])
+    return None
+
+
 def largest_size(phrase: str) -> tuple[float, float]:
-    """Return the longest plausible side of an object in metres, and its largest share of an image without depth."""
-    head = head_of(phrase)
+    """Return the longest plausible side of an object in metres, and its largest share of an image without depth.
+
+    Things may be longer than the models of their kind in `sizes.txt`.
+    """
+    head, usual_m = head_of(phrase), usual_length_m(phrase)
     row = next(row for row in words()["sizes"] if head in row.get("nouns", (head,)))
-    return row["longest_m"], row["image_share"]
+    return row["longest_m"] if usual_m is None else words()["lengths"]["slack"] * usual_m, row["image_share"]
 
 
 def same_kind(phrase: str, name: str) -> bool:

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.camera import project
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import same_kind
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.settings import EvidenceSettings
@@ -48,8 +49,9 @@ class Evidence:
         return LandmarkState.KNOWN if is_known else LandmarkState.CONFIRMED
 
     def confirmed(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
-        """Return the landmarks that are confirmed or known."""
-        return [landmark for landmark in landmarks if self.state(landmark) is not LandmarkState.CANDIDATE]
+        """Return the landmarks that are confirmed or known, without those in whose place another thing is surer."""
+        found = [landmark for landmark in landmarks if self.state(landmark) is not LandmarkState.CANDIDATE]
+        return [landmark for landmark in found if not any(_is_rather(other, landmark) for other in found)]
 
     def rival(self, landmark: Landmark) -> str | None:
         """Return the different thing that the landmark rather is by the sums of the scores; None if there is none."""
@@ -57,9 +59,9 @@ class Evidence:
         return name if score > self.settings.max_rival_ratio * landmark.score_sum else None
 
     def without_low_scores(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
-        """Return those of one target's landmarks whose best scores are not far below the best of all."""
-        limit = self.settings.min_score_share * max((landmark.best_score for landmark in landmarks), default=0.0)
-        return [landmark for landmark in landmarks if landmark.best_score >= limit]
+        """Return those of one target's landmarks whose confidence is not far below the best of all."""
+        limit = self.settings.min_score_share * max((landmark.confidence for landmark in landmarks), default=0.0)
+        return [landmark for landmark in landmarks if landmark.confidence >= limit]
 
     def is_present(self, landmark: Landmark) -> bool:
         """Return True if the latest frame with detections found the landmark, or few of its frames missed it."""
@@ -71,6 +73,16 @@ class Evidence:
         """Return True if one more observation could confirm a candidate."""
         is_candidate = self.state(landmark) is LandmarkState.CANDIDATE
         return is_candidate and landmark.seen_count + 1 >= self.settings.min_seen
+
+
+def _is_rather(other: Landmark, landmark: Landmark) -> bool:
+    """Return True if a landmark's place shows an object of another kind with more confidence."""
+    return (
+        other.phrase != landmark.phrase
+        and other.confidence > landmark.confidence
+        and landmark.may_equal(other)
+        and not (same_kind(landmark.phrase, other.phrase) or same_kind(other.phrase, landmark.phrase))
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -137,22 +137,27 @@ class Landmark:
             settings=observation.settings,
         )
 
-    def is_colocated_with(self, other: Observation) -> bool:
+    def is_colocated_with(self, other: Observation | Landmark) -> bool:
         """Return True if the centroids are close for the size of the smaller object."""
         smaller_m = min(self.radius_m, other.radius_m)
         max_distance_m = max(self.settings.min_match_distance_m, self.settings.match_radius_share * smaller_m)
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < max_distance_m
 
-    def may_equal(self, other: Observation) -> bool:
-        """Return True if an observation of another phrase may show this object: the same place, and a similar size."""
+    def may_equal(self, other: Observation | Landmark) -> bool:
+        """Return True if an object of another phrase may be this one: the same place, and a similar size."""
         smaller_m, larger_m = sorted((self.radius_m, other.radius_m))
         return larger_m <= self.settings.max_size_ratio * smaller_m and self.is_colocated_with(other)
 
-    def matches(self, other: Observation) -> bool:
-        """Return True if an observation of the same phrase shows this object, in whole or in part."""
+    def matches(self, other: Observation | Landmark) -> bool:
+        """Return True if an observation or a double of the same phrase shows this object, in whole or in part."""
         shared = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
         smaller = max(1, min(len(self.cells), len(other.cells)))
         return self.is_colocated_with(other) or shared >= self.settings.min_shared_share * smaller
+
+    @property
+    def confidence(self) -> float:
+        """The best score times the share of frames that detected the object, of those that should have."""
+        return min(max(self.best_score, 0.0), 1.0) * self.seen_count / (self.seen_count + self.missed_count)
 
     def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
         """Return the whole object as an observation by a camera, to evaluate relations."""
@@ -252,7 +257,7 @@ class ObjectMap:
     def observe(
         self, observations: Sequence[Observation], is_visible: Callable[[Landmark], bool] | None = None
     ) -> None:
-        """Merge one frame's observations into their landmarks; an observation of several landmarks merges these.
+        """Merge one frame's observations into their landmarks, and landmarks that are doubles of the observed ones.
 
         With is_visible, the other landmarks that the frame should have shown are counted as missed.
         """
@@ -277,11 +282,15 @@ class ObjectMap:
             new.number, self._next_number = self._next_number, self._next_number + 1
             self._objects.append(new)
             return new
-        matches[0].add(new)
-        for other in matches[1:]:
-            matches[0].add(other)
-            self._objects.remove(other)
-        return matches[0]
+        first = matches[0]
+        first.add(new)
+        doubles = matches[1:]
+        while doubles:
+            for other in doubles:
+                first.add(other)
+                self._objects.remove(other)
+            doubles = [other for other in self.with_phrase(first.phrase) if other is not first and first.matches(other)]
+        return first
 
     def _add_weak(self, weak: Observation, observed: list[Landmark]) -> None:
         """Count a weak observation for the nearest landmark that it shows, unless this frame already shows one.
@@ -297,24 +306,22 @@ class ObjectMap:
 
 
 def describe_landmarks(landmarks: Sequence[Landmark], graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
-    """Return the landmarks as values for a report, in their order; of too many, the most confident ones."""
+    """Return the landmarks as values for a report: the targets before the anchors, the most confident ones first."""
     described = [describe_landmark(landmark, graph) for landmark in landmarks]
-    chosen = sorted(described, key=lambda landmark: -landmark.confidence)[:MAX_OBJECTS_PER_AGENT]
-    ids = {landmark.object_id for landmark in chosen}
-    return tuple(landmark for landmark in described if landmark.object_id in ids)
+    described.sort(key=lambda landmark: (landmark.role is not ObjectRole.TARGET, -landmark.confidence))
+    return tuple(described[:MAX_OBJECTS_PER_AGENT])
 
 
 def describe_landmark(landmark: Landmark, graph: TaskGraph) -> ObjectLandmark:
-    """Return a landmark as a value; its confidence is the best score times the share of frames that detected it."""
+    """Return a landmark as a value."""
     x, y, z = (float(value) for value in landmark.centroid_m)
-    seen_share = landmark.seen_count / (landmark.seen_count + landmark.missed_count)
     return ObjectLandmark(
         object_id=f"{landmark.phrase}-{landmark.number}",
         noun=landmark.phrase,
         role=ObjectRole.TARGET if landmark.phrase in map(noun_of, graph.targets) else ObjectRole.ANCHOR,
         centroid_m=(x, y, z),
         extent_m=landmark.box_m(),
-        confidence=min(max(landmark.best_score, 0.0), 1.0) * seen_share,
+        confidence=landmark.confidence,
         first_seen_ns=landmark.first_seen_ns,
         last_seen_ns=landmark.last_seen_ns,
     )

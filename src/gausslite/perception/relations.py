@@ -67,7 +67,9 @@ class NamedObjects:
 
     def confirmed(self, name: str) -> list[Landmark]:
         """Return the confirmed landmarks of a name; if there are none, all of them."""
-        return self.evidence.confirmed(self.seen(name)) or self.seen(name)
+        seen = self.seen(name)
+        confirmed = self.evidence.confirmed(self.object_map.objects)
+        return [landmark for landmark in seen if any(landmark is other for other in confirmed)] or seen
 
     def candidates(self, name: str) -> list[Landmark]:
         """Return the confirmed landmarks without those of far lower scores: one false candidate decides."""

@@ -81,7 +81,7 @@ class RelevanceTracker:
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
-        """The confirmed objects of the task, in the order of their first detection."""
+        """The confirmed objects of the task, targets before anchors, the most confident first."""
         return describe_landmarks(self._evidence.confirmed(self.landmarks), self._graph)
 
     def report(self, match: NounMatch) -> NounReport:

@@ -172,17 +172,23 @@ def test_the_extent_is_the_longer_side_at_the_measured_depth(depth_m):
 
 def test_a_near_object_may_fill_the_image_and_a_far_one_may_not():
     limits = BoxSizeLimits()
-    assert limits.accepts("mug", 0.5, WHOLE_IMAGE, frame_at(0.4))
-    assert not limits.accepts("mug", 0.5, WHOLE_IMAGE, frame_at(1.0))
+    assert limits.accepts("tool", 0.5, WHOLE_IMAGE, frame_at(0.4))
+    assert not limits.accepts("tool", 0.5, WHOLE_IMAGE, frame_at(1.0))
     assert limits.accepts("chair", 0.5, WHOLE_IMAGE, frame_at(0.5))
     assert not limits.accepts("chair", 0.5, WHOLE_IMAGE, frame_at(1.0))
     assert limits.accepts("couch", 0.5, WHOLE_IMAGE, frame_at(1.0))
-    assert limits.accepts("table", 0.5, WHOLE_IMAGE, frame_at(2.5))
+    assert limits.accepts("table", 0.5, WHOLE_IMAGE, frame_at(1.5))
     assert not limits.accepts("wardrobe", 0.5, WHOLE_IMAGE, frame_at(2.5))
 
 
+def test_a_thing_is_about_as_long_as_others_of_its_kind():
+    for noun, plausible_m, implausible_m in (("mug", 0.15, 0.6), ("book", 0.4, 1.2), ("chair", 1.2, 3.0)):
+        boxes = [(0.0, 0.0, 100.0 * length_m, 10.0) for length_m in (plausible_m, implausible_m)]
+        assert [BoxSizeLimits().accepts(noun, 0.4, box, frame_at(1.0)) for box in boxes] == [True, False]
+
+
 def test_a_confident_detection_may_be_larger():
-    accepted = [BoxSizeLimits().accepts("monitor", score, WHOLE_IMAGE, frame_at(0.7)) for score in (0.3, 0.6, 0.8)]
+    accepted = [BoxSizeLimits().accepts("basket", score, WHOLE_IMAGE, frame_at(0.6)) for score in (0.3, 0.6, 0.8)]
     assert accepted == [False, False, True]
 
 

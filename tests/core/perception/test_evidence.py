@@ -15,8 +15,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.perception.evidence import LandmarkState, VisibilityCheck
-from gausslite.perception.object_map import Landmark, ObjectMap, Observation
+from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
+from gausslite.perception.object_map import Landmark, ObjectMap, Observation, describe_landmarks
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 
@@ -186,6 +186,52 @@ def test_a_candidate_with_a_far_lower_score_does_not_decide_a_superlative():
     assert states == [LandmarkState.CANDIDATE, LandmarkState.CONFIRMED, LandmarkState.KNOWN]
     assert objects.target_of(high) is not None
     assert objects.target_of(low) is None
+
+
+def test_the_thing_with_more_confidence_has_the_place():
+    place = ((0.0, 0.1), (0.0, 0.1), (0.0, 0.1))
+    evidence, object_map = Evidence(EvidenceSettings()), ObjectMap()
+    for _ in range(2):
+        object_map.observe([cloud("telephone", 0.8, *place), cloud("cup", 0.4, *place), cloud("mug", 0.3, *place)])
+    assert [landmark.phrase for landmark in evidence.confirmed(object_map.objects)] == ["telephone"]
+    cups = [landmark for landmark in object_map.objects if landmark.phrase != "telephone"]
+    assert len(evidence.confirmed(cups)) == 2, "two words for one thing do not exclude each other"
+
+
+def test_an_object_that_most_frames_miss_is_left_out_beside_a_surer_one():
+    evidence = Evidence(EvidenceSettings())
+    sure, missed = landmark_at(score=0.5), landmark_at(score=0.5)
+    assert evidence.without_low_scores([sure, missed]) == [sure, missed]
+    missed.missed_count = 2
+    assert evidence.without_low_scores([sure, missed]) == [sure]
+
+
+def test_doubles_are_merged_when_an_observation_makes_them_overlap():
+    left, right, whole = (
+        cloud("table", 0.5, (low_m, high_m), (0.0, 0.05), (0.0, 0.4))
+        for low_m, high_m in ((0, 0.6), (1.4, 2), (0, 1.7))
+    )
+    object_map = ObjectMap()
+    object_map.observe([left, right])
+    assert len(object_map.objects) == 2
+    object_map.observe([whole])
+    assert [landmark.seen_count for landmark in object_map.objects] == [3]
+
+
+def test_the_best_target_is_reported_first_and_anchors_last():
+    graph = TaskGraph("id", "", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),))
+    observations = [
+        cloud(*seen, (x_m, x_m + 0.1), (0, 0.1), (0, 0.1))
+        for x_m, seen in enumerate([("table", 0.9), ("mug", 0.3), ("mug", 0.8)])
+    ]
+    object_map = ObjectMap()
+    object_map.observe(observations)
+    described = describe_landmarks(object_map.objects, graph)
+    assert [(landmark.noun, landmark.confidence) for landmark in described] == [
+        ("mug", 0.8),
+        ("mug", 0.3),
+        ("table", 0.9),
+    ]
 
 
 @pytest.mark.parametrize("settings", [{"min_seen": 0}, {"confident_score": -0.1}, {"min_seen_fraction": 1.1}])

@@ -104,7 +104,7 @@ def test_boxes_below_the_score_or_without_a_mask_are_dropped(tmp_path):
 
 
 def test_boxes_below_the_threshold_are_weak_and_of_named_objects_only(tmp_path):
-    weak, sure = (24.0, 32.0, 16.0, 16.0, 0, 0.2), (22.0, 32.0, 12.0, 16.0, 1, 0.3)
+    weak, sure = (24.0, 32.0, 8.0, 8.0, 0, 0.2), (22.0, 32.0, 12.0, 16.0, 1, 0.3)
     detector = detector_from(write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [weak, sure]))
     found = detector.detect(frame_with_red_square(), ["cup", "chair"])
     assert [(each.phrase, each.is_weak) for each in found] == [("cup", True), ("chair", False)]
@@ -115,8 +115,9 @@ def test_boxes_too_large_for_their_class_are_dropped_whatever_else_is_asked_for(
     huge = (32.0, 32.0, 64.0, 24.0, 0, 0.9)
     path = write_tiny_yolo(tmp_path / "tiny.onnx", NAMES, [huge])
     near = frame_with_red_square()
+    near = replace(near, depth_m=0.3 * near.depth_m)
     far = replace(near, depth_m=2.0 * near.depth_m)
-    # the box is 1.28 m wide at a depth of 1 m, and 2.56 m wide at 2 m
+    # the box is 0.38 m wide at a depth of 0.3 m, and 0.77 m wide at 0.6 m
     for queries in (["cup"], ["cup", "chair", "table"]):
         assert len(detector_from(path).detect(near, queries)) == 1
         assert detector_from(path).detect(far, queries) == []
