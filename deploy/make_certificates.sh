@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Create a certificate authority, and a certificate for each name, to test encrypted services:
 #   deploy/make_certificates.sh FOLDER NAME[:ROLE]...
-# A name is a host, a compose service or an agent's --agent-id. A role is robot (default), viewer, operator, or none for
-# a service that calls no other. An existing authority in FOLDER is reused.
+# A name is a host, a compose service or an agent's --agent-id. A role is robot (default), viewer, operator, server
+# for fusion servers that share a mission, or none for a service that calls no other. An existing authority in FOLDER is reused.
 # FOLDER/NAME gets ca.pem, cert.pem and key.pem: all that this service may read. Only FOLDER has the authority's key.
 set -euo pipefail
 fail() { echo "make_certificates: $1" >&2; exit 1; }
@@ -22,7 +22,7 @@ for argument in "$@"; do
   role=robot
   [[ $argument != *:* ]] || role=${argument#*:}
   [[ $name =~ ^[A-Za-z0-9][A-Za-z0-9._-]*$ ]] || fail "expected names of letters, digits and ._-, got '$name'"
-  [[ $role =~ ^(robot|viewer|operator|none)$ ]] || fail "expected the role robot, viewer, operator or none, got '$role'"
+  [[ $role =~ ^(robot|viewer|operator|server|none)$ ]] || fail "expected the role robot, viewer, operator, server or none, got '$role'"
   own=$folder/$name
   mkdir -p "$own"
   openssl req "${new_key[@]}" -keyout "$own/key.pem" -out "$own/request" -subj "/CN=$name" 2>/dev/null

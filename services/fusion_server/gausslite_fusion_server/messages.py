@@ -1,11 +1,8 @@
-"""Convert a mission's figures, layers, frames and views to messages, and contributions and exports from them."""
+"""Convert a mission's figures, layers, frames and views to messages, and keyframes and exports from them."""
 
 from __future__ import annotations
 
-import asyncio
 import tempfile
-from concurrent.futures import Future
-from dataclasses import dataclass
 from types import TracebackType
 
 import google_crc32c
@@ -13,22 +10,16 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.errors import (
-    GaussLiteError,
-    InvalidInputError,
-    MismatchError,
-    SessionUnknownError,
-    StorageError,
-    UnavailableError,
-)
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import MAX_COORDINATE_M
+from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.refinement import LayerView
-from gausslite.fusion.store import PutOutcome, SessionRecord
-from gausslite.fusion.traffic import AgentContribution, TrafficCounters
+from gausslite.fusion.store import SessionRecord
+from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
 from gausslite.wire.convert import (
@@ -40,17 +31,9 @@ from gausslite.wire.convert import (
     transform_to_message,
 )
 from gausslite.wire.security import Caller
-from gausslite.wire.status import code_and_reason
 from gausslite.wire.views import region_from_png
 
 _MAX_SELECTED_KEYFRAMES = 10_000
-_STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)
-"""Errors that every later message would raise too, so they end the stream; other errors reject one message."""
-_ACCEPTED, _STALE, _REJECTED = (
-    pb.SUBSET_STATUS_ACCEPTED,
-    pb.SUBSET_STATUS_STALE,
-    pb.SUBSET_STATUS_REJECTED,
-)
 
 
 def agent_of_session(engine: FusionEngine, session_id: str, caller: Caller) -> str:
@@ -63,44 +46,6 @@ def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> Session
     session = engine.session(session_id)
     caller.require_agent(session.agent_id)
     return session
-
-
-@dataclass(frozen=True, slots=True)
-class QueuedSubset:
-    """A message of an agent that waits for its commit."""
-
-    agent_id: str
-    sequence: int
-    traffic: TrafficCounters
-    put: Future[PutOutcome]
-
-
-def enqueue_subset(engine: FusionEngine, request: pb.ContributeSubsetsRequest, session: SessionRecord) -> QueuedSubset:
-    """Queue one message of a session, without decoding it. Raises UnavailableError if too many wait."""
-    size = len(request.subset)
-    is_handover = request.purpose == pb.PURPOSE_HANDOVER
-    traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
-    put = engine.enqueue_update(session, request.subset)
-    return QueuedSubset(session.agent_id, request.sequence, traffic, put)
-
-
-async def outcome_of(engine: FusionEngine, queued: QueuedSubset) -> pb.SubsetOutcome:
-    """Wait for the commit. A rejected message gives a REJECTED outcome; errors of the whole stream are raised."""
-    outcome = pb.SubsetOutcome(sequence=queued.sequence)
-    try:
-        put = await asyncio.wrap_future(queued.put)
-    except _STREAM_ERRORS:
-        raise
-    except GaussLiteError as error:
-        outcome.status, outcome.reason, outcome.message = _REJECTED, code_and_reason(error)[1], str(error)
-        engine.record_traffic(queued.agent_id, queued.traffic.plus(TrafficCounters(subsets_rejected=1)))
-        return outcome
-    accepted = len(put.accepted) > 0 or len(put.stale) == 0
-    outcome.status = _ACCEPTED if accepted else _STALE
-    outcome.accepted_voxels, outcome.stale_voxels = len(put.accepted), len(put.stale)
-    stored = TrafficCounters(subsets_accepted=int(accepted), subsets_stale=int(not accepted))
-    engine.record_traffic(queued.agent_id, queued.traffic.plus(stored))
-    return outcome
 
 
 def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest, caller: Caller) -> None:
@@ -116,6 +61,21 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
     engine.add_keyframe(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])
+
+
+def select_map(engine: FusionEngine, request: pb.ExportFusedMapRequest) -> VoxelBatch:
+    """Return the map that a request names. Raises InvalidInputError, MismatchError, RevisionGoneError."""
+    match request.strategy:
+        case pb.FUSION_STRATEGY_VOTE:
+            return engine.maps.voted_map(request.agent_id)
+        case pb.FUSION_STRATEGY_CONCATENATION:
+            return engine.maps.union_map(request.agent_id)
+        case pb.FUSION_STRATEGY_REFINED if not request.agent_id:
+            return engine.maps.refined_map()
+        case pb.FUSION_STRATEGY_REFINED:
+            raise InvalidInputError("agent_id: expected none with REFINED, whose Gaussians belong to everyone")
+        case other:
+            raise InvalidInputError(f"strategy: expected VOTE, CONCATENATION or REFINED, got {other}")
 
 
 _CHUNK_BYTES = 1 << 20

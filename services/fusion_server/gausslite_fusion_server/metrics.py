@@ -6,11 +6,16 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
-from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.traffic import ACKNOWLEDGEMENT_BOUNDS_S, AgentContribution, MissionStatus
+from gausslite.fusion.traffic import (
+    ACKNOWLEDGEMENT_BOUNDS_S,
+    Acknowledgements,
+    AgentContribution,
+    MissionStatus,
+    StorageProbe,
+)
 from gausslite.wire.channel import host_and_port
 
 _log = logging.getLogger(__name__)
@@ -53,11 +58,49 @@ _OF_MISSION: tuple[tuple[str, str, Callable[[MissionStatus, bool], float]], ...]
 )
 
 
+class MessageCounts(NamedTuple):
+    """Of a server that shares a mission: messages of agents, parts sent to owners and stored as one, and parts refused
+    because their voxels are another server's.
+    """
+
+    received: int
+    sent: int
+    stored: int
+    foreign: int
+
+
+_OF_SHARE = (
+    ("messages_received", "messages that agents sent to this server"),
+    ("parts_sent", "parts of them sent to other servers, which own their voxels"),
+    ("parts_stored", "parts of messages stored as the owner of their voxels"),
+    ("parts_foreign", "parts of messages refused, because this server does not own their voxels"),
+)
+
+
+@runtime_checkable
+class Figures(Protocol):
+    """What a server knows of its mission, or of its part."""
+
+    @property
+    def storage(self) -> StorageProbe:
+        """The check whether the store can write."""
+        ...
+
+    @property
+    def acknowledgements(self) -> Acknowledgements:
+        """The times until the messages are answered."""
+        ...
+
+    def status(self) -> MissionStatus:
+        """Return the totals."""
+        ...
+
+
 class MissionCollector:
     """Reads the figures when Prometheus asks for them; counters start at 0 with the server."""
 
-    def __init__(self, engine: FusionEngine) -> None:
-        self._engine = engine
+    def __init__(self, engine: Figures, counts: Callable[[], MessageCounts] | None = None) -> None:
+        self._engine, self._counts = engine, counts
 
     def collect(self) -> Iterator[Any]:
         """Yield the metrics of the mission and of each agent, with the ids as the labels `mission` and `agent`."""
@@ -76,6 +119,11 @@ class MissionCollector:
         )
         acknowledgement.add_metric([mission_id], list(zip(bounds, accumulate(counts), strict=True)), total_s)
         yield acknowledgement
+        if self._counts is not None:
+            for (name, help_text), count in zip(_OF_SHARE, self._counts(), strict=True):
+                of_share = CounterMetricFamily(f"gausslite_fusion_{name}", help_text, labels=["mission"])
+                of_share.add_metric([mission_id], count)
+                yield of_share
         for metric in _OF_AGENTS:
             kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
             family = kind(f"gausslite_agent_{metric.name}", metric.help_text, labels=["mission", "agent"])
@@ -85,7 +133,9 @@ class MissionCollector:
 
 
 @contextmanager
-def metrics_server(address: str | None, engine: FusionEngine) -> Iterator[int]:
+def metrics_server(
+    address: str | None, engine: Figures, counts: Callable[[], MessageCounts] | None = None
+) -> Iterator[int]:
     """Serve /metrics on HOST:PORT while the context is open, with the figures of the process; gives the actual port.
 
     None serves nothing and gives 0. Raises InvalidInputError without prometheus-client or for another address,
@@ -101,7 +151,7 @@ def metrics_server(address: str | None, engine: FusionEngine) -> Iterator[int]:
         raise InvalidInputError("--metrics: needs prometheus-client; pip install 'gausslite[metrics]'") from error
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
-    registry.register(MissionCollector(engine))
+    registry.register(MissionCollector(engine, counts))
     try:
         server, thread = start_http_server(port, host.strip("[]"), registry)
     except OSError as error:

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
@@ -101,15 +101,21 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return run_service(PROGRAM, serve)
 
 
-def _open_database(url: str) -> FusionStore:
+@contextlib.contextmanager
+def _extra_needed() -> Iterator[None]:
     try:
         # psycopg is an extra
-        from gausslite.fusion.postgres_store import PostgresStore
+        yield
     except ImportError as error:
         raise InvalidInputError(
             f"--store {POSTGRES_SCHEME}...: expected the package 'psycopg'; install it with: "
             "pip install 'gausslite[postgres]'"
         ) from error
+
+
+def _open_database(url: str) -> FusionStore:
+    with _extra_needed():
+        from gausslite.fusion.postgres_store import PostgresStore
     return PostgresStore(url)
 
 
@@ -123,6 +129,9 @@ def _open_store(settings: ServerSettings) -> FusionStore:
 
 
 async def _serve(settings: ServerSettings) -> None:
+    if settings.peer_address is not None:
+        await _serve_share(settings, settings.peer_address)
+        return
     store = _open_store(settings)
     with contextlib.closing(store), contextlib.closing(FitProcess()) as fit:
         engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, fit=fit)
@@ -139,6 +148,15 @@ async def _serve(settings: ServerSettings) -> None:
                 engine.save_counters()
 
 
+def _page(settings: ServerSettings) -> AbstractContextManager[None]:
+    if settings.view is None:
+        return nullcontext()
+    page: AbstractContextManager[None] = sibling(Sibling.PAGES).service_page(
+        settings.view, settings.listen, is_agent=False, tls=settings.tls
+    )
+    return page
+
+
 async def _serve_mission(settings: ServerSettings, engine: FusionEngine, servicer: FusionServicer) -> None:
     async def work_until_stopped() -> None:
         try:
@@ -147,11 +165,18 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
             servicer.drain()
 
-    page: AbstractContextManager[None] = nullcontext()
-    if settings.view is not None:
-        live = sibling(Sibling.PAGES)
-        page = live.service_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
-    with metrics_server(settings.metrics, engine), page:
+    with metrics_server(settings.metrics, engine), _page(settings):
         await serve_until_stopped(
             settings.listen, [servicer.service()], work_until_stopped, settings.tls, settings.limits, settings.health
         )
+
+
+async def _serve_share(settings: ServerSettings, peer_address: str) -> None:
+    """Serve a part of a mission, together with the other servers of the database."""
+    with _extra_needed():
+        from gausslite_fusion_server.sharing import open_share
+    async with open_share(settings, peer_address) as share:
+        with metrics_server(settings.metrics, share, share.counts), _page(settings):
+            await serve_until_stopped(
+                settings.listen, share.services, share.run, settings.tls, settings.limits, settings.health
+            )

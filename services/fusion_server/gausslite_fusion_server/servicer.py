@@ -7,10 +7,11 @@ import functools
 import logging
 import time
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from gausslite.codec.ply import ply_bytes
+from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.checks import require_identifier
 from gausslite.domain.errors import (
@@ -19,10 +20,9 @@ from gausslite.domain.errors import (
     UnavailableError,
 )
 from gausslite.domain.objects import ObjectReport
-from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.refinement import MapRenderer
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store import MissionConfig, PutOutcome, SessionRecord
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.convert import (
@@ -38,16 +38,16 @@ from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
 from gausslite.wire.views import ChangeNotifier
+from gausslite_fusion_server.contributions import Contributions, StoredCount
 from gausslite_fusion_server.messages import (
     ExportedFile,
     agent_of_session,
     alignment_to_message,
     contribution_to_message,
     declared_frame_from_message,
-    enqueue_subset,
     layer_from_message,
-    outcome_of,
     read_keyframe,
+    select_map,
     session_of,
     store_keyframe,
     view_to_message,
@@ -142,7 +142,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
-        self._rejections = RejectionLog(_log)
+        find = functools.partial(self._work, session_of, engine)
+        self._contributions = Contributions(find, self._store_message, engine.record_traffic, RejectionLog(_log))
         # one map at a time is in memory
         self._exports = asyncio.Semaphore(1)
 
@@ -160,7 +161,28 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._gate.close()
         self._map_changes.notify()
 
-    def _publish_changes(self) -> None:
+    @property
+    def engine(self) -> FusionEngine:
+        """The engine of the map that is served."""
+        return self._engine
+
+    async def _store_message(self, session: SessionRecord, message: bytes) -> StoredCount:
+        return await self._commit_queued(functools.partial(self._engine.enqueue_update, session, message))
+
+    async def store_part(self, session_id: str, part: StoredSubset) -> StoredCount:
+        """Store a decoded message, or a part of one. Raises UnavailableError, and as FusionEngine.contribute."""
+        return await self._commit_queued(functools.partial(self._engine.enqueue_part, session_id, part))
+
+    async def _commit_queued(self, enqueue: Callable[[], Future[PutOutcome]]) -> StoredCount:
+        self._gate.require_open()
+        put = enqueue()
+        self._commit_soon()
+        try:
+            return StoredCount.of(await asyncio.wrap_future(put))
+        finally:
+            self.publish_changes()
+
+    def publish_changes(self) -> None:
         """Wake the watchers, and look which frames are due. Use it on the event loop."""
         self._map_changes.notify()
         self._align_in_background()
@@ -231,23 +253,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
     ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
         """Store voxel updates; one acknowledgement for each message."""
-        acknowledged, caller, session = 0, Caller.of(context), None
-        async for request in self._gate.admit(request_iterator):
-            if session is None or session.session_id != request.session_id:
-                session = await self._work(session_of, self._engine, request.session_id, caller)
-            self._gate.require_open()
-            try:
-                queued = enqueue_subset(self._engine, request, session)
-            except UnavailableError as error:
-                self._rejections.record(caller.key, "UNAVAILABLE", str(error))
-                raise
-            self._commit_soon()
-            outcome = await outcome_of(self._engine, queued)
-            if outcome.status == pb.SUBSET_STATUS_REJECTED:
-                self._rejections.record(caller.key, outcome.reason, outcome.message)
-            self._publish_changes()
-            acknowledged = max(acknowledged, request.sequence)
-            yield pb.ContributeSubsetsResponse(acknowledged=acknowledged, outcomes=[outcome])
+        async for answer in self._contributions.answer(self._gate.admit(request_iterator), Caller.of(context)):
+            yield answer
 
     async def ContributeKeyframes(
         self, request_iterator: AsyncIterator[pb.ContributeKeyframesRequest], context: Any
@@ -369,14 +376,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """End a session; with `forget` the agent's updates are deleted."""
         agent_of_session(self._engine, request.session_id, Caller.of(context))
         revision = await self._work(self._engine.leave, request.session_id, request.forget)
-        self._publish_changes()
+        self.publish_changes()
         return pb.LeaveSessionResponse(fused_revision=revision)
 
     async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
         """End an agent's session and delete its data; with `ban` its later joins are refused."""
         self._engine.require_mission(request.mission_id)
         voxels = await self._work(self._engine.evict, request.agent_id, request.ban)
-        self._publish_changes()
+        self.publish_changes()
         _log.warning("agent %s: %s, data of %d voxels deleted", request.agent_id, _evicted(request), voxels)
         return pb.EvictAgentResponse(fused_revision=self._engine.revision, voxels=voxels)
 
@@ -388,21 +395,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         return pb.UnbanAgentResponse()
 
     def _export(self, request: pb.ExportFusedMapRequest) -> ExportedFile:
-        batch = self._select_map(request)
+        batch = select_map(self._engine, request)
         return ExportedFile(ply_bytes(batch.gaussians, self._engine.mission_config.given_world_frame))
-
-    def _select_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
-        match request.strategy:
-            case pb.FUSION_STRATEGY_VOTE:
-                return self._engine.maps.voted_map(request.agent_id)
-            case pb.FUSION_STRATEGY_CONCATENATION:
-                return self._engine.maps.union_map(request.agent_id)
-            case pb.FUSION_STRATEGY_REFINED if not request.agent_id:
-                return self._engine.maps.refined_map()
-            case pb.FUSION_STRATEGY_REFINED:
-                raise InvalidInputError("agent_id: expected none with REFINED, whose Gaussians belong to everyone")
-            case other:
-                raise InvalidInputError(f"strategy: expected VOTE, CONCATENATION or REFINED, got {other}")
 
     def _align_in_background(self) -> None:
         """Compare an agent's frame soon, unless a comparison is pending or running. Use on the event loop."""

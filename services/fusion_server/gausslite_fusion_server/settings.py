@@ -18,7 +18,7 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.process import print_message
 from gausslite.render.choose import BACKENDS
-from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port
+from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port, require_callable
 from gausslite.wire.process import LogFormat
 from gausslite.wire.security import CallLimits, Tls, TlsFiles
 
@@ -49,6 +49,11 @@ def _read_health(text: str) -> str:
     return text
 
 
+def _read_peer(text: str) -> str:
+    require_callable("peer-address", text)
+    return text
+
+
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
     """Address, storage (a file, the URL of a PostgreSQL database, or memory) and limits of the server; the mission."""
@@ -71,6 +76,12 @@ class ServerSettings:
         high=_MAX_STORE_MB,
         convert=lambda mebibytes: mebibytes << 20,
         to_plain=lambda size: size >> 20,
+    )
+    peer_address: str | None = option(
+        None,
+        "where the other servers of the database reach this one: servers with it share the mission (default: alone)",
+        metavar="ADDRESS",
+        convert=_read_peer,
     )
     fusion: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
@@ -130,6 +141,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
 def _require_store(options: argparse.Namespace) -> None:
     """Raise InvalidInputError for a store of another kind than the other options need, or for a misspelt one."""
     store = options.store
+    if options.peer_address is not None and not isinstance(store, str):
+        raise InvalidInputError(f"peer-address: expected a database as --store, {POSTGRES_SCHEME}USER@HOST/DATABASE")
     if store is None:
         return
     if isinstance(store, str):

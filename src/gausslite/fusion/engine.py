@@ -13,9 +13,8 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.codec.subset_codec import decode_stored
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import MismatchError, NotPermittedError
+from gausslite.domain.errors import MismatchError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
@@ -33,8 +32,15 @@ from gausslite.fusion.keyframes import (
 )
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.mission_data import MissionData
-from gausslite.fusion.objects import MergedObjects, find_objects
-from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome, SessionRecord, require_storable
+from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
+from gausslite.fusion.store import (
+    FusionStore,
+    MissionConfig,
+    PutOutcome,
+    SessionRecord,
+    SharedRows,
+    require_storable,
+)
 from gausslite.fusion.traffic import (
     Acknowledgements,
     AgentContribution,
@@ -42,7 +48,13 @@ from gausslite.fusion.traffic import (
     StorageProbe,
     TrafficCounters,
 )
-from gausslite.fusion.updates import PendingUpdate, UpdateCommitter, require_within_quotas
+from gausslite.fusion.updates import (
+    PendingUpdate,
+    UpdateCommitter,
+    decode_own,
+    require_own,
+    require_within_quotas,
+)
 
 
 def mission_status(store: FusionStore, mission: MissionData) -> MissionStatus:
@@ -95,6 +107,7 @@ class FusionEngine:
     Updates, sessions, keyframes, objects, counters and the refined map persist with the store.
     first_revision must exceed the revisions from before a restart; by default it is the time in microseconds.
     decode_keyframe reads keyframes as they were received; only a refinement needs it. fit compares two agents' maps.
+    others: finds what the other servers of the store know; this engine then has the store's part of the voxels.
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
@@ -105,6 +118,7 @@ class FusionEngine:
         first_revision: int | None = None,
         decode_keyframe: FrameDecoder = no_decoder,
         fit: Fit = fit_frame,
+        others: SharedRows | None = None,
     ) -> None:
         self._lock = RLock()
         self._store = store
@@ -114,7 +128,7 @@ class FusionEngine:
         self._merged_objects = MergedObjects()
         if first_revision is None:
             first_revision = time.time_ns() // 1000
-        self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe, fit)
+        self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe, fit, others)
         self._committer = UpdateCommitter(
             store, self._lock, self._decode_update, self._check_update, self._record_updates
         )
@@ -195,6 +209,31 @@ class FusionEngine:
                 self._mission.keyframes.indices(agent_id),
             )
 
+    def begin_elsewhere(self, agent_id: str, fresh_map: bool) -> int:
+        """Note that the agent has joined at another server of the store; returns its highest update_seq here.
+
+        fresh_map: as in `join`. Raises StorageError.
+        """
+        with self._committer.committing, self._lock:
+            self._mission.members.forget_elsewhere(agent_id)
+            if fresh_map:
+                self._mission.agents.begin_new_map(agent_id)
+            return self.highest_update_seq(agent_id)
+
+    def remove_elsewhere(self, agent_id: str) -> int:
+        """Delete the agent's voxels here, after another server has ended its session; returns their number."""
+        with self._committer.committing, self._lock:
+            voxels = self._store.totals(agent_id).voxels
+            self._mission.members.forget_elsewhere(agent_id)
+            self._mission.agents.remove(agent_id)
+            return voxels
+
+    @property
+    def moved_agents(self) -> tuple[str, ...]:
+        """The agents whose frame is not the fused map's, or that are quarantined."""
+        alignments = self._mission.alignments
+        return tuple(sorted(alignments.quarantined | alignments.transforms().keys()))
+
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
         with self._lock:
@@ -207,7 +246,7 @@ class FusionEngine:
         InvalidInputError, QuotaError, StorageError, UnavailableError; see UpdateCommitter for what is stored then.
         """
         agent_id = self.session(session_id).agent_id
-        self._require_own(agent_id, subset.agent_id, grid)
+        require_own(agent_id, subset.agent_id, grid, self.grid)
         stored = StoredSubset.exact(subset)
         stored = replace(stored, voxels=stored.voxels.with_computed_sums())
         future = self._enqueue(PendingUpdate(session_id, agent_id, stored))
@@ -221,6 +260,10 @@ class FusionEngine:
         The message is decoded when it is its agent's turn. Raises UnavailableError.
         """
         return self._enqueue(PendingUpdate(session.session_id, session.agent_id, message))
+
+    def enqueue_part(self, session_id: str, part: StoredSubset) -> Future[PutOutcome]:
+        """Queue a decoded message, or the part of one that is this server's, as `enqueue_update` does."""
+        return self._enqueue(PendingUpdate(session_id, part.agent_id, part))
 
     def _enqueue(self, update: PendingUpdate) -> Future[PutOutcome]:
         put = self._committer.add(update)
@@ -291,6 +334,10 @@ class FusionEngine:
         with self._lock:
             reports, frames = self._mission.objects.reports(), self._mission.alignments.transforms()
         return find_objects(self._merged_objects.of(reports, frames), noun)
+
+    def query_stored_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
+        """Return the same of the reports as they are in the store, whichever server has written them."""
+        return find_objects(self._merged_objects.of(TeamObjects(self._store).reports(), {}), noun)
 
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.
@@ -379,16 +426,7 @@ class FusionEngine:
         """Return the message as it is stored, with computed sums. Raises GaussLiteError."""
         if not isinstance(update.message, bytes):
             return update.message
-        subset, grid = decode_stored(update.message)
-        self._require_own(update.agent_id, subset.agent_id, grid)
-        return subset
-
-    def _require_own(self, agent_id: str, named: str, grid: VoxelGrid) -> None:
-        """Raise NotPermittedError for another agent's name, MismatchError for another grid."""
-        if named != agent_id:
-            raise NotPermittedError(f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(named)}")
-        if grid != self.grid:
-            raise MismatchError(f"voxel size: this mission votes on {self.grid.size_m:g} m, got {grid.size_m:g} m")
+        return decode_own(update.message, update.agent_id, self.grid)
 
     def _check_update(self, update: PendingUpdate) -> None:
         """Raise GaussLiteError for a message that may not be stored; only its first part is checked."""

@@ -19,7 +19,7 @@ from gausslite.domain.errors import (
 )
 from gausslite.fusion.agent_data import is_earlier_map
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord, reconcile
+from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord, SharedRows, reconcile
 
 RECORD = "ban"
 _BANNED = b"banned"
@@ -66,11 +66,19 @@ class SessionRegistry:
     """Opens, finds and ends sessions; they persist with the store. Not thread-safe; FusionEngine holds a lock.
 
     A lease lasts `lease_s` after the session's last use; clock_s: the time in seconds. Only a join with the token of
-    the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256.
+    the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256. others: finds
+    the sessions that other servers of the store have opened; their leases are kept there.
     """
 
-    def __init__(self, store: FusionStore, lease_s: float, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._store, self._lease_s, self._clock_s = store, lease_s, clock_s
+    def __init__(
+        self,
+        store: FusionStore,
+        lease_s: float,
+        clock_s: Callable[[], float] = time.monotonic,
+        others: SharedRows | None = None,
+    ) -> None:
+        self._store, self._lease_s, self._clock_s, self._others = store, lease_s, clock_s, others
+        self._elsewhere: dict[str, SessionRecord] = {}
         self._sessions = {session.session_id: session for session in store.sessions()}
         # in the order of the agents' first sessions; after a restart, each robot has a whole lease to come back
         self._lease_ends_s = {session.agent_id: clock_s() + lease_s for session in self._sessions.values()}
@@ -130,7 +138,18 @@ class SessionRegistry:
             error = NameInUseError(f"session: {_NAME_TAKEN}")
             error.retry_after_s = self._lease_s
             raise error
-        raise SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
+        elsewhere = self._elsewhere.get(session_id)
+        if elsewhere is None and self._others is not None:
+            elsewhere = self._others.find_session(session_id)
+        if elsewhere is None:
+            raise SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
+        self._elsewhere[session_id] = elsewhere
+        return elsewhere
+
+    def forget_elsewhere(self, agent_id: str) -> None:
+        """Ask the store again for the session of an agent that another server has opened."""
+        for session_id in [key for key, session in self._elsewhere.items() if session.agent_id == agent_id]:
+            del self._elsewhere[session_id]
 
     def end(self, session_id: str) -> None:
         """End a session and its lease. Raises SessionUnknownError, MismatchError, NameInUseError, StorageError."""
@@ -190,11 +209,11 @@ class Membership:
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
-    def __init__(self, store: FusionStore, settings: FusionSettings) -> None:
+    def __init__(self, store: FusionStore, settings: FusionSettings, others: SharedRows | None = None) -> None:
         self._store, self._settings = store, settings
         own = settings.mission_config
         self._mission_config = reconcile(store.mission_config() or own, own)
-        self._sessions = SessionRegistry(store, settings.lease_s)
+        self._sessions = SessionRegistry(store, settings.lease_s, others=others)
         self._bans = BanList(store)
 
     @property
@@ -252,6 +271,10 @@ class Membership:
     def end_session(self, session_id: str) -> None:
         """End a session, see SessionRegistry.end."""
         self._sessions.end(session_id)
+
+    def forget_elsewhere(self, agent_id: str) -> None:
+        """Forget the agent's session of another server, see SessionRegistry."""
+        self._sessions.forget_elsewhere(agent_id)
 
     def require_evictable(self, agent_id: str, ban: bool) -> None:
         """Raise InvalidInputError for an unknown agent, or with `ban` for a name that no agent can have."""

@@ -15,7 +15,7 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import TeamObjects
-from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store import FusionStore, SharedRows
 from gausslite.fusion.traffic import TrafficLog
 from gausslite.fusion.updates import UpdateChecks
 from gausslite.fusion.vote_input import VoteInput
@@ -45,17 +45,22 @@ class MissionData:
         first_revision: int,
         decode: FrameDecoder,
         fit: Fit,
+        others: SharedRows | None = None,
     ) -> MissionData:
-        """Read the data. Raises MismatchError, CodecError for damaged records, StorageError."""
+        """Read the data; others: of the servers that share the store.
+
+        Raises MismatchError, CodecError for damaged records, StorageError.
+        """
         grid, quotas = settings.grid, settings.quotas
-        members = Membership(store, settings)
+        members = Membership(store, settings, others)
         keyframes = KeyframePool(store, quotas.keyframe_limits, decode)
-        objects, checks = TeamObjects(store), UpdateChecks(store, quotas, MissionClock(store))
+        objects, checks = TeamObjects(store), UpdateChecks(store, quotas, MissionClock(store), others)
         traffic = TrafficLog(store)
         alignments = FrameAlignments(store)
         votes = VoteInput(store, alignments, grid)
         aligner = FrameAligner(store, alignments, lock, grid, settings.alignment, fit)
-        refined = load_refinement(store)
+        # a refinement is of the whole map
+        refined = load_refinement(store) if others is None else None
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
         of_agents = members, checks, traffic, keyframes, objects
         return cls(

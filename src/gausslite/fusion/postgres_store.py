@@ -1,22 +1,28 @@
-"""The store of voxel updates in a PostgreSQL database: acknowledged updates are committed there."""
+"""The store of voxel updates in a PostgreSQL database: acknowledged updates are committed there.
+
+Rows are kept by slot (`regions.py`). One server uses all slots alone, or several servers some each (SharedSlots of
+`postgres_regions.py`). Each statement on updates addresses one slot, so that a distributed PostgreSQL can spread them.
+"""
 
 from __future__ import annotations
 
+import itertools
 import secrets
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from threading import RLock
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import psycopg
 from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.errors import StorageError
+from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
+from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots, slots_of
 from gausslite.fusion.store import (
     AgentTotals,
     MissionConfig,
@@ -27,16 +33,19 @@ from gausslite.fusion.store import (
     require_storable,
 )
 from gausslite.fusion.store_migration import rows_of_voxels
-from gausslite.fusion.store_rows import Places, UpdateLog, data_checksum, read_batches, require_intact
+from gausslite.fusion.store_rows import SLOT_BITS, Places, UpdateLog, data_checksum, read_batches, require_intact
+from gausslite.fusion.traffic import PROBE_RECORD, TRAFFIC_RECORD
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _VOXEL_ROWS_VERSION = 1
 """Had one row a voxel; such a database is converted when a server opens it."""
-_LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
+LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
 _UPDATES_SCHEMA = """
 CREATE TABLE gausslite.voxel_updates (
-    number BIGINT PRIMARY KEY, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL, voxels BYTEA NOT NULL);
+    slot SMALLINT NOT NULL, number BIGINT NOT NULL, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL,
+    voxels BYTEA NOT NULL, PRIMARY KEY (slot, number));
 ALTER TABLE gausslite.voxel_updates ALTER COLUMN voxels SET STORAGE EXTERNAL;
+CREATE TABLE IF NOT EXISTS gausslite.servers (pid INTEGER PRIMARY KEY, address TEXT NOT NULL);
 """
 _SCHEMA = """
 CREATE SCHEMA gausslite;
@@ -53,13 +62,15 @@ CREATE TABLE gausslite.mission_config (
     mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m DOUBLE PRECISION NOT NULL);
 ALTER TABLE gausslite.keyframes ALTER COLUMN data SET STORAGE EXTERNAL;
 """
-# one statement a transaction, with its rows as arrays: a statement a row takes 1.5 to 2 times as long
+# one statement a slot, with its rows as arrays: a statement a row takes 1.5 to 2 times as long
 _INSERT = """
-INSERT INTO gausslite.voxel_updates SELECT * FROM unnest(%s::bigint[], %s::text[], %s::bigint[], %b::bytea[])
+INSERT INTO gausslite.voxel_updates
+SELECT %s::smallint, * FROM unnest(%s::bigint[], %s::text[], %s::bigint[], %b::bytea[])
 """
-_DELETE = "DELETE FROM gausslite.voxel_updates WHERE number = ANY(%s::bigint[])"
-_SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM gausslite.voxel_updates"
-_SELECT_ROWS = f"{_SELECT_UPDATES} WHERE number = ANY(%s::bigint[])"
+_DELETE = "DELETE FROM gausslite.voxel_updates WHERE slot = %s::smallint AND number = ANY(%s::bigint[])"
+_SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM gausslite.voxel_updates WHERE"
+_SELECT_ROWS = f"{_SELECT_UPDATES} slot = %s::smallint AND number = ANY(%s::bigint[])"
+_OF_SERVER = (TRAFFIC_RECORD, PROBE_RECORD)
 _SET_PROPERTY = """
 INSERT INTO gausslite.properties VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SET value = excluded.value
 """
@@ -67,25 +78,41 @@ INSERT INTO gausslite.properties VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SE
 _SELECT_TIMELINE = "SELECT substr(pg_walfile_name(pg_current_wal_lsn()), 1, 8)"
 
 
-class PostgresStore:
-    """A FusionStore in the schema `gausslite` of a database: one transaction per call, one server at a time.
+@runtime_checkable
+class SlotHolder(Protocol):
+    """Holds the locks of the slots that this server owns, by a connection that also writes their rows."""
 
-    An advisory lock, which ends with the connection, keeps other servers out. The totals of all updates are in memory
-    (ScoreIndex). Reads use a second connection and so do not wait for a commit. A lost connection is opened again,
-    with the lock, if nobody else has written and no commit is missing. The constructor reads and checks every row.
+    def write(self, work: Callable[[Database], object]) -> None:
+        """Do the work in one transaction. Raises StorageError, UnavailableError if the locks have been lost."""
+        ...
+
+
+class PostgresStore:
+    """A FusionStore in the schema `gausslite` of a database: one transaction per call.
+
+    Without `owned`, for one server: an advisory lock, which ends with the connection, keeps other servers out. With
+    it, the store has the updates of these slots alone; a message with other voxels raises UnavailableError. Other
+    servers may change the records, sessions and keyframes; only an agent's home deletes them.
+
+    The totals of all updates are in memory (ScoreIndex). Reads use a second connection and so do not wait for a
+    commit. A lost connection is opened again, with the lock, if nobody else has written and no commit is missing. The
+    constructor reads and checks every row.
     It raises InvalidInputError for an address that cannot be read, StorageError if the database cannot be reached, is
     in use by another server, is damaged, or has another schema.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, owned: OwnedSlots | None = None, holder: SlotHolder | None = None) -> None:
+        """holder: of the locks of the `owned` slots."""
         self._name = database_name(url)
+        self._owned, self._holder = owned, holder
         self._write_lock, self._index_lock = RLock(), RLock()
-        self._log = UpdateLog()
+        self._log = UpdateLog(slots_of)
         # identify the content of the database: this opening, and the number of transactions since
         self._opening, self._commits = "", 0
         with ExitStack() as opened:
-            self._writer = PostgresConnection(url, self._take_over)
-            opened.callback(self._writer.close)
+            if holder is None:
+                self._writer = PostgresConnection(url, self._take_over)
+                opened.callback(self._writer.close)
             self._reader = PostgresConnection(url, lambda _: None)
             opened.callback(self._reader.close)
             self._reader.run(self._load)
@@ -104,27 +131,34 @@ class PostgresStore:
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
         for update in updates:
             require_storable(update)
+            self.require_owned(update.voxels.keys)
         with self._write_lock:
             change = self._log.plan(updates, self._read_rows)
             if change.rows:
-                columns = list(map(list, zip(*change.rows, strict=True)))
 
                 def write(db: Database) -> None:
-                    if change.deleted:
-                        db.execute(_DELETE, (change.deleted,))
-                    db.execute(_INSERT, columns)
+                    for slot, numbers in _by_slot(change.deleted):
+                        db.execute(_DELETE, (slot, numbers))
+                    for slot, rows in itertools.groupby(sorted(change.rows), key=lambda row: row[0] >> SLOT_BITS):
+                        db.execute(_INSERT, (slot, *map(list, zip(*rows, strict=True))))
 
                 self._write(write)
                 with self._index_lock:
                     self._log.apply(change)
         return change.outcomes
 
+    def require_owned(self, keys: Int64[ndarray, " n"]) -> None:
+        """Raise UnavailableError for voxels of slots that this server does not own."""
+        if self._owned is not None and not self._owned.have(keys):
+            raise UnavailableError(f"server {self._owned.server}: some voxels belong to another server now")
+
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
 
         def delete(db: Database) -> None:
-            db.execute(_DELETE, (self._log.rows_of(agent_id),))
-            for table in ("keyframes", "records"):
+            for slot, numbers in _by_slot(self._log.rows_of(agent_id)):
+                db.execute(_DELETE, (slot, numbers))
+            for table in ("keyframes", "records") if self._owned is None or self._owned.is_home(agent_id) else ():
                 db.execute(f"DELETE FROM gausslite.{table} WHERE agent_id = %s", (agent_id,))  # noqa: S608 - constants
 
         with self._write_lock:
@@ -175,9 +209,15 @@ class PostgresStore:
         self._write_row("mission_config", "number", ("mission_id", "world_frame", "voxel_size_m"), (1, *values))
 
     def sessions(self) -> tuple[SessionRecord, ...]:
-        """Return all open sessions, sorted by session id."""
+        """Return the open sessions, sorted by session id; with owned slots, of the agents whose home is here."""
         rows = self._read("SELECT session_id, agent_id FROM gausslite.sessions")
-        return tuple(sorted((SessionRecord(*row) for row in rows), key=lambda session: session.session_id))
+        sessions = (SessionRecord(*row) for row in rows if self._owned is None or self._owned.is_home(row[1]))
+        return tuple(sorted(sessions, key=lambda session: session.session_id))
+
+    def find_session(self, session_id: str) -> SessionRecord | None:
+        """Return the open session of this id, whoever opened it."""
+        query = "SELECT session_id, agent_id FROM gausslite.sessions WHERE session_id = %s"
+        return next((SessionRecord(*row) for row in self._read(query, (session_id,))), None)
 
     def save_session(self, session: SessionRecord) -> None:
         """Store a session; it replaces any other session of the same agent."""
@@ -217,8 +257,18 @@ class PostgresStore:
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
         """Store a named record of an agent; it replaces the earlier one."""
+        agent_id = self._record_owner(agent_id, name)
         row = name, agent_id, data_checksum(agent_id, name, data), data
         self._write_row("records", "name, agent_id", ("checksum", "data"), row)
+
+    def find_record(self, agent_id: str, name: str) -> bytes:
+        """Return a named record of an agent; empty if it does not exist. Raises StorageError for a damaged one."""
+        query = "SELECT data, checksum FROM gausslite.records WHERE name = %s AND agent_id = %s"
+        for data, checksum in self._read(query, (name, agent_id)):
+            if data_checksum(agent_id, name, data) != checksum:
+                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
+            return bytes(data)
+        return b""
 
     def records(self, name: str) -> dict[str, bytes]:
         """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
@@ -226,10 +276,13 @@ class PostgresStore:
         for agent_id, data, checksum in rows:
             if data_checksum(agent_id, name, data) != checksum:
                 raise self._damaged(f"record {name!r} of agent {agent_id!r}")
-        return {agent_id: data for agent_id, data, _ in rows}
+        found, own = {agent_id: data for agent_id, data, _ in rows}, self._record_owner("", name)
+        if own:
+            found = {"": found[own]} if own in found else {}
+        return found
 
     def close(self) -> None:
-        """Close the connections, which frees the database for another server."""
+        """Close the own connections; without owned slots, this frees the database for another server."""
         with self._write_lock:
             self._opened.close()
 
@@ -239,18 +292,15 @@ class PostgresStore:
             with db.transaction():
                 # the connection of a server that was killed may take a moment to end
                 db.execute("SET LOCAL lock_timeout = '2s'")
-                db.execute("SELECT pg_advisory_lock(%s)", (_LOCK,))
+                db.execute("SELECT pg_advisory_lock(%s)", (LOCK,))
         except psycopg.errors.LockNotAvailable as error:
-            text = f"store {self._name}: in use by another server; give each its own database"
-            raise StorageError(text) from error
+            raise in_use(self._name) from error
         if self._opening:
             self._require_unchanged(db)
         else:
             with db.transaction():
-                self._create_or_check(db)
-                opening = secrets.token_hex(16)
-                db.execute(_SET_PROPERTY, ("position", _position(opening, 0)))
-            self._opening = opening
+                create_or_check(db, self._name)
+                self._opening = begin_opening(db)
 
     def _require_unchanged(self, db: Database) -> None:
         """Raise StorageError unless the database has the transactions of this server, and no other ones."""
@@ -263,37 +313,11 @@ class PostgresStore:
                 f"store {self._name}: changed by another server, or acknowledged data is missing; restart this server"
             )
 
-    def _create_or_check(self, db: Database) -> None:
-        if db.execute("SELECT to_regclass('gausslite.properties')").fetchone() == (None,):
-            db.execute(_SCHEMA)
-            db.execute(_UPDATES_SCHEMA)
-            db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
-            db.execute(_SET_PROPERTY, ("incarnation_id", secrets.token_hex(16)))
-        if _property(db, "schema_version") == str(_VOXEL_ROWS_VERSION):
-            self._convert(db)
-        version = _property(db, "schema_version")
-        if version != str(SCHEMA_VERSION):
-            raise StorageError(
-                f"store {self._name}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use "
-                "that release, or another database, and the agents send their updates again"
-            )
-
-    def _convert(self, db: Database) -> None:
-        """Write the rows of a database with one row a voxel as those of this version."""
-        db.execute("ALTER TABLE gausslite.voxel_updates RENAME TO voxel_rows")
-        db.execute("ALTER INDEX gausslite.voxel_updates_pkey RENAME TO voxel_rows_pkey")
-        db.execute(_UPDATES_SCHEMA)
-        with db.cursor("convert", binary=True) as cursor:
-            cursor.execute('SELECT * FROM gausslite.voxel_rows ORDER BY agent_id COLLATE "C", voxel')
-            for row in rows_of_voxels(cursor, self._damaged):
-                db.execute("INSERT INTO gausslite.voxel_updates VALUES (%s, %s, %s, %s)", row)
-        db.execute("DROP TABLE gausslite.voxel_rows")
-        db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
-
     def _load(self, db: Database) -> None:
         """Check every row of updates and fill the index; read the id of the content."""
         with db.transaction(), db.cursor("load", binary=True) as cursor:
-            cursor.execute(f"{_SELECT_UPDATES} ORDER BY number")
+            slots = sorted(ALL_SLOTS if self._owned is None else self._owned.slots)
+            cursor.execute(f"{_SELECT_UPDATES} slot = ANY(%s::smallint[]) ORDER BY slot, number", (slots,))
             self._log.load(require_intact(cursor, self._damaged))
         timeline = db.execute(_SELECT_TIMELINE).fetchone()
         self._incarnation_id = f"{_property(db, 'incarnation_id')}-{'' if timeline is None else timeline[0]}"
@@ -308,20 +332,25 @@ class PostgresStore:
         return read_batches(locate, self._read_rows)
 
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
-        rows = self._read(_SELECT_ROWS, (numbers,))
+        rows = itertools.chain.from_iterable(self._read(_SELECT_ROWS, part) for part in _by_slot(numbers))
         return {row[0]: row[3] for row in require_intact(rows, self._damaged)}
 
+    def _record_owner(self, agent_id: str, name: str) -> str:
+        """Return under which name a record is kept: each server that shares the store has its own figures."""
+        # no agent's name begins with @
+        return f"@{self._owned.server}" if self._owned is not None and name in _OF_SERVER else agent_id
+
     def _damaged(self, what: str) -> StorageError:
-        return StorageError(
-            f"store {self._name}: {what} is damaged (its checksum does not match); restore a backup of the database, "
-            "or delete the row, and the agents send again what is missing"
-        )
+        return _damaged(self._name, what)
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         return self._reader.run(lambda db: db.execute(query, values, binary=True).fetchall())
 
     def _write(self, work: Callable[[Database], object]) -> None:
         """Do the work in one transaction, without waiting for the answer to each statement. Raises StorageError."""
+        if self._holder is not None:
+            self._holder.write(work)
+            return
 
         def commit(db: Database) -> None:
             with db.pipeline(), db.transaction():
@@ -349,3 +378,62 @@ def _position(opening: str, commits: int) -> str:
 def _property(db: Database, name: str) -> str | None:
     row = db.execute("SELECT value FROM gausslite.properties WHERE name = %s", (name,)).fetchone()
     return None if row is None else str(row[0])
+
+
+def in_use(name: str) -> StorageError:
+    """Return the error of a server that cannot have the database."""
+    return StorageError(
+        f"store {name}: in use by another server; give each its own database, or share it: set peer-address of both"
+    )
+
+
+def begin_opening(db: Database) -> str:
+    """Record that another opening of the database begins, so that earlier ones no longer write; returns its id."""
+    opening = secrets.token_hex(16)
+    db.execute(_SET_PROPERTY, ("position", _position(opening, 0)))
+    return opening
+
+
+def create_or_check(db: Database, name: str) -> None:
+    """Create the tables, or convert those of an earlier release. Raises StorageError for other ones."""
+    if db.execute("SELECT to_regclass('gausslite.properties')").fetchone() == (None,):
+        db.execute(_SCHEMA)
+        db.execute(_UPDATES_SCHEMA)
+        db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
+        db.execute(_SET_PROPERTY, ("incarnation_id", secrets.token_hex(16)))
+    if _property(db, "schema_version") == str(_VOXEL_ROWS_VERSION):
+        _convert(db, name)
+    version = _property(db, "schema_version")
+    if version != str(SCHEMA_VERSION):
+        raise StorageError(
+            f"store {name}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use that "
+            "release, or another database, and the agents send their updates again"
+        )
+
+
+def _convert(db: Database, name: str) -> None:
+    """Write the rows of a database with one row a voxel as those of this version."""
+    db.execute("ALTER TABLE gausslite.voxel_updates RENAME TO voxel_rows")
+    db.execute("ALTER INDEX gausslite.voxel_updates_pkey RENAME TO voxel_rows_pkey")
+    db.execute(_UPDATES_SCHEMA)
+    with db.cursor("convert", binary=True) as cursor:
+        cursor.execute('SELECT * FROM gausslite.voxel_rows ORDER BY agent_id COLLATE "C", voxel')
+        for number, *row in rows_of_voxels(cursor, lambda what: _damaged(name, what), slots_of):
+            db.execute(
+                "INSERT INTO gausslite.voxel_updates VALUES (%s, %s, %s, %s, %s)", (number >> SLOT_BITS, number, *row)
+            )
+    db.execute("DROP TABLE gausslite.voxel_rows")
+    db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
+
+
+def _damaged(name: str, what: str) -> StorageError:
+    return StorageError(
+        f"store {name}: {what} is damaged (its checksum does not match); restore a backup of the database, or delete "
+        "the row, and the agents send again what is missing"
+    )
+
+
+def _by_slot(numbers: Iterable[int]) -> Iterator[tuple[int, list[int]]]:
+    """Yield each slot with the numbers of its rows."""
+    for slot, own in itertools.groupby(sorted(numbers), key=lambda number: number >> SLOT_BITS):
+        yield slot, list(own)

@@ -245,6 +245,19 @@ class FusionStore(Protocol):
         ...
 
 
+@runtime_checkable
+class SharedRows(Protocol):
+    """What several servers of one store know of an agent, whichever of them wrote it."""
+
+    def find_session(self, session_id: str) -> SessionRecord | None:
+        """Return the open session of this id. Raises StorageError."""
+        ...
+
+    def find_record(self, agent_id: str, name: str) -> bytes:
+        """Return a named record of an agent; empty if it does not exist. Raises StorageError."""
+        ...
+
+
 def require_storable(update: StoredSubset) -> None:
     """Raise InvalidInputError if a number of the message does not fit the store's signed 64-bit columns."""
     largest_sum = int(update.voxels.voxels["kappa_sums"].max(initial=0))

@@ -18,7 +18,7 @@ from gausslite.codec.stored import RECORD
 from gausslite.codec.stored_voxels import CODES, StoredVoxels, voxel_table
 from gausslite.domain.errors import StorageError
 from gausslite.domain.voxels import tile_of
-from gausslite.fusion.store_rows import SEGMENT_BITS, UpdateRow, row_checksum
+from gausslite.fusion.store_rows import SEGMENT_BITS, SLOT_BITS, SlotsOf, UpdateRow, row_checksum
 
 OldRow = tuple[str, int, int, int, int, int, bytes]
 """agent_id, voxel, update_seq, Σkappa, count, checksum, Gaussians."""
@@ -27,7 +27,9 @@ _SIZE, _HEADER = struct.Struct("<d"), struct.Struct("<qqqq")
 _SEGMENT_ROWS = 64
 
 
-def rows_of_voxels(old: Iterable[OldRow], damaged: Callable[[str], StorageError]) -> Iterator[UpdateRow]:
+def rows_of_voxels(
+    old: Iterable[OldRow], damaged: Callable[[str], StorageError], slots_of: SlotsOf = np.zeros_like
+) -> Iterator[UpdateRow]:
     """Yield the new rows; the old ones are sorted by agent and voxel. Raises what `damaged` makes of a damaged one."""
     groups = itertools.groupby(old, key=lambda row: (row[0], tile_of(row[1]), _size_m(row)))
     for count, ((agent_id, _, size_m), rows) in enumerate(groups):
@@ -36,6 +38,7 @@ def rows_of_voxels(old: Iterable[OldRow], damaged: Callable[[str], StorageError]
         for row in own:
             _require_intact(row, damaged)
         _, keys, seqs, sums, counts, _, data = zip(*own, strict=True)
+        number += int(slots_of(np.array(keys[:1], np.int64))[0]) << SLOT_BITS
         table = voxel_table(np.array(keys), np.array(seqs), np.array(sums, np.uint64), np.array(counts, np.uint32))
         voxels = StoredVoxels(table, _gaussians(data, size_m), size_m).to_row()
         yield number, agent_id, row_checksum(number, agent_id, voxels), voxels

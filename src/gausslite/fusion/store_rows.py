@@ -34,6 +34,10 @@ Places = tuple[Int64[ndarray, " _"], Int64[ndarray, " _"]]
 """Ascending keys of voxels, and the row of each."""
 SEGMENT_BITS = 16
 """The other bits of a row's number name its segment."""
+SLOT_BITS = 48
+"""The bits from here on are the slot of the row's voxels; a segment has rows of one slot."""
+SlotsOf = Callable[[Int64[ndarray, " n"]], Int64[ndarray, " n"]]
+"""Returns the slot of each voxel; those of a tile have the same."""
 _SEGMENT_UNITS = 1 << 14
 """About 350 kB of Gaussians."""
 _SPARE_SEGMENTS = 4
@@ -66,15 +70,17 @@ class LogChange:
 class UpdateLog:
     """Owns the index of the rows. Not thread-safe: one thread plans and applies, readers of the index hold its lock."""
 
-    def __init__(self) -> None:
+    def __init__(self, slots_of: SlotsOf = np.zeros_like) -> None:
         self.index = ScoreIndex()
+        self._slots_of = slots_of
         self._segments: dict[int, _Segment] = {}
         # (agent, size) of every row, those of emptied segments included
         self._rows: dict[int, tuple[str, int]] = {}
         # deleted by the next transaction
         self._outdated: list[int] = []
         self._total = self._used = 0
-        self._last_number, self._filled = 0, 0
+        # of each slot: the last row's number, and the size of its segment
+        self._last: dict[int, tuple[int, int]] = {}
 
     def load(self, rows: Iterable[UpdateRow]) -> None:
         """Read all rows of a store; they are intact."""
@@ -90,8 +96,8 @@ class UpdateLog:
             keys = table["keys"][order]
             latest = order[np.append(keys[1:] != keys[:-1], True)[: len(keys)]]
             self._put([(agent_id, *_scores(table[latest], numbers[latest]))])
-        # a number beyond all others, in a segment of its own
-        self._last_number, self._filled = max(self._rows, default=0), _SEGMENT_UNITS
+        # numbers beyond all others, in segments of their own
+        self._last = {number >> SLOT_BITS: (number, _SEGMENT_UNITS) for number in sorted(self._rows)}
 
     def plan(self, updates: Sequence[StoredSubset], read: ReadRows) -> LogChange:
         """Return how to store messages of different agents, each completely. Raises StorageError."""
@@ -153,9 +159,10 @@ class UpdateLog:
         if not parts:
             return
         numbers = []
-        for part in parts:
+        slots = self._slots_of(np.array([part.voxels["keys"][0] for part in parts], np.int64)).tolist()
+        for slot, part in zip(slots, parts, strict=True):
             size, data = _size(part), part.to_row()
-            numbers.append(self._next_number(size))
+            numbers.append(self._next_number(slot, size))
             change.rows.append((numbers[-1], agent_id, row_checksum(numbers[-1], agent_id, data), data))
             change.sizes.append(size)
         table = join_elements([part.voxels for part in parts])
@@ -165,9 +172,9 @@ class UpdateLog:
     def _empty_segments(self, change: LogChange, read: ReadRows) -> None:
         """Move the voxels in use out of the segments with the smallest part in use, while too much is outdated."""
         total, used = self._total, self._used
-        current = self._last_number >> SEGMENT_BITS
+        current = {number >> SEGMENT_BITS for number, _ in self._last.values()}
         while total - used > max(used, _SPARE_SEGMENTS * _SEGMENT_UNITS):
-            others = (name for name in self._segments if name not in change.emptied and name != current)
+            others = (name for name in self._segments if name not in change.emptied and name not in current)
             name = min(others, key=lambda name: self._segments[name].used / self._segments[name].total, default=None)
             if name is None:
                 return
@@ -188,12 +195,13 @@ class UpdateLog:
             voxels = StoredVoxels.concatenate(own)
             self._add(change, agent_id, voxels.take(np.argsort(voxels.keys)))
 
-    def _next_number(self, size: int) -> int:
-        self._last_number += 1
-        if self._filled >= _SEGMENT_UNITS:
-            self._last_number, self._filled = ((self._last_number >> SEGMENT_BITS) + 1) << SEGMENT_BITS, 0
-        self._filled += size
-        return self._last_number
+    def _next_number(self, slot: int, size: int) -> int:
+        number, filled = self._last.get(slot, (slot << SLOT_BITS, 0))
+        number += 1
+        if filled >= _SEGMENT_UNITS:
+            number, filled = ((number >> SEGMENT_BITS) + 1) << SEGMENT_BITS, 0
+        self._last[slot] = number, filled + size
+        return number
 
     def _add_row(self, number: int, agent_id: str, size: int) -> None:
         segment = self._segments.setdefault(number >> SEGMENT_BITS, _Segment())

@@ -17,11 +17,19 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.codec.subset_codec import declared_bytes
+from gausslite.codec.subset_codec import declared_bytes, decode_stored
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
+from gausslite.domain.errors import (
+    GaussLiteError,
+    InvalidInputError,
+    MismatchError,
+    NotPermittedError,
+    QuotaError,
+    UnavailableError,
+)
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import Quotas
-from gausslite.fusion.store import FusionStore, PutOutcome
+from gausslite.fusion.store import FusionStore, PutOutcome, SharedRows
 
 MAX_SEQ_STEP = 1 << 32
 """An honest agent counts its messages; a larger step would let one message use up all later numbers."""
@@ -29,14 +37,35 @@ RECORD = "first-joined"
 _JOINED = struct.Struct("<d")
 
 
+def decode_own(message: bytes, agent_id: str, grid: VoxelGrid) -> StoredSubset:
+    """Return an agent's encoded message as a store keeps it.
+
+    Raises CodecError, ChecksumError, NotPermittedError (another agent's name), MismatchError (another grid).
+    """
+    subset, own_grid = decode_stored(message)
+    require_own(agent_id, subset.agent_id, own_grid, grid)
+    return subset
+
+
+def require_own(agent_id: str, named: str, grid: VoxelGrid, expected: VoxelGrid) -> None:
+    """Raise NotPermittedError for another agent's name, MismatchError for another grid."""
+    if named != agent_id:
+        raise NotPermittedError(f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(named)}")
+    if grid != expected:
+        raise MismatchError(f"voxel size: this mission votes on {expected.size_m:g} m, got {grid.size_m:g} m")
+
+
 class UpdateChecks:
     """Knows when each agent first joined. Not thread-safe; FusionEngine holds a lock.
 
-    The first joins persist with the store. clock_s: the mission's time in seconds.
+    The first joins persist with the store. clock_s: the mission's time in seconds. others: finds the first joins at
+    other servers of the store.
     """
 
-    def __init__(self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float]) -> None:
-        self._store, self._quotas, self._clock_s = store, quotas, clock_s
+    def __init__(
+        self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float], others: SharedRows | None = None
+    ) -> None:
+        self._store, self._quotas, self._clock_s, self._others = store, quotas, clock_s, others
         self._first_joined_s = {agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(RECORD).items()}
 
     def record_join(self, agent_id: str) -> None:
@@ -69,6 +98,9 @@ class UpdateChecks:
     def _kappa_bound(self, agent_id: str) -> int:
         """Return the largest plausible kappa: the iterations before the first join, and those since then."""
         now_s = self._clock_s()
+        if agent_id not in self._first_joined_s and self._others is not None:
+            stored = self._others.find_record(agent_id, RECORD)
+            self._first_joined_s[agent_id] = _JOINED.unpack(stored)[0] if stored else now_s
         elapsed_s = max(0.0, now_s - self._first_joined_s.get(agent_id, now_s))
         return self._quotas.kappa_at_join + int(self._quotas.kappa_per_second * elapsed_s)
 

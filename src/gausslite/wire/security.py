@@ -36,6 +36,7 @@ class Role(StrEnum):
     ROBOT = "robot"
     VIEWER = "viewer"
     OPERATOR = "operator"
+    SERVER = "server"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +75,8 @@ class Caller:
         return self.host if self.names is None else ", ".join(sorted(self.names))
 
     def require_agent(self, agent_id: str) -> None:
-        """Raise NotPermittedError if the caller has a certificate that does not name the agent."""
-        if self.names is not None and agent_id not in self.names:
+        """Raise NotPermittedError if the caller has a certificate that does not name the agent, and is no server."""
+        if self.names is not None and Role.SERVER not in self.roles and agent_id not in self.names:
             owner = ", ".join(sorted(self.names))[:200]
             raise NotPermittedError(
                 f"agent {quote_name(agent_id)}: expected a certificate that names it, got one for {owner!r}"
@@ -133,9 +134,16 @@ class RejectionLog:
             entry.count = 0
 
 
-_ANY = frozenset(Role)
+_ANY = frozenset({Role.ROBOT, Role.VIEWER, Role.OPERATOR})
 _ROBOT, _OPERATOR = frozenset({Role.ROBOT}), frozenset({Role.OPERATOR})
-_PARSER, _AGENT, _FUSION = (f"/gausslite.v1.{name}Service/" for name in ("Parser", "Agent", "Fusion"))
+_PARSER, _AGENT, _FUSION, _REGION = (
+    f"/gausslite.v1.{name}Service/" for name in ("Parser", "Agent", "Fusion", "Region")
+)
+_FOR_SERVERS = (
+    *("StoreParts", "BeginAgent", "RemoveAgent", "ReadVoxels", "WatchFusedMap", "GetSessionStatus", "GetUpdateDigests"),
+    *("JoinSession", "KeepSession", "LeaveSession", "ContributeKeyframes", "GetKeyframe", "ReportObjects"),
+    *("EvictAgent", "UnbanAgent"),
+)
 
 ROLES_OF_METHOD: Final = {
     _PARSER + "ParseTask": _ANY,
@@ -162,10 +170,13 @@ ROLES_OF_METHOD: Final = {
     _FUSION + "RefineFusedMap": _OPERATOR,
     _FUSION + "EvictAgent": _OPERATOR,
     _FUSION + "UnbanAgent": _OPERATOR,
+    **{_REGION + name: frozenset({Role.SERVER}) for name in _FOR_SERVERS},
 }
 """The caller's certificate must state one of these roles."""
 
-_LOCAL_WITHOUT_CERTIFICATES: Final = frozenset({_FUSION + "EvictAgent", _FUSION + "UnbanAgent"})
+_LOCAL_WITHOUT_CERTIFICATES: Final = frozenset(
+    {_FUSION + "EvictAgent", _FUSION + "UnbanAgent", *(_REGION + name for name in _FOR_SERVERS)}
+)
 """Without certificates, every caller may call the other methods; these need a caller on the server's machine."""
 
 
@@ -175,7 +186,8 @@ def require_role(method: str, caller: Caller) -> None:
     if caller.names is None:
         if method in _LOCAL_WITHOUT_CERTIFICATES and not caller.is_local:
             raise NotPermittedError(
-                f"{name}: expected a caller on the server's machine, or --tls-ca and an operator's certificate"
+                f"{name}: expected a caller on the server's machine, or --tls-ca and a certificate with the role "
+                f"{', '.join(sorted(ROLES_OF_METHOD[method]))}"
             )
         return
     permitted = ROLES_OF_METHOD.get(method, frozenset())
@@ -381,7 +393,7 @@ class CallUsage:
     """The open calls and the bandwidth of each caller. Use it on the event loop only.
 
     A caller is a certificate, or an address without one. Programs on the server's machine without a certificate are
-    not limited: many agents and watchers share that address.
+    not limited: many agents and watchers share that address. Nor are servers, which send what many agents sent.
     """
 
     limits: CallLimits
@@ -390,7 +402,7 @@ class CallUsage:
     @contextmanager
     def open_call(self, caller: Caller) -> Iterator[TokenBucket | None]:
         """Count a call while it is open; gives the caller's bandwidth, None without a limit. Raises RateLimitError."""
-        if caller.names is None and caller.is_local:
+        if (caller.names is None and caller.is_local) or Role.SERVER in caller.roles:
             yield None
             return
         self._forget_idle_callers()

@@ -90,7 +90,7 @@ def error_from_reason(reason: str, message: str) -> GaussLiteError:
 
 def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
     """Return the error that the server raised; an error of the transport gets the class of its code."""
-    if not isinstance(error, grpc.Call):
+    if not isinstance(error, grpc.Call | grpc.aio.AioRpcError):
         return errors.UnavailableError(f"{address}: {error}")
     code, text = error.code(), error.details() or "no details"
     reason, retry_after_s = _details(error)
@@ -113,7 +113,7 @@ def has_reason(error: grpc.Call) -> bool:
     return _details(error)[0] is not None
 
 
-def _details(error: grpc.Call) -> tuple[str | None, float | None]:
+def _details(error: Any) -> tuple[str | None, float | None]:
     """Return the ErrorInfo's reason and the RetryInfo's time in seconds; None for what the status does not have."""
     try:
         status = rpc_status.from_call(error)

@@ -1,0 +1,151 @@
+"""Decode the messages that this server accepts, in a fair order, and send the parts to the owners of their voxels."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.domain.errors import GaussLiteError, UnavailableError
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.store import SessionRecord
+from gausslite.fusion.traffic import Acknowledgements
+from gausslite.fusion.updates import PendingUpdate, UpdateQueue, decode_own
+from gausslite_fusion_server.contributions import StoredCount
+from gausslite_fusion_server.peers import Peers
+from gausslite_fusion_server.region_host import WAIT_S, RegionHost
+from gausslite_fusion_server.region_servicer import RegionServicer
+
+_GROUP_BYTES = 2 << 20
+_RETRY_S = 0.05
+
+
+class PartSender:
+    """Owns the queue of received messages. Use it on the event loop; one thread decodes.
+
+    A message is decoded to the codes of its Gaussians, once, by the server that received it. If some parts are stored
+    and another one is refused, the stored ones stay, as with the slices of UpdateCommitter.
+    """
+
+    def __init__(self, host: RegionHost, regions: RegionServicer, peers: Peers, grid: VoxelGrid) -> None:
+        self._host, self._regions, self._peers, self._grid = host, regions, peers, grid
+        self._queue = UpdateQueue()
+        self._decoder = ThreadPoolExecutor(1, "decode")
+        self._decoded: dict[PendingUpdate, asyncio.Future[StoredSubset]] = {}
+        self._is_decoding = False
+        self._highest: dict[str, tuple[str, int]] = {}
+        self.received = self.sent = 0
+        """Messages accepted from agents, and parts sent to other servers."""
+        self.acknowledgements = Acknowledgements()
+
+    async def store(self, session: SessionRecord, message: bytes) -> StoredCount:
+        """Return when every owner has its part of the message. Raises GaussLiteError to refuse it."""
+        answered: Future[Any] = Future()
+        self.acknowledgements.add(answered)
+        try:
+            subset = await self._decode(session, message)
+            self.received += 1
+            stored = await self._store(session.session_id, subset)
+        finally:
+            answered.set_result(None)
+        highest = self.highest_acknowledged(session)
+        if highest is not None:
+            self.note_acknowledged(session, max(highest, subset.update_seq))
+        return stored
+
+    def highest_acknowledged(self, session: SessionRecord) -> int | None:
+        """Return the highest update_seq that is known to be stored in a session; None if it was never asked for."""
+        session_id, highest = self._highest.get(session.agent_id, ("", 0))
+        return highest if session_id == session.session_id else None
+
+    def note_acknowledged(self, session: SessionRecord, update_seq: int) -> None:
+        """Record the highest update_seq of a session."""
+        self._highest[session.agent_id] = session.session_id, update_seq
+
+    def close(self) -> None:
+        """Wait until the thread has ended."""
+        self._decoder.shutdown(wait=True)
+
+    async def _decode(self, session: SessionRecord, message: bytes) -> StoredSubset:
+        update = PendingUpdate(session.session_id, session.agent_id, message)
+        self._queue.add(update)
+        decoded = self._decoded[update] = asyncio.get_running_loop().create_future()
+        if not self._is_decoding:
+            self._is_decoding = True
+            self._decoder.submit(self._decode_waiting, asyncio.get_running_loop())
+        return await decoded
+
+    def _decode_waiting(self, loop: asyncio.AbstractEventLoop) -> None:
+        while self._queue.has_waiting:
+            for update in self._queue.take(_GROUP_BYTES):
+                try:
+                    assert isinstance(update.message, bytes)
+                    subset = decode_own(update.message, update.agent_id, self._grid)
+                    loop.call_soon_threadsafe(self._end, update, _value(subset))
+                except GaussLiteError as error:
+                    loop.call_soon_threadsafe(self._end, update, _error(error))
+                finally:
+                    self._queue.put_back(update, is_done=True)
+        loop.call_soon_threadsafe(self._decode_again, loop)
+
+    def _decode_again(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._is_decoding = self._queue.has_waiting
+        if self._is_decoding:
+            self._decoder.submit(self._decode_waiting, loop)
+
+    def _end(self, update: PendingUpdate, end: Callable[[asyncio.Future[StoredSubset]], None]) -> None:
+        decoded = self._decoded.pop(update)
+        # the call may have been cancelled
+        if not decoded.done():
+            end(decoded)
+
+    async def _store(self, session_id: str, subset: StoredSubset) -> StoredCount:
+        """Send the parts; those whose owner changes are cut and sent again, for 10 s at most."""
+        loop = asyncio.get_running_loop()
+        end_s, waiting, accepted, stale = loop.time() + WAIT_S, [subset], 0, 0
+        while True:
+            changed, owners = self._host.changes.subscribe(), self._host.owners
+            parts = [item for part in waiting for item in owners.split(part).items()]
+            results = await asyncio.gather(
+                *(self._store_part(owner, session_id, part) for owner, part in parts), return_exceptions=True
+            )
+            unavailable = None
+            waiting = []
+            for (_, part), result in zip(parts, results, strict=True):
+                if isinstance(result, UnavailableError):
+                    unavailable = result
+                    waiting.append(part)
+                elif isinstance(result, BaseException):
+                    raise result
+                else:
+                    accepted, stale = accepted + result[0], stale + result[1]
+            if unavailable is None:
+                return StoredCount(accepted, stale)
+            if loop.time() > end_s:
+                raise unavailable
+            await _wait_at_most(changed, _RETRY_S if owners is self._host.owners else 0.0)
+
+    async def _store_part(self, owner: str | None, session_id: str, part: StoredSubset) -> tuple[int, int]:
+        if owner is None:
+            raise UnavailableError("fusion server: nobody owns some of these voxels; try again in a moment")
+        if owner == self._host.server:
+            return await self._regions.store_part(session_id, part)
+        self.sent += 1
+        return await self._peers.send_part(owner, session_id, part)
+
+
+def _value(subset: StoredSubset) -> Callable[[asyncio.Future[StoredSubset]], None]:
+    return lambda decoded: decoded.set_result(subset)
+
+
+def _error(error: GaussLiteError) -> Callable[[asyncio.Future[StoredSubset]], None]:
+    return lambda decoded: decoded.set_exception(error)
+
+
+async def _wait_at_most(event: asyncio.Event, timeout_s: float) -> None:
+    try:
+        await asyncio.wait_for(event.wait(), timeout_s)
+    except TimeoutError:
+        return

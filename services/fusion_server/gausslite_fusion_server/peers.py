@@ -1,0 +1,203 @@
+"""Call the other servers of a mission: single calls, calls to all owners at once, and streams of parts of messages."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import grpc
+
+from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.domain.errors import GaussLiteError, UnavailableError
+from gausslite.fusion.regions import ALL_SLOTS
+from gausslite.v1 import region_service_pb2 as region_pb
+from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
+from gausslite.wire.channel import open_async_channel
+from gausslite.wire.security import Tls
+from gausslite.wire.status import error_from_reason, from_rpc_error
+from gausslite_fusion_server.contributions import StoredCount
+from gausslite_fusion_server.region_servicer import SLOTS_KEY
+
+CALL_S = 30.0
+_BATCH_BYTES = 1 << 20
+_Answer = TypeVar("_Answer")
+
+
+@contextmanager
+def peer_errors(server: str) -> Iterator[None]:
+    """Raise the errors of calls to another server as GaussLite errors."""
+    try:
+        yield
+    except grpc.aio.AioRpcError as error:
+        raise from_rpc_error(error, f"server {server}") from error
+
+
+async def stated_slots(call: Any) -> frozenset[int]:
+    """Return the slots for which the answer of a call holds."""
+    metadata = dict(await call.initial_metadata() or ())
+    bits = int(metadata.get(SLOTS_KEY, "0"), 16)
+    return frozenset(slot for slot in ALL_SLOTS if bits >> slot & 1)
+
+
+def require_all(parts: Iterable[frozenset[int]], wanted: frozenset[int] = ALL_SLOTS) -> None:
+    """Raise UnavailableError unless these answers hold for each wanted slot, and no two of them for the same one."""
+    slots = list(itertools.chain.from_iterable(parts))
+    if len(set(slots)) < len(slots) or not wanted <= set(slots):
+        raise UnavailableError("fusion server: regions move from one server to another; try again in a moment")
+
+
+class Peers:
+    """Owns the connections to the servers, also the one to this server itself. Use it on the event loop."""
+
+    def __init__(self, tls: Tls | None) -> None:
+        self._tls = tls
+        self._channels: dict[str, grpc.aio.Channel] = {}
+        self._streams: dict[str, _PartStream] = {}
+
+    def stub(self, server: str) -> Any:
+        """Return the methods of a server."""
+        if server not in self._channels:
+            self._channels[server] = open_async_channel(server, self._tls)
+        return region_pb_grpc.RegionServiceStub(self._channels[server])
+
+    async def call(self, server: str, method: str, request: Any) -> Any:
+        """Return the answer of one server. Raises GaussLiteError."""
+        with peer_errors(server):
+            return await getattr(self.stub(server), method)(request, timeout=CALL_S)
+
+    async def ask_all(
+        self, servers: Iterable[str], ask: Callable[[str], tuple[Any, Awaitable[_Answer]]]
+    ) -> dict[str, _Answer]:
+        """Return the answer of each server; ask: returns the call to one and its answer.
+
+        Raises UnavailableError unless the answers hold for all slots together, and the errors of the servers.
+        """
+
+        async def answer_of(server: str) -> tuple[frozenset[int], _Answer]:
+            with peer_errors(server):
+                call, answer = ask(server)
+                result = await answer
+                return await stated_slots(call), result
+
+        names = list(servers)
+        results = await asyncio.gather(*map(answer_of, names))
+        require_all(slots for slots, _ in results)
+        return {name: answer for name, (_, answer) in zip(names, results, strict=True)}
+
+    async def call_all(self, servers: Iterable[str], method: str, request: Any) -> dict[str, Any]:
+        """Return the answer of each server to a unary call. Raises as `ask_all`."""
+
+        def ask(server: str) -> tuple[Any, Awaitable[Any]]:
+            call = getattr(self.stub(server), method)(request, timeout=CALL_S)
+            return call, call
+
+        return await self.ask_all(servers, ask)
+
+    async def read_all(self, servers: Iterable[str], method: str, request: Any) -> dict[str, list[Any]]:
+        """Return all answers of each server to a streaming call. Raises as `ask_all`."""
+
+        def ask(server: str) -> tuple[Any, Awaitable[list[Any]]]:
+            call = getattr(self.stub(server), method)(request, timeout=20 * CALL_S)
+            return call, _read(call)
+
+        return await self.ask_all(servers, ask)
+
+    async def send_part(self, server: str, session_id: str, part: StoredSubset) -> StoredCount:
+        """Send a part of a message to its owner; returns when it is durable. Raises what the owner raised."""
+        stream = self._streams.get(server)
+        if stream is None or stream.has_ended:
+            stream = self._streams[server] = _PartStream(server, self.stub(server))
+        return await stream.send(session_id, part)
+
+    async def close(self) -> None:
+        """Close the connections; open calls end."""
+        for stream in self._streams.values():
+            await stream.close()
+        for channel in self._channels.values():
+            await channel.close(None)
+
+
+async def _read(call: Any) -> list[Any]:
+    return [response async for response in call]
+
+
+class _PartStream:
+    """One stream to one server for the parts of all agents; what waits while a write is busy goes as one message."""
+
+    def __init__(self, server: str, stub: Any) -> None:
+        self._server = server
+        self._waiting: deque[region_pb.SubsetPart] = deque()
+        self._woken = asyncio.Event()
+        self._numbers = itertools.count()
+        self._outcomes: dict[int, asyncio.Future[StoredCount]] = {}
+        self.has_ended = self._is_closing = False
+        self._call = stub.StoreParts(self._requests())
+        self._reading = asyncio.create_task(self._read())
+
+    async def send(self, session_id: str, part: StoredSubset) -> StoredCount:
+        number = next(self._numbers)
+        self._waiting.append(
+            region_pb.SubsetPart(
+                number=number,
+                session_id=session_id,
+                agent_id=part.agent_id,
+                message_seq=part.message_seq,
+                update_seq=part.update_seq,
+                voxels=part.voxels.to_row(),
+            )
+        )
+        self._woken.set()
+        outcome = self._outcomes[number] = asyncio.get_running_loop().create_future()
+        try:
+            return await outcome
+        finally:
+            del self._outcomes[number]
+
+    async def close(self) -> None:
+        self._is_closing = True
+        self._woken.set()
+        self._call.cancel()
+        await self._reading
+
+    async def _requests(self) -> AsyncIterator[region_pb.StorePartsRequest]:
+        while not self._is_closing:
+            await self._woken.wait()
+            self._woken.clear()
+            while self._waiting:
+                size, parts = 0, []
+                while self._waiting and size < _BATCH_BYTES:
+                    parts.append(self._waiting.popleft())
+                    size += len(parts[-1].voxels)
+                yield region_pb.StorePartsRequest(parts=parts)
+
+    async def _read(self) -> None:
+        error: GaussLiteError = UnavailableError(f"server {self._server}: has ended the stream of parts")
+        try:
+            with peer_errors(self._server):
+                async for response in self._call:
+                    for outcome in response.outcomes:
+                        self._end(outcome)
+        except GaussLiteError as raised:
+            error = raised
+        except asyncio.CancelledError:
+            # the call is cancelled by `close`, not this task
+            if not self._is_closing:
+                raise
+        self.has_ended = self._is_closing = True
+        self._woken.set()
+        for waiting in self._outcomes.values():
+            if not waiting.done():
+                waiting.set_exception(error)
+
+    def _end(self, outcome: region_pb.PartOutcome) -> None:
+        waiting = self._outcomes.get(outcome.number)
+        if waiting is None or waiting.done():
+            return
+        if outcome.reason:
+            waiting.set_exception(error_from_reason(outcome.reason, outcome.message))
+        else:
+            waiting.set_result(StoredCount(outcome.accepted_voxels, outcome.stale_voxels))

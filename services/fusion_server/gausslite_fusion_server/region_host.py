@@ -1,0 +1,160 @@
+"""Own a share of a mission's slots: follow who lives, take and release slots, and open the engine of those held.
+
+An engine has a fixed set of slots. When the set changes, it is closed and another one is opened from the rows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from typing import TypeVar
+
+from gausslite.domain.errors import GaussLiteError, MismatchError, StorageError, UnavailableError
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.postgres_regions import SharedSlots
+from gausslite.fusion.postgres_store import PostgresStore
+from gausslite.fusion.regions import OwnedSlots, Owners, wanted_slots
+from gausslite.wire.convert import decode_frame
+from gausslite.wire.views import ChangeNotifier
+from gausslite_fusion_server.servicer import FusionServicer
+
+POLL_S = 0.25
+WAIT_S = 10.0
+"""Longest wait for the owner of a slot: a message or a call waits for a server that takes over."""
+_log = logging.getLogger(__name__)
+_Value = TypeVar("_Value")
+
+
+class RegionHost:
+    """Owns the slots and the open engine with its servicer. Use it on the event loop.
+
+    create_servicer: serves an engine that has just been opened.
+    """
+
+    def __init__(
+        self, slots: SharedSlots, settings: FusionSettings, create_servicer: Callable[[FusionEngine], FusionServicer]
+    ) -> None:
+        self._slots, self.settings, self._create_servicer = slots, settings, create_servicer
+        self._store: PostgresStore | None = None
+        self._local: FusionServicer | None = None
+        # the connection and the slots of the open engine
+        self._opened: tuple[int, frozenset[int]] | None = None
+        self._owners = Owners()
+        self._failure = ""
+        self.changes = ChangeNotifier()
+        """Notified when the owners, or the open engine, have changed."""
+
+    @property
+    def server(self) -> str:
+        """The address of this server among the others."""
+        return self._slots.server
+
+    @property
+    def owners(self) -> Owners:
+        """Who owned which slot at the latest look."""
+        return self._owners
+
+    @property
+    def owned(self) -> OwnedSlots:
+        """The slots of the open engine. Raises UnavailableError without one."""
+        self.local()
+        assert self._opened is not None
+        return OwnedSlots(self.server, self._opened[1])
+
+    def local(self) -> FusionServicer:
+        """Return what serves this server's own part. Raises UnavailableError while it is opened."""
+        if self._local is None:
+            raise UnavailableError(f"server {self.server}: it is taking its regions; try again in a moment")
+        return self._local
+
+    def check(self) -> None:
+        """Raise UnavailableError or StorageError while this server cannot store its part."""
+        self.local().engine.storage.check()
+
+    async def ready(self) -> FusionServicer:
+        """Return what serves this server's own part as soon as it is open. Raises UnavailableError after 10 s."""
+        return await self.wait_for(self.local)
+
+    async def wait_for(self, find: Callable[[], _Value]) -> _Value:
+        """Return what `find` returns, as soon as it does not raise UnavailableError, which is raised after 10 s."""
+        end_s = asyncio.get_running_loop().time() + WAIT_S
+        while True:
+            changed = self.changes.subscribe()
+            try:
+                return find()
+            except UnavailableError:
+                remaining_s = end_s - asyncio.get_running_loop().time()
+                if remaining_s <= 0:
+                    raise
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(changed.wait(), remaining_s)
+
+    async def run(self) -> None:
+        """Follow the owners until it is cancelled. Raises MismatchError, CodecError for a mission it cannot serve."""
+        while True:
+            try:
+                await self._follow()
+                if self._failure:
+                    _log.info("server %s: it shares the store again", self.server)
+                self._failure = ""
+            except StorageError as error:
+                if not self._failure:
+                    _log.error("server %s: %s; trying again", self.server, error)
+                self._failure = str(error)
+            await asyncio.sleep(POLL_S)
+
+    async def close(self) -> None:
+        """Close the engine and give all slots up."""
+        await self._close_local()
+        await asyncio.to_thread(self._slots.close)
+
+    async def _follow(self) -> None:
+        owners = await asyncio.to_thread(self._slots.owners)
+        wanted = wanted_slots(owners.servers, self.server)
+        await asyncio.to_thread(self._slots.take, wanted)
+        surplus = self._slots.held - wanted
+        if surplus or self._opened != (self._slots.connection, self._slots.held):
+            await self._close_local()
+            await asyncio.to_thread(self._slots.release, surplus)
+            await self._open_local()
+            owners = await asyncio.to_thread(self._slots.owners)
+        if owners != self._owners:
+            self._owners = owners
+            self.changes.notify()
+
+    async def _open_local(self) -> None:
+        connection, held = self._slots.connection, self._slots.held
+        engine = await asyncio.to_thread(self._open_engine)
+        self._local, self._opened = self._create_servicer(engine), (connection, held)
+        _log.info("server %s: serves %d of the mission's regions", self.server, len(held))
+        self.changes.notify()
+
+    def _open_engine(self) -> FusionEngine:
+        store = self._slots.open_store()
+        try:
+            store.set_mission_config(self.settings.mission_config)
+            engine = FusionEngine(store, self.settings, decode_keyframe=decode_frame, others=store)
+            if engine.moved_agents:
+                raise MismatchError(
+                    f"server {self.server}: the frames of {', '.join(engine.moved_agents[:8])} differ from the fused "
+                    "map's, and servers that share a mission trust frames; evict these agents, or run one server "
+                    "without peer-address"
+                )
+        except GaussLiteError:
+            store.close()
+            raise
+        self._store = store
+        return engine
+
+    async def _close_local(self) -> None:
+        local, self._local, self._opened = self._local, None, None
+        if local is None or self._store is None:
+            return
+        local.drain()
+        await asyncio.to_thread(local.close)
+        with contextlib.suppress(StorageError, UnavailableError):
+            await asyncio.to_thread(local.engine.save_counters)
+        await asyncio.to_thread(self._store.close)

@@ -1,0 +1,195 @@
+"""The methods of RegionService: what other servers ask of the part of the mission that this one owns."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
+from gausslite.codec.subset_codec import SubsetCoding, encode_subset, split_batch
+from gausslite.domain.errors import GaussLiteError, UnavailableError
+from gausslite.domain.voxels import RoiSubset
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import region_service_pb2 as region_pb
+from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
+from gausslite.v1.gaussians_pb2 import MapBlock
+from gausslite.wire.map_changes import BLOCK_BYTES, read_deadline
+from gausslite.wire.server import Service
+from gausslite.wire.status import code_and_reason
+from gausslite_fusion_server.messages import select_map
+from gausslite_fusion_server.region_host import RegionHost
+
+# ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
+
+SLOTS_KEY = "gausslite-slots"
+"""The initial metadata of an answer: the slots for which it holds, as bits of a hexadecimal number."""
+_SENDER = "fusion-server"
+
+
+class RegionServicer(region_pb_grpc.RegionServiceServicer):
+    """Answers for the host's engine as it is at the call. Parts of messages are counted in `stored` and `foreign`."""
+
+    def __init__(self, host: RegionHost) -> None:
+        self._host = host
+        self.stored = self.foreign = 0
+
+    def service(self) -> Service:
+        """Return the servicer, ready for a server."""
+        return Service(
+            region_pb.DESCRIPTOR.services_by_name["RegionService"].full_name,
+            lambda server: region_pb_grpc.add_RegionServiceServicer_to_server(self, server),
+        )
+
+    async def store_part(self, session_id: str, part: StoredSubset) -> tuple[int, int]:
+        """Store a part of a message; returns the numbers of accepted and stale voxels. Raises GaussLiteError."""
+        try:
+            if not self._host.owned.have(part.voxels.keys):
+                self.foreign += 1
+                raise UnavailableError(f"server {self._host.server}: does not own all of these voxels")
+            count = await self._host.local().store_part(session_id, part)
+        except RuntimeError as error:
+            # the threads of an engine that has just been closed
+            raise UnavailableError(f"server {self._host.server}: its regions change") from error
+        self.stored += 1
+        return count
+
+    async def StoreParts(
+        self, request_iterator: AsyncIterator[region_pb.StorePartsRequest], context: Any
+    ) -> AsyncIterator[region_pb.StorePartsResponse]:
+        """Store parts of messages; those that are done together are answered together."""
+        done: asyncio.Queue[region_pb.PartOutcome | None] = asyncio.Queue()
+        tasks: set[asyncio.Task[None]] = set()
+
+        async def read() -> None:
+            async for request in request_iterator:
+                for part in request.parts:
+                    task = asyncio.create_task(self._store(part, done))
+                    tasks.add(task)
+                    task.add_done_callback(tasks.discard)
+            await asyncio.gather(*tasks)
+            done.put_nowait(None)
+
+        reading = asyncio.create_task(read())
+        reading.add_done_callback(lambda _: done.put_nowait(None))
+        try:
+            while (outcome := await done.get()) is not None:
+                outcomes = [outcome]
+                while not done.empty() and (further := done.get_nowait()) is not None:
+                    outcomes.append(further)
+                yield region_pb.StorePartsResponse(outcomes=outcomes)
+        finally:
+            reading.cancel()
+
+    async def _store(self, part: region_pb.SubsetPart, done: asyncio.Queue[region_pb.PartOutcome | None]) -> None:
+        outcome = region_pb.PartOutcome(number=part.number)
+        try:
+            voxels = StoredVoxels.from_row(part.voxels)
+            subset = StoredSubset(part.agent_id, part.message_seq, part.update_seq, voxels)
+            outcome.accepted_voxels, outcome.stale_voxels = await self.store_part(part.session_id, subset)
+        except GaussLiteError as error:
+            outcome.reason, outcome.message = code_and_reason(error)[1], str(error)
+        done.put_nowait(outcome)
+
+    async def BeginAgent(self, request: region_pb.BeginAgentRequest, context: Any) -> region_pb.BeginAgentResponse:
+        """Note that an agent has joined at its home."""
+        engine = self._host.local().engine
+        if request.fresh_map and self._host.owned.is_home(request.agent_id):
+            raise UnavailableError(f"server {self._host.server}: has become the home of this agent; join again")
+        await self._state_slots(context)
+        highest = await asyncio.to_thread(engine.begin_elsewhere, request.agent_id, request.fresh_map)
+        return region_pb.BeginAgentResponse(highest_update_seq=highest)
+
+    async def RemoveAgent(self, request: region_pb.RemoveAgentRequest, context: Any) -> region_pb.RemoveAgentResponse:
+        """Delete an agent's voxels here."""
+        local = self._host.local()
+        await self._state_slots(context)
+        voxels = await asyncio.to_thread(local.engine.remove_elsewhere, request.agent_id)
+        local.publish_changes()
+        return region_pb.RemoveAgentResponse(voxels=voxels)
+
+    async def ReadVoxels(
+        self, request: pb.ExportFusedMapRequest, context: Any
+    ) -> AsyncIterator[pb.WatchFusedMapResponse]:
+        """Send the voxels of a map that are owned here, without loss."""
+        engine = self._host.local().engine
+        await self._state_slots(context)
+        batch = await asyncio.to_thread(select_map, engine, request)
+        for part in split_batch(batch, BLOCK_BYTES, SubsetCoding.LOSSLESS):
+            subset = RoiSubset(_SENDER, "", 0, 0, part)
+            data = await asyncio.to_thread(encode_subset, subset, engine.grid, SubsetCoding.LOSSLESS)
+            with read_deadline():
+                yield pb.WatchFusedMapResponse(block=MapBlock(subset=data))
+
+    async def WatchFusedMap(
+        self, request: pb.WatchFusedMapRequest, context: Any
+    ) -> AsyncIterator[pb.WatchFusedMapResponse]:
+        """Send the part of the map that is owned here, then its changes."""
+        local = self._host.local()
+        await self._state_slots(context)
+        async for response in local.WatchFusedMap(request, context):
+            yield response
+
+    async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
+        """Return the figures of the part of the mission that is owned here."""
+        local = self._host.local()
+        await self._state_slots(context)
+        return await local.GetSessionStatus(request, context)
+
+    async def GetUpdateDigests(
+        self, request: pb.GetUpdateDigestsRequest, context: Any
+    ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
+        """Return the digests of an agent's updates that are owned here."""
+        local = self._host.local()
+        await self._state_slots(context)
+        async for response in local.GetUpdateDigests(request, context):
+            yield response
+
+    async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
+        """Join at the agent's home."""
+        return await self._at_home(request.agent_id).JoinSession(request, context)
+
+    async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
+        """Renew the lease at the agent's home."""
+        return await (await self._home_of(request.session_id)).KeepSession(request, context)
+
+    async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
+        """End the session at the agent's home."""
+        return await (await self._home_of(request.session_id)).LeaveSession(request, context)
+
+    async def ContributeKeyframes(
+        self, request_iterator: AsyncIterator[pb.ContributeKeyframesRequest], context: Any
+    ) -> pb.ContributeKeyframesResponse:
+        """Store keyframes at the agent's home."""
+        return await self._host.local().ContributeKeyframes(request_iterator, context)
+
+    async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
+        """Return a keyframe at the agent's home."""
+        return await self._at_home(request.agent_id).GetKeyframe(request, context)
+
+    async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
+        """Replace the agent's objects at its home."""
+        return await (await self._home_of(request.session_id)).ReportObjects(request, context)
+
+    async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
+        """Evict the agent at its home."""
+        return await self._at_home(request.agent_id).EvictAgent(request, context)
+
+    async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
+        """Let the agent join again at its home."""
+        return await self._at_home(request.agent_id).UnbanAgent(request, context)
+
+    def _at_home(self, agent_id: str) -> Any:
+        """Return the own servicer. Raises UnavailableError if this is not the agent's home."""
+        if not self._host.owned.is_home(agent_id):
+            raise UnavailableError(f"server {self._host.server}: is not the home of this agent")
+        return self._host.local()
+
+    async def _home_of(self, session_id: str) -> Any:
+        """Return the own servicer. Raises SessionUnknownError, UnavailableError as `_at_home`."""
+        session = await asyncio.to_thread(self._host.local().engine.session, session_id)
+        return self._at_home(session.agent_id)
+
+    async def _state_slots(self, context: Any) -> None:
+        slots = sum(1 << slot for slot in self._host.owned.slots)
+        await context.send_initial_metadata(((SLOTS_KEY, f"{slots:x}"),))

@@ -1,0 +1,330 @@
+"""The methods of FusionService where several servers share a mission: route each call to who owns what it needs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import logging
+from collections.abc import AsyncIterator, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from gausslite.codec.ply import ply_bytes
+from gausslite.codec.subset_codec import CodecLimits, decode_subset
+from gausslite.domain.checks import require_identifier
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, UnavailableError
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import VoxelBatch, merge_batches
+from gausslite.fusion.regions import Owners
+from gausslite.fusion.store import SessionRecord
+from gausslite.fusion.traffic import TrafficCounters
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.v1 import region_service_pb2 as region_pb
+from gausslite.wire.channel import MAX_MESSAGE_BYTES
+from gausslite.wire.convert import box_from_message, digests_from_messages, digests_to_messages
+from gausslite.wire.convert_task import object_to_message
+from gausslite.wire.map_changes import read_deadline
+from gausslite.wire.security import Caller, RejectionLog
+from gausslite.wire.server import Service
+from gausslite_fusion_server.contributions import Contributions
+from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_message, layer_from_message
+from gausslite_fusion_server.part_sender import PartSender
+from gausslite_fusion_server.peers import CALL_S, Peers, peer_errors
+from gausslite_fusion_server.region_host import RegionHost
+from gausslite_fusion_server.region_servicer import RegionServicer
+from gausslite_fusion_server.servicer import DrainGate
+from gausslite_fusion_server.shared_watch import SharedRevisions, SharedWatch
+
+# ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
+
+_log = logging.getLogger(__name__)
+_PART_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
+
+
+class SharedServicer(pb_grpc.FusionServiceServicer):
+    """Accepts any agent and any watcher. What needs voxels goes to their owners, what needs an agent to its home."""
+
+    def __init__(self, host: RegionHost, regions: RegionServicer, peers: Peers, sender: PartSender) -> None:
+        self._host, self._regions, self._peers, self._sender = host, regions, peers, sender
+        self._gate = DrainGate()
+        self._watch = SharedWatch(host, peers, SharedRevisions(), host.settings.grid)
+        self._contributions = Contributions(self._session, sender.store, self._record_traffic, RejectionLog(_log))
+        self._exports = asyncio.Semaphore(1)
+
+    def service(self) -> Service:
+        """Return the servicer, ready for a server."""
+        return Service(
+            pb.DESCRIPTOR.services_by_name["FusionService"].full_name,
+            functools.partial(pb_grpc.add_FusionServiceServicer_to_server, self),
+            self._host.check,
+            self._sender.acknowledgements.check,
+        )
+
+    def drain(self) -> None:
+        """End every open stream of agents and every later call with UNAVAILABLE."""
+        self._gate.close()
+        self._host.changes.notify()
+
+    async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
+        """Join at the agent's home, and tell the other owners."""
+        Caller.of(context).require_agent(request.agent_id)
+        T_fused_agent = declared_frame_from_message(request)
+        if T_fused_agent is not None and not np.array_equal(T_fused_agent, np.eye(4)):
+            raise MismatchError(
+                "t_fused_agent: expected none, because several servers share this mission and use maps as they are "
+                "sent; localise the robot in the mission's frame"
+            )
+        response: pb.JoinSessionResponse = await self._at_home(request.agent_id, "JoinSession", request, context)
+        home, highest = self._host.owners.home(request.agent_id), response.highest_update_seq
+        begin = functools.partial(self._begin, request, home)
+        answers = await self._peers.ask_all(self._host.owners.servers, begin)
+        response.highest_update_seq = max([highest, *(answer.highest_update_seq for answer in answers.values())])
+        return response
+
+    def _begin(self, request: pb.JoinSessionRequest, home: str | None, server: str) -> tuple[Any, Any]:
+        fresh_map = request.fresh_map and server != home
+        begin = region_pb.BeginAgentRequest(agent_id=request.agent_id, fresh_map=fresh_map)
+        call = self._peers.stub(server).BeginAgent(begin, timeout=CALL_S)
+        return call, call
+
+    async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
+        """Renew the agent's lease; return what identifies the stored updates."""
+        session = await self._session(request.session_id, Caller.of(context))
+        response: pb.KeepSessionResponse = await self._at_home(session.agent_id, "KeepSession", request, context)
+        highest = self._sender.highest_acknowledged(session)
+        if highest is None:
+            begin = region_pb.BeginAgentRequest(agent_id=session.agent_id)
+            answers = await self._peers.call_all(self._host.owners.servers, "BeginAgent", begin)
+            highest = max(answer.highest_update_seq for answer in answers.values())
+            self._sender.note_acknowledged(session, highest)
+        response.highest_update_seq = max(response.highest_update_seq, highest)
+        return response
+
+    async def GetUpdateDigests(
+        self, request: pb.GetUpdateDigestsRequest, context: Any
+    ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
+        """Return the digests of the agent's stored updates."""
+        await self._session(request.session_id, Caller.of(context))
+        answers = await self._peers.read_all(self._host.owners.servers, "GetUpdateDigests", request)
+        digests = TileDigests.sum_of(digests_from_messages(blocks) for blocks in answers.values())
+        for block in digests_to_messages(digests):
+            with read_deadline():
+                yield block
+
+    async def ContributeSubsets(
+        self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
+    ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
+        """Store voxel updates; one acknowledgement for each message, after all owners have their parts."""
+        async for answer in self._contributions.answer(self._gate.admit(request_iterator), Caller.of(context)):
+            yield answer
+
+    async def ContributeKeyframes(
+        self, request_iterator: AsyncIterator[pb.ContributeKeyframesRequest], context: Any
+    ) -> pb.ContributeKeyframesResponse:
+        """Store keyframes at the agent's home."""
+        requests = self._gate.admit(request_iterator)
+        first = await anext(requests, None)
+        if first is None:
+            return pb.ContributeKeyframesResponse()
+        session = await self._session(first.session_id, Caller.of(context))
+
+        async def of_session() -> AsyncIterator[pb.ContributeKeyframesRequest]:
+            yield first
+            async for request in requests:
+                if request.session_id != first.session_id:
+                    raise InvalidInputError("session_id: expected the one of the stream's first keyframe, got another")
+                yield request
+
+        server = self._home(session.agent_id)
+        if server == self._host.server:
+            return await self._regions.ContributeKeyframes(of_session(), context)
+        with peer_errors(server):
+            stored: pb.ContributeKeyframesResponse = await self._peers.stub(server).ContributeKeyframes(of_session())
+            return stored
+
+    async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
+        """Return a stored keyframe of an agent, for a person."""
+        response: pb.GetKeyframeResponse = await self._at_home(request.agent_id, "GetKeyframe", request, context)
+        return response
+
+    async def WatchFusedMap(
+        self, request: pb.WatchFusedMapRequest, context: Any
+    ) -> AsyncIterator[pb.WatchFusedMapResponse]:
+        """Send the map, then its changes, from the owners of what is looked at."""
+        await self._require_mission(request.mission_id)
+        region = box_from_message(request.region) if request.HasField("region") else None
+        if request.exclude_agent_id:
+            require_identifier("exclude_agent_id", request.exclude_agent_id)
+        layer_from_message(request.layer)
+        async for response in self._watch.follow(request, region):
+            self._gate.require_open()
+            yield response
+
+    async def RefineFusedMap(
+        self, request: pb.RefineFusedMapRequest, context: Any
+    ) -> AsyncIterator[pb.RefineFusedMapResponse]:
+        """Refuse: a refinement needs the whole map in one server."""
+        _refuse("refinement")
+        yield pb.RefineFusedMapResponse()
+
+    async def ExportFusedMap(
+        self, request: pb.ExportFusedMapRequest, context: Any
+    ) -> AsyncIterator[pb.ExportFusedMapResponse]:
+        """Send a map, put together from all owners, as the bytes of a PLY file."""
+        await self._require_mission(request.mission_id)
+        async with self._exports:
+            batch = await self._read_map(request)
+            world_frame = (await self._host.ready()).engine.mission_config.given_world_frame
+            exported = await asyncio.to_thread(lambda: ExportedFile(ply_bytes(batch.gaussians, world_frame)))
+        with exported:
+            while chunk := await asyncio.to_thread(exported.next_chunk):
+                self._gate.require_open()
+                with read_deadline():
+                    yield chunk
+
+    async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
+        """Refuse: a view needs the whole map in one server."""
+        _refuse("view")
+        return pb.RenderFusedViewResponse()
+
+    async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
+        """Replace the agent's task graph and objects at its home."""
+        session = await self._session(request.session_id, Caller.of(context))
+        response: pb.ReportObjectsResponse = await self._at_home(session.agent_id, "ReportObjects", request, context)
+        return response
+
+    async def QueryObjects(self, request: pb.QueryObjectsRequest, context: Any) -> pb.QueryObjectsResponse:
+        """Return the team's objects that a noun names, or all, of the reports as they are stored now."""
+        await self._require_mission(request.mission_id)
+        engine = (await self._host.ready()).engine
+        found = await asyncio.to_thread(engine.query_stored_objects, request.noun)
+        return pb.QueryObjectsResponse(objects=[object_to_message(shown.landmark, shown.observers) for shown in found])
+
+    async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
+        """Return the figures of the mission and of each agent, summed over the owners."""
+        await self._require_mission(request.mission_id)
+        owners = self._host.owners
+        parts = await self._peers.call_all(owners.servers, "GetSessionStatus", request)
+        return sum_status(parts, owners)
+
+    async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
+        """End a session; with `forget` the agent's updates are deleted."""
+        session = await self._session(request.session_id, Caller.of(context))
+        response: pb.LeaveSessionResponse = await self._at_home(session.agent_id, "LeaveSession", request, context)
+        if request.forget:
+            await self._remove_elsewhere(session.agent_id)
+        return response
+
+    async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
+        """End an agent's session and delete its data; with `ban` its later joins are refused."""
+        await self._require_mission(request.mission_id)
+        unknown: GaussLiteError | None = None
+        try:
+            response = await self._at_home(request.agent_id, "EvictAgent", request, context)
+        except InvalidInputError as error:
+            # its home may have none of its voxels
+            response, unknown = pb.EvictAgentResponse(), error
+        response.voxels += await self._remove_elsewhere(request.agent_id)
+        if unknown is not None and not response.voxels:
+            raise unknown
+        evicted: pb.EvictAgentResponse = response
+        return evicted
+
+    async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
+        """Let a banned agent join again."""
+        response: pb.UnbanAgentResponse = await self._at_home(request.agent_id, "UnbanAgent", request, context)
+        return response
+
+    async def _remove_elsewhere(self, agent_id: str) -> int:
+        """Delete the agent's voxels at all owners; returns the number of those that its home had not deleted."""
+        request = region_pb.RemoveAgentRequest(agent_id=agent_id)
+        answers = await self._peers.call_all(self._host.owners.servers, "RemoveAgent", request)
+        return sum(answer.voxels for answer in answers.values())
+
+    async def _session(self, session_id: str, caller: Caller) -> SessionRecord:
+        """Return a session, whoever opened it. Raises SessionUnknownError, NotPermittedError for another robot."""
+        engine = (await self._host.ready()).engine
+        session = await asyncio.to_thread(engine.session, session_id)
+        caller.require_agent(session.agent_id)
+        return session
+
+    async def _require_mission(self, mission_id: str) -> None:
+        self._gate.require_open()
+        (await self._host.ready()).engine.require_mission(mission_id)
+
+    def _record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
+        # figures are not worth an error while the engine is opened
+        with contextlib.suppress(UnavailableError):
+            self._host.local().engine.record_traffic(agent_id, traffic)
+
+    def _home(self, agent_id: str) -> str:
+        server = self._host.owners.home(agent_id)
+        if server is None:
+            raise UnavailableError("fusion server: nobody is the home of this agent now; try again in a moment")
+        return server
+
+    async def _at_home(self, agent_id: str, method: str, request: Any, context: Any) -> Any:
+        """Return the answer of the agent's home. Raises GaussLiteError."""
+        self._gate.require_open()
+        server = await self._host.wait_for(functools.partial(self._home, agent_id))
+        if server == self._host.server:
+            await self._host.ready()
+            return await getattr(self._regions, method)(request, context)
+        return await self._peers.call(server, method, request)
+
+    async def _read_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
+        if request.strategy == pb.FUSION_STRATEGY_REFINED:
+            _refuse("refined map")
+        answers = await self._peers.read_all(self._host.owners.servers, "ReadVoxels", request)
+        return await asyncio.to_thread(_merge, [block.block.subset for own in answers.values() for block in own])
+
+
+def _refuse(what: str) -> None:
+    raise MismatchError(
+        f"{what}: expected one server with the whole map, but several share this mission; export it, or run one server "
+        "without peer-address"
+    )
+
+
+def _merge(parts: Iterable[bytes]) -> VoxelBatch:
+    return merge_batches(*(decode_subset(data, _PART_LIMITS)[0].batch for data in parts))
+
+
+def sum_status(parts: Mapping[str, pb.GetSessionStatusResponse], owners: Owners) -> pb.GetSessionStatusResponse:
+    """Return the figures of a mission from those of each server's part; what an agent's home knows is taken from it."""
+    total = pb.GetSessionStatusResponse()
+    agents: dict[str, pb.AgentContribution] = {}
+    for server, part in parts.items():
+        if not total.mission_id:
+            total.mission_id, total.world_frame = part.mission_id, part.world_frame
+            total.grid.CopyFrom(part.grid)
+        total.fused_revision = max(total.fused_revision, part.fused_revision)
+        total.fused_gaussians += part.fused_gaussians
+        total.fused_voxels += part.fused_voxels
+        total.banned_agents.extend(name for name in part.banned_agents if owners.home(name) == server)
+        for own in part.agents:
+            _add(agents.setdefault(own.agent_id, pb.AgentContribution(agent_id=own.agent_id)), own)
+            if owners.home(own.agent_id) == server:
+                agent = agents[own.agent_id]
+                agent.joined, agent.keyframes = own.joined, own.keyframes
+                agent.targets[:] = own.targets
+                agent.alignment.CopyFrom(own.alignment)
+    total.agents.extend(agents[name] for name in sorted(agents))
+    total.keyframes = sum(agent.keyframes for agent in total.agents)
+    return total
+
+
+_SUMS = (
+    *("gaussians", "voxels", "won_voxels", "roi_bytes", "handover_bytes", "kappa_sum"),
+    *("subsets_accepted", "subsets_stale", "subsets_rejected"),
+)
+
+
+def _add(agent: pb.AgentContribution, part: pb.AgentContribution) -> None:
+    for name in _SUMS:
+        setattr(agent, name, getattr(agent, name) + getattr(part, name))
+    for name in ("last_update_seq", "last_seen_ns"):
+        setattr(agent, name, max(getattr(agent, name), getattr(part, name)))

@@ -1,0 +1,131 @@
+"""Share a PostgreSQL database among servers: each holds advisory locks on its slots, which end with its connection.
+
+The locks are the whole truth about who owns what: `owners` reads them. All rows of a slot are written by the connection
+that holds the slot's lock, so a server that has lost its connection cannot write what another server owns by now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from contextlib import ExitStack
+
+import psycopg
+
+from gausslite.domain.errors import StorageError, UnavailableError
+from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
+from gausslite.fusion.postgres_store import LOCK, PostgresStore, begin_opening, create_or_check, in_use
+from gausslite.fusion.regions import OwnedSlots, Owners
+
+_SLOT_LOCKS = 0x47534C53  # "GSLS"
+_OWNERS = """
+SELECT locks.classid::bigint, locks.objid::bigint, servers.address
+FROM pg_locks AS locks JOIN gausslite.servers AS servers USING (pid)
+WHERE locks.locktype = 'advisory' AND locks.granted
+    AND locks.database = (SELECT oid FROM pg_database WHERE datname = current_database())
+    AND (locks.classid = 0 AND locks.objid = %s AND locks.objsubid = 1 OR locks.classid = %s AND locks.objsubid = 2)
+"""
+_FORGET_ENDED = """
+DELETE FROM gausslite.servers
+WHERE pid = pg_backend_pid() OR pid NOT IN (SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted)
+"""
+_REGISTER = "INSERT INTO gausslite.servers VALUES (pg_backend_pid(), %s)"
+_TAKE = "SELECT slot FROM unnest(%s::integer[]) AS slot WHERE pg_try_advisory_lock(%s, slot)"
+_RELEASE = "SELECT pg_advisory_unlock(%s, slot) FROM unnest(%s::integer[]) AS slot"
+
+
+class SharedSlots:
+    """Owns this server's connection with its locks. Thread-safe.
+
+    server: the address under which the other servers reach this one. Raises InvalidInputError, StorageError.
+    """
+
+    def __init__(self, url: str, server: str) -> None:
+        self._url, self._name, self.server = url, database_name(url), server
+        self._holder: Database | None = None
+        self._connections = 0
+        self._held: frozenset[int] = frozenset()
+        with ExitStack() as opened:
+            self._locks = PostgresConnection(url, self._enter)
+            opened.callback(self._locks.close)
+            self._reader = PostgresConnection(url, lambda _: None)
+            opened.callback(self._reader.close)
+            self._opened = opened.pop_all()
+
+    @property
+    def held(self) -> frozenset[int]:
+        """The slots whose locks this server has."""
+        return self._held
+
+    @property
+    def connection(self) -> int:
+        """The number of the connection that holds them."""
+        return self._connections
+
+    def owners(self) -> Owners:
+        """Return who owns which slot now; a lost connection is opened again, without locks. Raises StorageError."""
+        self._locks.run(lambda db: db.execute("SELECT 1"))
+        rows = self._reader.run(lambda db: db.execute(_OWNERS, (LOCK, _SLOT_LOCKS)).fetchall())
+        return Owners(
+            tuple(sorted({address for kind, _, address in rows if kind != _SLOT_LOCKS})),
+            {slot: address for kind, slot, address in rows if kind == _SLOT_LOCKS},
+        )
+
+    def take(self, slots: Collection[int]) -> frozenset[int]:
+        """Lock those of these slots that nobody owns; returns them. Raises StorageError."""
+        wanted = sorted(frozenset(slots) - self._held)
+        rows = self._locks.run(lambda db: db.execute(_TAKE, (wanted, _SLOT_LOCKS)).fetchall()) if wanted else []
+        taken = frozenset(slot for (slot,) in rows)
+        self._held |= taken
+        return taken
+
+    def release(self, slots: Collection[int]) -> None:
+        """Give these slots up; no store of theirs may be open. Raises StorageError."""
+        self._locks.run(lambda db: db.execute(_RELEASE, (_SLOT_LOCKS, sorted(self._held.intersection(slots)))))
+        self._held -= frozenset(slots)
+
+    def open_store(self) -> PostgresStore:
+        """Return the store of the slots that are held now. Raises StorageError."""
+        return PostgresStore(self._url, OwnedSlots(self.server, self._held), _Writer(self._locks, self._holder))
+
+    def close(self) -> None:
+        """Close the connections; the locks end."""
+        self._opened.close()
+
+    def _enter(self, db: Database) -> None:
+        """Become one of the servers; the slots of an earlier connection are lost. Raises StorageError."""
+        self._held = frozenset()
+        try:
+            with db.transaction():
+                # the connection of a server that was killed may take a moment to end
+                db.execute("SET LOCAL lock_timeout = '2s'")
+                db.execute("SELECT pg_advisory_lock_shared(%s)", (LOCK,))
+                # one after the other
+                db.execute("SELECT pg_advisory_xact_lock(%s, -1)", (_SLOT_LOCKS,))
+                create_or_check(db, self._name)
+                db.execute(_FORGET_ENDED)
+                if any(address == self.server for *_, address in db.execute(_OWNERS, (LOCK, _SLOT_LOCKS))):
+                    raise StorageError(f"store {self._name}: another server has the peer-address {self.server}")
+                db.execute(_REGISTER, (self.server,))
+                begin_opening(db)
+        except psycopg.errors.LockNotAvailable as error:
+            raise in_use(self._name) from error
+        self._holder = db
+        self._connections += 1
+
+
+class _Writer:
+    """Writes by the connection that holds the locks, as long as it is the same one."""
+
+    def __init__(self, locks: PostgresConnection, holder: Database | None) -> None:
+        self._locks, self._holder = locks, holder
+
+    def write(self, work: Callable[[Database], object]) -> None:
+        """Do the work in one transaction. Raises StorageError, UnavailableError if the locks have been lost."""
+
+        def commit(db: Database) -> None:
+            if db is not self._holder:
+                raise UnavailableError("store: the connection with the locks of this server's regions was lost")
+            with db.pipeline(), db.transaction():
+                work(db)
+
+        self._locks.run(commit)

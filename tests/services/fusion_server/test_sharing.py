@@ -1,0 +1,277 @@
+"""Several servers of one database: any accepts any agent, each stores its regions alone, and the map is that of one."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fusion_running import CAMERA, COMMAND, GRID, frame, fusion_server, request
+from sample_gaussians import plain_gaussians
+from sharing_running import SharingServer, sharing_server, sharing_servers, wait_until_settled
+from support.postgres_running import PostgresServer
+from test_fusion_objects import GRAPH, MUG
+from waiting import wait_until
+
+from gausslite.codec.ply import gaussians_from_ply, ply_bytes
+from gausslite.codec.subset_codec import decode_stored, encode_subset
+from gausslite.domain.errors import (
+    InvalidInputError,
+    MismatchError,
+    NameInUseError,
+    NotPermittedError,
+    RevisionGoneError,
+    SessionUnknownError,
+)
+from gausslite.domain.objects import ObjectReport
+from gausslite.domain.voxel_changes import TileDigests
+from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelBatch, crop_to_box, empty_batch, group_by_voxel
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.regions import ALL_SLOTS, wanted_slots
+from gausslite.fusion.vote import fuse
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.clients import Export
+from gausslite.wire.convert import MapUpdate
+
+pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
+
+AGENTS = ("ant", "bee", "cat")
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    # a short path, for the sockets
+    with tempfile.TemporaryDirectory() as name:
+        yield Path(name)
+
+
+@pytest.fixture
+def servers(postgres: PostgresServer, folder: Path) -> Iterator[list[SharingServer]]:
+    with sharing_servers(postgres.new_database(), folder, 3) as running:
+        yield running
+
+
+def scattered(agent_id: str, seq: int, seed: int, count: int = 60) -> RoiSubset:
+    """Voxels of many regions; messages with other seeds share some."""
+    rng = np.random.default_rng(seed)
+    means = (np.random.default_rng(seed % 3).uniform(-40, 40, (count, 3))).astype(np.float32)
+    kappa = rng.integers(1, 99, count).tolist()
+    gaussians = plain_gaussians(means, rgb=rng.random((count, 3), np.float32), kappa=kappa)
+    return RoiSubset(agent_id, "", seq, seq, group_by_voxel(gaussians, GRID))
+
+
+def latest_of(subsets: list[RoiSubset]) -> VoxelBatch:
+    """One agent's latest update of each voxel, as a store has it after these messages."""
+    store = MemoryStore()
+    for subset in subsets:
+        stored = decode_stored(encode_subset(subset, GRID))[0]
+        store.put_all([replace(stored, voxels=stored.voxels.with_computed_sums())])
+    return store.batch(subsets[0].agent_id)
+
+
+def offline(subsets: dict[str, list[RoiSubset]]) -> bytes:
+    """The offline vote of all agents' latest updates, as the bytes of a file."""
+    return ply_bytes(fuse({name: latest_of(own) for name, own in subsets.items()}).batch.gaussians)
+
+
+def watched(updates: Iterator[MapUpdate], snapshot: bool = True) -> VoxelBatch:
+    """The map after the first complete state that is sent."""
+    batch = empty_batch()
+    for update in updates:
+        batch = update.apply_to(batch)
+        if update.last and update.snapshot is snapshot:
+            return batch
+    raise AssertionError("the stream has ended")
+
+
+def same(left: VoxelBatch, right: VoxelBatch) -> bool:
+    """Whether two maps are equal but for the precision of the messages to watchers."""
+    return (
+        np.array_equal(left.keys, right.keys)
+        and np.array_equal(left.counts, right.counts)
+        and np.array_equal(left.kappa_sums, right.kappa_sums)
+    )
+
+
+def test_shuffled_and_repeated_messages_to_three_servers_give_the_offline_vote_bit_for_bit(
+    servers: list[SharingServer],
+) -> None:
+    subsets = {name: [scattered(name, seq, seq * 7 + i) for seq in range(1, 6)] for i, name in enumerate(AGENTS)}
+    rng = random.Random(0)
+    sessions = {name: servers[0].client.join(name, GRID).session_id for name in AGENTS}
+    messages = [request(sessions[name], subset) for name in AGENTS for subset in subsets[name] * 2]
+    rng.shuffle(messages)
+    for message in messages:
+        # any server, whichever the agent has joined at
+        [answer] = rng.choice(servers).client.contribute([message], 20.0)
+        assert answer.outcomes[0].status in (pb.SUBSET_STATUS_ACCEPTED, pb.SUBSET_STATUS_STALE)
+    expected = offline(subsets)
+    assert [server.client.export(Export()) == expected for server in servers] == [True, True, True]
+    counts = [server.share.counts() for server in servers]
+    assert sum(count.received for count in counts) == len(messages)
+    assert sum(count.stored for count in counts) >= len(messages)
+    assert all(count.stored and count.sent for count in counts)
+    assert [count.foreign for count in counts] == [0, 0, 0]
+    slots = [server.share.host.owned.slots for server in servers]
+    assert frozenset.union(*slots) == ALL_SLOTS
+    assert sum(map(len, slots)) == len(ALL_SLOTS)
+    # each server has its part alone
+    parts = [server.share.status() for server in servers]
+    total = servers[0].client.status()
+    assert total.fused_voxels == sum(part.fused_voxels for part in parts) == len(gaussians_from_ply(expected).means_m)
+    assert [agent.agent_id for agent in total.agents] == list(AGENTS)
+    assert all(agent.joined for agent in total.agents)
+    assert sum(agent.subsets_accepted + agent.subsets_stale for agent in total.agents) == len(messages)
+
+
+def test_a_watcher_of_one_server_sees_the_changes_of_all(servers: list[SharingServer]) -> None:
+    ant = servers[0].client.join("ant", GRID).session_id
+    first = scattered("ant", 1, 1)
+    list(servers[0].client.contribute([request(ant, first)], 20.0))
+    watch = servers[1].client.watch()
+    batch = empty_batch()
+    for update in watch:
+        batch = update.apply_to(batch)
+        if update.last:
+            break
+    assert same(batch, latest_of([first]))
+    second = scattered("ant", 2, 2)
+    list(servers[2].client.contribute([request(ant, second)], 20.0))
+    expected = latest_of([first, second])
+    while not same(batch, expected):
+        update = next(watch)
+        assert not update.snapshot
+        batch = update.apply_to(batch)
+    since = update.revision if update.last else next(seen.revision for seen in watch if seen.last)
+    # the number is a vector of that server's: it gives the changes since, and another server does not know it
+    third = scattered("ant", 3, 3)
+    list(servers[2].client.contribute([request(ant, third)], 20.0))
+    expected = latest_of([first, second, third])
+    for update in servers[1].client.watch(since_revision=since):
+        assert not update.snapshot
+        batch = update.apply_to(batch)
+        if same(batch, expected):
+            break
+    with pytest.raises(RevisionGoneError):
+        next(servers[0].client.watch(since_revision=since))
+    [key] = expected.keys[:1].tolist()
+    centre = GRID.centres_m(np.array([key], np.int64))[0]
+    box = AxisAlignedBox(tuple((centre - 2).tolist()), tuple((centre + 2).tolist()))
+    assert same(watched(servers[0].client.watch(region=box)), crop_to_box(expected, box, GRID))
+
+
+def test_what_is_known_of_an_agent_is_the_same_at_every_server(servers: list[SharingServer]) -> None:
+    one, two, three = (server.client for server in servers)
+    session = one.join("ant", GRID, task=GRAPH).session_id
+    subsets = [scattered("ant", seq, seq) for seq in (1, 2)]
+    list(two.contribute([request(session, subset) for subset in subsets], 20.0))
+    with pytest.raises(NameInUseError):
+        three.join("ant", GRID)
+    assert [client.keep_session(session).highest_update_seq for client in (one, two, three)] == [2, 2, 2]
+    digests = [client.stored_digests(session) for client in (one, two, three)]
+    latest = np.concatenate([np.full(len(own.batch), own.update_seq, np.int64) for own in subsets])
+    keys = np.concatenate([own.batch.keys for own in subsets])
+    last = dict(zip(keys.tolist(), latest.tolist(), strict=True))
+    expected = TileDigests.of(np.array(list(last), np.int64), np.array(list(last.values()), np.int64))
+    assert all(len(own.differing(expected)) == len(expected.differing(own)) == 0 for own in digests)
+    two.report_objects(session, ObjectReport(GRAPH, (MUG,)))
+    assert [len(client.query_objects("mug")) for client in (one, two, three)] == [1, 1, 1]
+    assert three.contribute_keyframes(session, [frame(3), frame(4)]) == 2
+    stored = [client.keyframe("ant") for client in (one, two, three)]
+    assert [keyframe is not None and keyframe.index for keyframe in stored] == [4, 4, 4]
+    assert [(agent.keyframes, list(agent.targets)) for agent in one.status().agents] == [(2, ["mug"])]
+    with pytest.raises(MismatchError, match="several share this mission"):
+        next(one.refine())
+    with pytest.raises(MismatchError, match="several share this mission"):
+        one.render(CAMERA, np.eye(4))
+    assert two.evict("ant", ban=True) == len(last)
+    assert [client.status().fused_voxels for client in (one, two, three)] == [0, 0, 0]
+    with pytest.raises(SessionUnknownError):
+        list(two.contribute([request(session, subsets[0])], 20.0))
+    with pytest.raises(NotPermittedError, match="banned"):
+        one.join("ant", GRID)
+    assert list(three.status().banned_agents) == ["ant"]
+    three.unban("ant")
+    with pytest.raises(InvalidInputError):
+        one.evict("nobody")
+    assert two.join("ant", GRID).highest_update_seq == 0
+
+
+def test_a_fresh_map_keeps_the_earlier_one_in_every_region_and_other_frames_are_refused(
+    servers: list[SharingServer],
+) -> None:
+    first, second = scattered("ant", 1, 1), scattered("ant", 1, 2)
+    exports = []
+    with fusion_server() as alone:
+        for client in (alone.client, servers[0].client):
+            session = client.join("ant", GRID).session_id
+            list(client.contribute([request(session, first)], 20.0))
+            session = client.join("ant", GRID, fresh_map=True).session_id
+            list(client.contribute([request(session, second)], 20.0))
+            exports.append(client.export(Export()))
+    assert exports[0] == exports[1]
+    # frames are used as they are
+    T_fused_agent = np.eye(4)
+    servers[0].client.join("bee", GRID, T_fused_agent=T_fused_agent)
+    T_fused_agent[0, 3] = 1.0
+    with pytest.raises(MismatchError, match="several servers share this mission"):
+        servers[0].client.join("bee", GRID, T_fused_agent=T_fused_agent)
+
+
+def test_a_server_that_ends_or_joins_moves_regions_and_loses_nothing(postgres: PostgresServer, folder: Path) -> None:
+    url = postgres.new_database()
+    subsets = [scattered("ant", seq, seq) for seq in range(1, 7)]
+    with sharing_servers(url, folder, 2) as servers:
+        client = servers[0].client
+        session = client.join("ant", GRID).session_id
+        watch, batch = client.watch(), empty_batch()
+        list(client.contribute([request(session, subset) for subset in subsets[:2]], 20.0))
+        servers[1].stop()
+        list(client.contribute([request(session, subset) for subset in subsets[2:4]], 30.0))
+        assert client.export(Export()) == offline({"ant": subsets[:4]})
+        with sharing_server(url, f"unix:{folder}/late.sock") as late:
+            wait_until_settled([servers[0], late])
+            late_client = late.client
+            list(late_client.contribute([request(session, subset) for subset in subsets[4:]], 30.0))
+            expected = offline({"ant": subsets})
+            assert late_client.export(Export()) == client.export(Export()) == expected
+            # the watcher that was there all the time has the same map
+            final = watched(late_client.watch())
+            while not same(batch, final):
+                batch = next(watch).apply_to(batch)
+
+
+def test_a_killed_owner_is_replaced_and_acknowledged_messages_are_in_the_map(
+    postgres: PostgresServer, folder: Path
+) -> None:
+    url = postgres.new_database()
+    peer = f"unix:{folder}/killed.sock"
+    with sharing_server(url, f"unix:{folder}/own.sock") as own:
+        arguments = ["--store", url, "--set", f"peer-address={peer}", "--listen", peer, "--voxel-size", "0.1"]
+        with subprocess.Popen([*COMMAND, *arguments], stderr=subprocess.DEVNULL) as process:
+            wait_until(lambda: own.share.host.owners.are_complete and peer in own.share.host.owners.server_of.values())
+            session = own.client.join("ant", GRID).session_id
+            subsets = [scattered("ant", seq, seq) for seq in range(1, 9)]
+            for number, subset in enumerate(subsets):
+                if number == 4:
+                    process.kill()
+                    process.wait(20)
+                [answer] = own.client.contribute([request(session, subset)], 30.0)
+                assert answer.outcomes[0].status == pb.SUBSET_STATUS_ACCEPTED
+            assert own.client.export(Export()) == offline({"ant": subsets})
+            assert own.share.host.owned.slots == ALL_SLOTS
+
+
+def test_only_the_slots_of_a_server_that_ends_move() -> None:
+    names = ("a:1", "b:1", "c:1", "d:1")
+    before = {name: wanted_slots(names, name) for name in names}
+    assert frozenset.union(*before.values()) == ALL_SLOTS
+    assert sum(map(len, before.values())) == len(ALL_SLOTS)
+    after = {name: wanted_slots(names[1:], name) for name in names[1:]}
+    assert all(before[name] <= after[name] for name in names[1:])
+    assert frozenset.union(*after.values()) == ALL_SLOTS
