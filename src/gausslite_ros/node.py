@@ -39,10 +39,7 @@ class GaussliteNode(Node):  # type: ignore[misc]
             message_type = get_message(wanted.message_type)
             self.create_subscription(message_type, wanted.topic, wanted.callback, _QOS[wanted.delivery])
         self._writers = {
-            topic: (
-                kind := get_message(written.message_type),
-                self.create_publisher(kind, topic, _QOS[written.delivery]),
-            )
+            topic: self.create_publisher(get_message(written.message_type), topic, _QOS[written.delivery])
             for topic, written in publications(parameters).items()
         }
         self.create_timer(parameters.tf_period_s, lambda: self._publish(self.session.transforms(self._now_ns())))

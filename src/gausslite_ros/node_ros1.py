@@ -17,7 +17,8 @@ from roslib.message import get_message_class
 from gausslite.domain.errors import GaussLiteError
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.robot import AgentLink
-from gausslite_ros.robot_session import Delivery, Fields, NodeParameters, Outgoing, RobotSession, publications
+from gausslite_ros.outgoing import Fields
+from gausslite_ros.robot_session import Delivery, NodeParameters, Outgoing, RobotSession, publications
 
 _QUEUE_SIZE = 100
 _BUFFER_BYTES = 1 << 26

@@ -43,7 +43,7 @@ class PartSender:
     async def store(self, session: SessionRecord, message: bytes) -> StoredCount:
         """Return when every owner has its part of the message. Raises GaussLiteError to refuse it."""
         answered: Future[Any] = Future()
-        self.acknowledgements.add(answered)
+        self.acknowledgements.add(session.agent_id, answered)
         try:
             subset = await self._decode(session, message)
             self.received += 1
@@ -71,7 +71,8 @@ class PartSender:
     async def _decode(self, session: SessionRecord, message: bytes) -> StoredSubset:
         update = PendingUpdate(session.session_id, session.agent_id, message)
         self._queue.add(update)
-        decoded = self._decoded[update] = asyncio.get_running_loop().create_future()
+        decoded: asyncio.Future[StoredSubset] = asyncio.get_running_loop().create_future()
+        self._decoded[update] = decoded
         if not self._is_decoding:
             self._is_decoding = True
             self._decoder.submit(self._decode_waiting, asyncio.get_running_loop())

@@ -151,7 +151,8 @@ class _PartStream:
             )
         )
         self._woken.set()
-        outcome = self._outcomes[number] = asyncio.get_running_loop().create_future()
+        outcome: asyncio.Future[StoredCount] = asyncio.get_running_loop().create_future()
+        self._outcomes[number] = outcome
         try:
             return await outcome
         finally:

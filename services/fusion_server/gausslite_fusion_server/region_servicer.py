@@ -19,6 +19,7 @@ from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason
 from gausslite_fusion_server.messages import select_map
 from gausslite_fusion_server.region_host import RegionHost
+from gausslite_fusion_server.servicer import FusionServicer
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
 
@@ -179,13 +180,13 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         """Let the agent join again at its home."""
         return await self._at_home(request.agent_id).UnbanAgent(request, context)
 
-    def _at_home(self, agent_id: str) -> Any:
+    def _at_home(self, agent_id: str) -> FusionServicer:
         """Return the own servicer. Raises UnavailableError if this is not the agent's home."""
         if not self._host.owned.is_home(agent_id):
             raise UnavailableError(f"server {self._host.server}: is not the home of this agent")
         return self._host.local()
 
-    async def _home_of(self, session_id: str) -> Any:
+    async def _home_of(self, session_id: str) -> FusionServicer:
         """Return the own servicer. Raises SessionUnknownError, UnavailableError as `_at_home`."""
         session = await asyncio.to_thread(self._host.local().engine.session, session_id)
         return self._at_home(session.agent_id)
