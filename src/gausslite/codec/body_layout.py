@@ -43,6 +43,12 @@ class BodyLayout:
         return cls(len(batch), len(batch.gaussians), kappa_bytes, 1 if narrow else 2, precision)
 
     @property
+    def shared_bytes(self) -> int:
+        """Bytes of the voxel and label columns before compression."""
+        label_bytes = self.gaussians * (self.kappa_bytes + self.target_bytes) + (self.gaussians + 7) // 8
+        return self.voxels * VOXEL_BYTES + label_bytes
+
+    @property
     def widths(self) -> tuple[int, int, int, int, int, int]:
         """The fields as `_unpack` takes them."""
         precision = self.precision

@@ -73,8 +73,7 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int, st
     Raises CodecError, InvalidInputError.
     """
     frame, packed = _split(body)
-    shared = sum(column.byte_count for column in (*layout.voxel_columns(), *layout.label_columns()))
-    raw = decompress(frame, shared + _SYMBOL_BYTES * layout.gaussians)
+    raw = decompress(frame, layout.shared_bytes + _SYMBOL_BYTES * layout.gaussians)
     try:
         table, codes, targets = _unpack.unpack(raw, packed, layout.widths, columns.QUAT_STEPS, update_seq, stated_sums)
     except ValueError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,6 +56,12 @@ class RevisionLog:
     def revision(self) -> int:
         """The map's current revision."""
         return self._revision
+
+    def copy(self) -> RevisionLog:
+        """Return an equal log that changes on its own."""
+        other = copy(self)
+        other._changed_at, other._removed_at = dict(self._changed_at), OrderedDict(self._removed_at)
+        return other
 
     def record(self, changed: Iterable[int], removed: Iterable[int], revision: int) -> None:
         """Set the current revision, at which these voxels changed or became empty."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from copy import copy
 
 import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS, RevisionLog
-from gausslite.domain.voxels import tile_of
+from gausslite.domain.voxels import tile_of, tiles_of
 from gausslite.fusion.vote import VoteResult
 
 
@@ -22,6 +23,13 @@ class TileIndex:
 
     def __contains__(self, key: int) -> bool:
         return key in self._keys.get(tile_of(key), ())
+
+    def copy(self) -> TileIndex:
+        """Return an equal index that changes on its own."""
+        other = TileIndex()
+        other._keys = {tile: set(keys) for tile, keys in self._keys.items()}
+        other._revisions = dict(self._revisions)
+        return other
 
     def tiles(self) -> Int64[ndarray, " t"]:
         """Return the tiles that have voxels, ascending; a tile is named by the smallest key that it can hold."""
@@ -39,12 +47,12 @@ class TileIndex:
         """Return the revision of the last change in a tile; 0 if it never had voxels."""
         return self._revisions.get(tile, 0)
 
-    def record(self, changed: Iterable[int], removed: Iterable[int], revision: int) -> None:
+    def record(self, changed: Collection[int], removed: Collection[int], revision: int) -> None:
         """Record that these voxels changed or became empty at this revision."""
-        for key in changed:
-            tile = tile_of(key)
+        tiles = tiles_of(np.fromiter(changed, np.int64, len(changed))).tolist()
+        for key, tile in zip(changed, tiles, strict=True):
             self._keys.setdefault(tile, set()).add(key)
-            self._revisions[tile] = revision
+        self._revisions.update(dict.fromkeys(tiles, revision))
         for key in removed:
             tile = tile_of(key)
             own = self._keys.get(tile, set())
@@ -54,6 +62,26 @@ class TileIndex:
             self._revisions[tile] = revision
 
 
+class VoxelLog:
+    """The revisions of one layer of the fused map: when each voxel last changed, by voxel and by tile."""
+
+    def __init__(self, first_revision: int, max_removed: int) -> None:
+        self.revisions = RevisionLog(first_revision, max_removed)
+        self.tiles = TileIndex()
+
+    def copy(self) -> VoxelLog:
+        """Return an equal log that changes on its own."""
+        other = copy(self)
+        other.revisions, other.tiles = self.revisions.copy(), self.tiles.copy()
+        return other
+
+    def record(self, changed: Collection[int], removed: Collection[int]) -> None:
+        """Record as one revision that these voxels changed or became empty."""
+        revision = self.revisions.revision + 1
+        self.revisions.record(changed, removed, revision)
+        self.tiles.record(changed, removed, revision)
+
+
 class ChangeLog:
     """Count the revisions of the fused map since the server started, and store each voxel's winner with its Gaussians.
 
@@ -61,16 +89,15 @@ class ChangeLog:
     """
 
     def __init__(self, first_revision: int = 1, max_removed: int = MAX_REMOVED_VOXELS) -> None:
-        self._log = RevisionLog(first_revision, max_removed)
+        self.voxels = VoxelLog(first_revision, max_removed)
         self._winner: dict[int, tuple[str, int]] = {}
         self._won_voxels: dict[str, int] = {}
         self._fused_gaussians = 0
-        self._tiles = TileIndex()
 
     @property
     def revision(self) -> int:
         """The fused map's current revision."""
-        return self._log.revision
+        return self.voxels.revisions.revision
 
     @property
     def fused_voxels(self) -> int:
@@ -89,7 +116,7 @@ class ChangeLog:
     @property
     def tiles(self) -> TileIndex:
         """The voxels of the fused map by tile."""
-        return self._tiles
+        return self.voxels.tiles
 
     def winners(self, keys: Iterable[int]) -> dict[str, list[int]]:
         """Return those of the voxels that are in the fused map, by winner."""
@@ -108,12 +135,12 @@ class ChangeLog:
         for key, name, count in zip(keys, names, counts, strict=True):
             self._set(key, (name, count))
         if keys:
-            self._advance(keys, [])
+            self.voxels.record(keys, [])
 
     def mark_changed(self, keys: Int64[ndarray, " k"]) -> None:
         """Record that these voxels of the fused map have changed, with the winners that are recorded already."""
         if len(keys):
-            self._advance(keys.tolist(), [])
+            self.voxels.record(keys.tolist(), [])
 
     def record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]], vote: VoteResult) -> Int64[ndarray, " c"]:
         """Record which voxels changed by agent, as one revision; `vote` is the new result on these voxels.
@@ -130,24 +157,20 @@ class ChangeLog:
                 new, old = new_winner.get(key), self._winner.get(key)
                 # after another agent has replaced the old winner, `old` is the new one
                 if agent_id in (new and new[0], old and old[0]):
-                    self._set(key, new)
+                    if new != old:
+                        self._set(key, new)
                     (removed if new is None else changed)[key] = None
         if changed or removed:
-            self._advance(list(changed), list(removed))
+            self.voxels.record(list(changed), list(removed))
         return np.array(sorted([*changed, *removed]), np.int64)
 
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the voxels that changed or became empty after this revision, ascending. Raises RevisionGoneError."""
-        return self._log.changed_since(revision)
+        return self.voxels.revisions.changed_since(revision)
 
     def changed_after(self, keys: Iterable[int], revision: int) -> list[int]:
         """Return those of the voxels of the fused map that changed after this revision."""
-        return [key for key in keys if self._log.changed_at(key) > revision]
-
-    def _advance(self, changed: list[int], removed: list[int]) -> None:
-        revision = self._log.revision + 1
-        self._log.record(changed, removed, revision)
-        self._tiles.record(changed, removed, revision)
+        return [key for key in keys if self.voxels.revisions.changed_at(key) > revision]
 
     def _set(self, key: int, new: tuple[str, int] | None) -> None:
         old = self._winner.pop(key, None)

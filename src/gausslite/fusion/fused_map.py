@@ -19,7 +19,7 @@ from gausslite.codec.stored import from_bytes, to_records
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, MismatchError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxel_changes import RevisionLog, hash_columns
+from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import (
     VoxelBatch,
     VoxelGrid,
@@ -29,7 +29,7 @@ from gausslite.domain.voxels import (
     select_keys,
     select_voxels,
 )
-from gausslite.fusion.change_log import ChangeLog, TileIndex
+from gausslite.fusion.change_log import ChangeLog, TileIndex, VoxelLog
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import FusedMap, VoteResult, fuse, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
@@ -168,18 +168,20 @@ class FusedMapLayers:
         self._votes, self._lock, self._grid = votes, lock, grid
         self._change_log = ChangeLog(first_revision, max_removed_voxels)
         self._refined: RefinedMap | None = None
-        self._refined_log = RevisionLog(first_revision, max_removed_voxels)
-        self._refined_tiles = TileIndex()
         vote = rank_voxels(votes.scores())
         self._change_log.load(vote)
-        shown = vote.keys if stored is None else self._restore_refined(stored, vote)
-        if len(shown):
-            self._record_refined(shown.tolist(), [])
+        # until the first refinement, the refined layer is the vote
+        self._refined_log = self._change_log.voxels
+        if stored is not None:
+            self._refined_log = VoxelLog(first_revision, max_removed_voxels)
+            shown = self._restore_refined(stored, vote)
+            if len(shown):
+                self._refined_log.record(shown.tolist(), [])
 
     def revision(self, layer: MapLayer = MapLayer.VOTE) -> int:
         """Return the layer's revision; it increases with every change."""
         with self._lock:
-            return self._change_log.revision if layer is MapLayer.VOTE else self._refined_log.revision
+            return self._log_of(layer).revisions.revision
 
     def size(self) -> tuple[int, int]:
         """Return the number of voxels and of Gaussians of the vote."""
@@ -209,7 +211,7 @@ class FusedMapLayers:
     def changes(self, since_revision: int = 0, layer: MapLayer = MapLayer.VOTE) -> FusedMapChanges:
         """Return the changes of a layer since a revision; the whole map for 0. Raises RevisionGoneError."""
         with self._lock:
-            log = self._change_log if layer is MapLayer.VOTE else self._refined_log
+            log = self._log_of(layer).revisions
             if since_revision:
                 keys = log.changed_since(since_revision)
             else:
@@ -242,9 +244,11 @@ class FusedMapLayers:
         refined = RefinedMap(group_by_voxel(gaussians, self._grid), revision)
         with self._lock:
             changed = set(self._change_log.changed_since(revision).tolist())
-            before = self._refined_tiles.all_keys()
+            if self._refined is None:
+                self._refined_log = self._change_log.voxels.copy()
+            before = self._refined_log.tiles.all_keys()
             shown = (set(refined.batch.keys.tolist()) - changed) | (before & changed)
-            self._record_refined(sorted(shown - changed), sorted(before - shown))
+            self._refined_log.record(sorted(shown - changed), sorted(before - shown))
             self._refined = refined
             vote = rank_voxels(self._votes.scores())
         return StoredRefinement.of(refined, vote, np.array(sorted(changed), np.int64))
@@ -277,8 +281,11 @@ class FusedMapLayers:
         with self._lock:
             return self._won_voxels(layer, self._tiles_of(layer).keys(tile))
 
+    def _log_of(self, layer: MapLayer) -> VoxelLog:
+        return self._change_log.voxels if layer is MapLayer.VOTE else self._refined_log
+
     def _tiles_of(self, layer: MapLayer) -> TileIndex:
-        return self._change_log.tiles if layer is MapLayer.VOTE else self._refined_tiles
+        return self._log_of(layer).tiles
 
     def _won_voxels(self, layer: MapLayer, keys: Int64[ndarray, " k"]) -> WonVoxels:
         voted = keys
@@ -298,11 +305,13 @@ class FusedMapLayers:
     def _record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
         vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
         fused_changes = self._change_log.record(changed_keys, vote)
+        if self._refined is None:
+            return
         present = set(vote.keys.tolist())
         changed = [key for key in fused_changes.tolist() if key in present]
-        removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_tiles]
+        removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_log.tiles]
         if changed or removed:
-            self._record_refined(changed, removed)
+            self._refined_log.record(changed, removed)
 
     def _restore_refined(self, stored: StoredRefinement, vote: VoteResult) -> Int64[ndarray, " k"]:
         """Show a refinement from before a restart; returns the voxels of the refined layer."""
@@ -310,11 +319,6 @@ class FusedMapLayers:
         self._refined = RefinedMap(stored.without_removed(vote), self._change_log.revision)
         self._change_log.mark_changed(changed)
         return np.union1d(self._refined.batch.keys, changed)
-
-    def _record_refined(self, changed: list[int], removed: list[int]) -> None:
-        revision = self._refined_log.revision + 1
-        self._refined_log.record(changed, removed, revision)
-        self._refined_tiles.record(changed, removed, revision)
 
     def _require_contributor(self, agent_id: str) -> None:
         agents = self._votes.agents()

@@ -137,7 +137,7 @@ class AgentTotals:
 
 def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
     """Return a sum that cannot wrap around."""
-    return (int((values >> np.uint64(32)).sum()) << 32) + int((values & np.uint64(0xFFFFFFFF)).sum())
+    return sum(values.tolist())
 
 
 @runtime_checkable

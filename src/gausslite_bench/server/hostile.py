@@ -24,7 +24,7 @@ import numpy as np
 
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.voxels import RoiSubset
 from gausslite.task.rules import RuleParser
 from gausslite.wire.async_calls import UpdateStreams
@@ -46,9 +46,12 @@ GOOD_AGENTS = 4
 _SEQ = 1 << 20
 _SAMPLE_S = 0.2
 _STORM_THREADS = 8
-_BEGIN_S = 3.0
-"""Until the attackers have joined."""
 _NOUN = "mug"
+
+
+def _note_begin() -> None:
+    sys.stdout.write("attacking\n")
+    sys.stdout.flush()
 
 
 def _join(address: str, count: int) -> list[tuple[str, str]]:
@@ -63,6 +66,7 @@ def _resend(address: str, count: int, make: Callable[[str], bytes]) -> None:
     async def run() -> None:
         joined = _join(address, count)
         messages = [make(name) for name, _ in joined]
+        _note_begin()
         async with UpdateStreams(address) as streams:
 
             async def repeat(session_id: str, message: bytes) -> None:
@@ -87,6 +91,7 @@ def _storm(address: str, call: Callable[[FusionClient, int], object]) -> None:
                 with contextlib.suppress(GaussLiteError):
                     call(client, number)
 
+    _note_begin()
     threads = [threading.Thread(target=repeat, args=(thread,), daemon=True) for thread in range(_STORM_THREADS)]
     for thread in threads:
         thread.start()
@@ -132,6 +137,7 @@ def _slow_readers(address: str) -> None:
     for stream in streams:
         with contextlib.suppress(GaussLiteError):
             next(stream)
+    _note_begin()
     threading.Event().wait()
 
 
@@ -148,6 +154,7 @@ def _half_open(address: str) -> None:
         sessions = _join(address, 48)
         async with UpdateStreams(address) as streams:
             held = [streams.open(session_id) for _, session_id in sessions for _ in range(8)]
+            _note_begin()
             await asyncio.sleep(1e6)
             held.clear()
 
@@ -219,9 +226,11 @@ def _lines(log: Path) -> list[str]:
 def _attacking(attack: str, address: str) -> Iterator[None]:
     """Attack from another process; it has a low priority, as if it ran on another machine."""
     command = [sys.executable, "-m", __name__, attack, address]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:  # noqa: S603 - this program
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe) as process:  # noqa: S603 - this program
         try:
-            time.sleep(_BEGIN_S)
+            if process.stdout is None or not process.stdout.readline():
+                raise UnavailableError(f"attack {attack}: expected it to begin, but its process ended")
             yield
         finally:
             process.kill()
