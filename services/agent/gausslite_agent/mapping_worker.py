@@ -11,7 +11,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ from gausslite.domain.errors import InvalidInputError, MismatchError, StorageErr
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
-from gausslite.domain.relevance import DetectedImage
+from gausslite.domain.relevance import DetectedImage, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.mapper import GaussianMapper
@@ -35,6 +35,7 @@ from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.schedule import MapRecorder, Timeline
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
+from gausslite.perception.pointing import pointed_masks
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import CameraView
@@ -172,12 +173,15 @@ class MappingWorker:
         """Return the map's revision. It increases, also across restarts."""
         return self.status().map_revision
 
-    def assign(self, graph: TaskGraph) -> Future[None]:
+    def assign(
+        self, graph: TaskGraph | None, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()
+    ) -> Future[TaskGraph]:
         """Switch to this task with the next frame; the map is kept and earlier keyframes are re-evaluated.
 
-        A task that is equivalent to the current one changes nothing. The future raises ModelFileError and the like.
+        A task that is equivalent to the current one changes nothing; without one, the current task goes on with what a
+        person points at. The future returns the graph; it raises InvalidInputError, ModelFileError and the like.
         """
-        return self._submit(lambda: self._assign(graph))
+        return self._submit(lambda: self._assign(graph, pointed, excluded_m))
 
     def restore(self, saved: SavedMission) -> Future[None]:
         """Continue a saved mission; call it before the first frame. The future raises MapFileError, StorageError."""
@@ -262,11 +266,20 @@ class MappingWorker:
         with suppress(UnavailableError):
             self._submit(work)
 
-    def _assign(self, graph: TaskGraph) -> None:
-        self._report_task(self._switch(graph))
+    def _assign(
+        self, graph: TaskGraph | None, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM]
+    ) -> TaskGraph:
+        # before any change: a person may point at nothing
+        masks = pointed_masks(pointed, [keyframe.as_recorded for keyframe in self._mapper.keyframes()])
+        base = graph or self.status().graph or TaskGraph("", "", (), (), ())
+        extended = base.with_pointed(noun for noun, _, _ in masks)
+        task_mapper = self._switch(extended, is_extended=graph is None)
+        task_mapper.point_at(masks, excluded_m)
+        self._report_task(task_mapper)
+        return extended
 
-    def _switch(self, graph: TaskGraph) -> TaskMapper:
-        """Make this the task of the next frame, and return its mapper."""
+    def _switch(self, graph: TaskGraph, is_extended: bool = False) -> TaskMapper:
+        """Make this the task of the next frame; return its mapper. is_extended: the task goes on with more targets."""
         current = self.status().graph
         if self._task_mapper is None:
             self._task_mapper = TaskMapper(
@@ -278,7 +291,8 @@ class MappingWorker:
                 build_tracker(self._settings, self._mapper),
             )
         elif current is None or not graph.is_equivalent_to(current):
-            self._task_mapper.assign(self._build_estimator(graph))
+            change = self._task_mapper.extend if is_extended else self._task_mapper.assign
+            change(self._build_estimator(graph))
         self._status.update(graph=graph)
         return self._task_mapper
 

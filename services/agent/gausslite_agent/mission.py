@@ -19,6 +19,7 @@ from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
 from gausslite.task.grounding import TaskParser
+from gausslite.wire.convert_task import AssignedTask
 from gausslite.wire.spool import Purpose
 from gausslite.wire.update_sender import UplinkCounters
 from gausslite.wire.uplink import Uplink
@@ -147,16 +148,17 @@ class AgentMission:
         if self._worker.uplink is not None:
             self._worker.uplink.limit_drain(grace_s)
 
-    def assign(self, graph: TaskGraph) -> TaskGraph:
+    def assign(self, assigned: AssignedTask) -> TaskGraph:
         """Assign a task, which begins the next mission if the last one has ended; return it with further warnings.
 
-        The warnings name the nouns that the detector cannot find, with the nearest names that it can.
-        Raises MismatchError while a mission ends, ModelFileError and the like.
+        The warnings name the nouns that the detector cannot find, with the nearest names that it can. Without a
+        detector, a person must point at all targets. Raises MismatchError while a mission ends, InvalidInputError,
+        ModelFileError and the like.
         """
         self._state_machine.require_accepting("task")
-        if not self.can_detect:
+        if not self.can_detect and assigned.graph is not None and assigned.graph.queries:
             raise MismatchError(f"task: {NO_DETECTOR}")
-        self._worker.assign(graph).result()
+        graph = self._worker.assign(assigned.graph, assigned.pointed, assigned.excluded_m).result()
         self._begin()
         unknown = match_warnings([noun.match for noun in self._worker.status().nouns])
         return replace(graph, warnings=(*graph.warnings, *unknown)[: LIMITS.max_warnings])
@@ -172,7 +174,7 @@ class AgentMission:
             _log.info("resuming %r after frame %d", resumed.graph.text, resumed.last_index)
             self._begin()
         if task is not None and (resumed is None or task != resumed.requested_task):
-            self.assign(self._parser.parse(task))
+            self.assign(AssignedTask(self._parser.parse(task)))
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame and return the future of its report. Call it from one thread.

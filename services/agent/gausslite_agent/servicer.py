@@ -39,7 +39,7 @@ from gausslite.wire.convert import (
     live_frame_from_message,
     transform_from_message,
 )
-from gausslite.wire.convert_task import graph_from_message, graph_to_message
+from gausslite.wire.convert_task import AssignedTask, assigned_from_message, graph_to_message
 from gausslite.wire.map_changes import BLOCK_BYTES, EncodedPart, EncodedPartCache, Parts, encode_parts, follow
 from gausslite.wire.server import Service
 from gausslite.wire.update_sender import UplinkCounters
@@ -192,7 +192,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         return Service(name, lambda server: pb_grpc.add_AgentServiceServicer_to_server(self, server))
 
     async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:  # noqa: N802
-        """Assign a task, given as text or as a graph."""
+        """Assign a task, given as text or as a graph, and what a person points at."""
         graph = await self._newest_task.assign(lambda: self._mission.assign(self._read_task(request)))
         return pb.AssignTaskResponse(graph=graph_to_message(graph))
 
@@ -269,14 +269,8 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         async for block in blocks:
             yield pb.WatchMapResponse(block=block)
 
-    def _read_task(self, request: pb.AssignTaskRequest) -> TaskGraph:
-        match request.WhichOneof("task"):
-            case "text":
-                return self._parser.parse(request.text)
-            case "graph":
-                return graph_from_message(request.graph)
-            case _:
-                raise InvalidInputError("task: expected a text or a graph, got neither")
+    def _read_task(self, request: pb.AssignTaskRequest) -> AssignedTask:
+        return assigned_from_message(request, self._parser.parse)
 
     async def _read_frames(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int16, Int64, UInt8
@@ -68,6 +68,33 @@ class TargetPoint:
     def ball(self) -> BallRegion:
         """Return the ball of the radius, of a metre without one. Raises InvalidInputError."""
         return BallRegion(self.point_m, 1.0 if self.radius_m is None else self.radius_m)
+
+
+PointM = tuple[float, float, float]
+"""A point in the world in metres."""
+UNNAMED: Final = "object"
+"""The noun of an object that a person points at without a word."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointedObject:
+    """One object that a person points at: by points (x, y) and boxes (left, top, right, bottom) on a keyframe's image,
+    or by a point in the world on a surface that a keyframe shows.
+
+    frame_index: of the keyframe; None for the newest. noun: what it is, for the team.
+    """
+
+    points_px: tuple[tuple[float, float], ...] = ()
+    boxes_px: tuple[tuple[float, float, float, float], ...] = ()
+    point_m: PointM | None = None
+    frame_index: int | None = None
+    noun: str = UNNAMED
+
+    def __post_init__(self) -> None:
+        if (self.point_m is not None) == bool(self.points_px or self.boxes_px):
+            raise InvalidInputError(
+                "pointed object: expected points and boxes in pixels, or a point_m, got both or none"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
@@ -33,12 +34,13 @@ class Predicate(StrEnum):
 
 
 class TargetRole(StrEnum):
-    """What the robot does with a target (docs/guides/task.md)."""
+    """What the robot does with a target (docs/guides/task.md); POINTED: a person points at it, nothing searches it."""
 
     OBJECT = "object"
     DESTINATION = "destination"
     TOOL = "tool"
     OBSTACLE = "obstacle"
+    POINTED = "pointed"
 
 
 class Superlative(StrEnum):
@@ -127,8 +129,19 @@ class TaskGraph:
     @property
     def queries(self) -> tuple[str, ...]:
         """The nouns to detect, in order, without duplicates: Q of Sec. III-B.1, and the excluded nouns."""
-        nouns = dict.fromkeys(noun_of(name) for name in (*self.targets, *self.anchors))
+        roles = zip(self.targets, self.roles, strict=True)
+        searched = [target for target, role in roles if role is not TargetRole.POINTED]
+        nouns = dict.fromkeys(noun_of(name) for name in (*searched, *self.anchors))
         return tuple(dict.fromkeys((*nouns, *self.excluded_nouns)))
+
+    def with_pointed(self, nouns: Iterable[str]) -> TaskGraph:
+        """Return the graph with the nouns that a person points at among its targets. Raises TaskError."""
+        known = set(map(noun_of, self.targets))
+        new = tuple(dict.fromkeys(noun for noun in nouns if noun not in known))
+        roles = (*self.roles, *(TargetRole.POINTED for _ in new))
+        graph = replace(self, targets=(*self.targets, *new), roles=roles)
+        require_graph(graph)
+        return graph
 
     @property
     def excluded_nouns(self) -> tuple[str, ...]:

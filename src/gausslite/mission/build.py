@@ -108,21 +108,23 @@ class EstimatorFactory:
     def build(self, graph: TaskGraph) -> RelevanceEstimator:
         """Return the relevance estimator of a task.
 
-        It uses the user's models or, without any, the scene's ground truth. Raises InvalidInputError without both.
+        It uses the user's models or, without any, the scene's ground truth. Raises InvalidInputError without both,
+        unless a person points at all targets.
         """
         accept_similar = self._perception.accept_similar
         evidence = EvidenceSettings.accept_similar() if accept_similar else EvidenceSettings()
         settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
         if self._models is None:
-            return TaskRelevanceEstimator(graph, self._ground_truth_detector(), settings)
+            return TaskRelevanceEstimator(graph, self._ground_truth_detector(bool(graph.queries)), settings)
         detector = self._models.detector
         if not self._perception.asynchronous:
             return TaskRelevanceEstimator(graph, detector, settings)
         self._executor = self._executor or ThreadPoolExecutor(1, "detector")
         return AsyncRelevanceEstimator(graph, detector, self._executor, settings)
 
-    def _ground_truth_detector(self) -> Detector:
-        self.require_detector()
+    def _ground_truth_detector(self, is_needed: bool = True) -> Detector:
+        if is_needed:
+            self.require_detector()
         from gausslite.perception.detector import RegionDetector
 
         return RegionDetector(self._scene().regions)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounReport, ObjectLandmark
-from gausslite.domain.relevance import DetectedImage, RelevanceMap
+from gausslite.domain.relevance import DetectedImage, PointM, RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
@@ -85,6 +85,23 @@ class TaskMapper:
         self._mapper.reset_roi()
         if self._sent_voxels is not None:
             self._sent_voxels.freeze_sent()
+
+    def extend(self, estimator: RelevanceEstimator) -> None:
+        """Continue with the estimator of the same task with more targets; it takes over all objects."""
+        estimator.restore(self._estimator.state())
+        self._estimator = estimator
+
+    def point_at(
+        self, masks: Iterable[tuple[str, Bool[ndarray, "h w"], Frame]], excluded_m: Iterable[PointM] = ()
+    ) -> None:
+        """Add the objects that a person points at, with noun, mask and frame of each, and leave out those at points.
+
+        Raises InvalidInputError.
+        """
+        for noun, mask, frame in masks:
+            self._estimator.point_at(noun, mask, frame)
+        for point_m in excluded_m:
+            self._estimator.exclude(point_m)
 
     @property
     def notes(self) -> tuple[str, ...]:

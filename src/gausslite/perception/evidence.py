@@ -40,6 +40,8 @@ class Evidence:
 
     def state(self, landmark: Landmark) -> LandmarkState:
         """Return how sure it is that a landmark exists; each detection or miss may change it."""
+        if landmark.is_given:
+            return LandmarkState.KNOWN
         seen, missed = landmark.seen_count, landmark.missed_count
         has_detections = seen >= self.settings.min_seen or landmark.best_score >= self.settings.confident_score
         is_found = seen >= self.settings.min_seen_fraction * (seen + missed)
@@ -55,19 +57,22 @@ class Evidence:
 
     def rival(self, landmark: Landmark) -> str | None:
         """Return the different thing that the landmark rather is by the sums of the scores; None if there is none."""
+        if landmark.is_given:
+            return None
         name, score = max(landmark.rival_scores.items(), key=lambda item: item[1], default=("", 0.0))
         return name if score > self.settings.max_rival_ratio * landmark.score_sum else None
 
     def without_low_scores(self, landmarks: Sequence[Landmark]) -> list[Landmark]:
         """Return those of one target's landmarks whose confidence is not far below the best of all."""
-        limit = self.settings.min_score_share * max((landmark.confidence for landmark in landmarks), default=0.0)
+        found = (landmark.confidence for landmark in landmarks if not landmark.is_given)
+        limit = self.settings.min_score_share * max(found, default=0.0)
         return [landmark for landmark in landmarks if landmark.confidence >= limit]
 
     def is_present(self, landmark: Landmark) -> bool:
         """Return True if the latest frame with detections found the landmark, or few of its frames missed it."""
         found = landmark.seen_count + landmark.weak_count
         is_often_found = found >= self.settings.min_present_fraction * (found + landmark.missed_count)
-        return landmark.missed_in_a_row == 0 or is_often_found
+        return landmark.is_given or landmark.missed_in_a_row == 0 or is_often_found
 
     def needs_observation(self, landmark: Landmark) -> bool:
         """Return True if one more observation could confirm a candidate."""

@@ -91,6 +91,7 @@ class Landmark:
     masks, on its surface. missed_in_a_row: frames since the last detection that should have shown it.
     weak_count: frames with a weak detection only, whose score is in score_sum.
     colours: sums over its observations. levels_m: the latest levels of planes seen under it.
+    is_given: a person has pointed at it, so it exists whatever detections say.
     """
 
     phrase: str
@@ -112,6 +113,7 @@ class Landmark:
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
     levels_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     weak_count: int = 0
+    is_given: bool = False
     settings: ObjectMapSettings = field(default_factory=ObjectMapSettings)
 
     @classmethod
@@ -157,6 +159,8 @@ class Landmark:
     @property
     def confidence(self) -> float:
         """The best score times the share of frames that detected the object, of those that should have."""
+        if self.is_given:
+            return 1.0
         return min(max(self.best_score, 0.0), 1.0) * self.seen_count / (self.seen_count + self.missed_count)
 
     def seen_from(self, camera_m: Float64[ndarray, "3"]) -> Observation:
@@ -184,6 +188,7 @@ class Landmark:
 
     def add(self, other: Landmark) -> None:
         """Merge another landmark into this one, and recompute the centroid."""
+        self.is_given |= other.is_given
         self.seen_count += other.seen_count
         self.weak_count += other.weak_count
         self.missed_count += other.missed_count
@@ -213,6 +218,12 @@ class Landmark:
         centres_m = self.footprint_m().astype(np.float64)
         self.centroid_m = centres_m.mean(axis=0)
         self.radius_m = 2.0 * float(np.median(np.linalg.norm(centres_m - self.centroid_m, axis=1)))
+
+    def contains(self, point_m: Float64[ndarray, "3"]) -> bool:
+        """Return True if a point is in the box of the footprint, or within half a cell of it."""
+        box, slack_m = self.box_m(), 0.5 * self.settings.cell_m
+        inside = (point_m >= np.array(box.min_m) - slack_m) & (point_m <= np.array(box.max_m) + slack_m)
+        return bool(inside.all())
 
     def box_m(self) -> AxisAlignedBox:
         """Return the axis-aligned box of the footprint's cells."""
@@ -271,7 +282,7 @@ class ObjectMap:
                     landmark.missed_count += 1
                     landmark.missed_in_a_row += 1
         while len(self._objects) > self._settings.max_objects:
-            self._objects.remove(min(self._objects, key=lambda landmark: landmark.seen_count))
+            self._objects.remove(min(self._objects, key=lambda landmark: (landmark.is_given, landmark.seen_count)))
 
     def _matches(self, observation: Observation) -> list[Landmark]:
         return [landmark for landmark in self.with_phrase(observation.phrase) if landmark.matches(observation)]

@@ -15,7 +15,7 @@ from gausslite.domain.camera import back_project, project
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.domain.relevance import Region
+from gausslite.domain.relevance import PointedObject, Region
 from gausslite.perception.depth_segmenter import DepthSegmenter
 from gausslite.perception.lifting import without_background_planes
 from gausslite.perception.settings import LiftingSettings, SurfaceSettings
@@ -64,6 +64,15 @@ def region_on_image(
 
     Raises InvalidInputError for a point outside the image, or a point or box without depth.
     """
+    return SurfaceRegion(mask_votes(mask_on_image(frame, points_px, boxes_px), frame, SurfaceSettings()))
+
+
+def mask_on_image(
+    frame: Frame,
+    points_px: Sequence[tuple[float, float]] = (),
+    boxes_px: Sequence[tuple[float, float, float, float]] = (),
+) -> Bool[ndarray, "h w"]:
+    """Return the mask of points and boxes as `region_on_image` does. Raises InvalidInputError."""
     if not (points_px or boxes_px):
         raise InvalidInputError("points: expected at least one point or box, got none")
     settings = PointingSettings()
@@ -72,7 +81,7 @@ def region_on_image(
         mask |= _grown(frame, *_pixel(frame, x, y), settings)
     for box in boxes_px:
         mask |= _in_box(frame, box, settings)
-    return SurfaceRegion(mask_votes(mask, frame, SurfaceSettings()))
+    return mask
 
 
 def region_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> Region:
@@ -80,6 +89,12 @@ def region_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> R
 
     Of frames that measure the same place, this is the nearest. Raises InvalidInputError if none shows the point.
     """
+    frame, mask = mask_at(point_m, frames)
+    return SurfaceRegion(mask_votes(mask, frame, SurfaceSettings()))
+
+
+def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tuple[Frame, Bool[ndarray, "h w"]]:
+    """Return the frame that shows a point best, and the mask as `region_at` grows it. Raises InvalidInputError."""
     settings = PointingSettings()
     best: tuple[tuple[int, float], Frame, tuple[int, int]] | None = None
     for frame in frames:
@@ -90,7 +105,35 @@ def region_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> R
         place = ",".join(f"{value:g}" for value in point_m)
         raise InvalidInputError(f"target {place}: expected a point on a surface that a frame shows, none shows it")
     _, frame, (row, column) = best
-    return SurfaceRegion(mask_votes(_grown(frame, row, column, settings), frame, SurfaceSettings()))
+    return frame, _grown(frame, row, column, settings)
+
+
+def pointed_masks(
+    pointed: Iterable[PointedObject], keyframes: Sequence[Frame]
+) -> list[tuple[str, Bool[ndarray, "h w"], Frame]]:
+    """Return noun, mask and keyframe of each object that a person points at; the keyframes are given oldest first.
+
+    Raises InvalidInputError.
+    """
+    masks = []
+    for shown in pointed:
+        if shown.point_m is not None:
+            frame, mask = mask_at(shown.point_m, keyframes)
+        else:
+            frame = _keyframe(shown.frame_index, keyframes)
+            mask = mask_on_image(frame, shown.points_px, shown.boxes_px)
+        masks.append((shown.noun, mask, frame))
+    return masks
+
+
+def _keyframe(index: int | None, keyframes: Sequence[Frame]) -> Frame:
+    """Return the keyframe of an index, the newest for None. Raises InvalidInputError."""
+    frame = next((frame for frame in reversed(keyframes) if index in (None, frame.index)), None)
+    if frame is None:
+        kept = ", ".join(str(frame.index) for frame in keyframes[-4:])
+        expected = f"a keyframe that is kept, such as {kept}" if kept else "a mapped frame first"
+        raise InvalidInputError(f"frame_index: expected {expected}; got {index}")
+    return frame
 
 
 def _pixel(frame: Frame, x: float, y: float) -> tuple[int, int]:

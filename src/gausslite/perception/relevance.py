@@ -8,13 +8,13 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounReport, ObjectLandmark, match_warnings
-from gausslite.domain.relevance import NO_TARGET, DetectedImage, Detection, Region, RelevanceMap
+from gausslite.domain.relevance import NO_TARGET, DetectedImage, Detection, PointM, Region, RelevanceMap
 from gausslite.domain.state import State
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.detector import Detector
@@ -88,6 +88,16 @@ class RelevanceEstimator(ABC):
         """What is searched for each noun of the task, and what was detected; empty without a detector."""
         return ()
 
+    def point_at(self, noun: str, mask: Bool[ndarray, "h w"], frame: Frame) -> None:
+        """Add the object that a person points at, by its mask on a frame. Raises InvalidInputError."""
+        del mask, frame
+        raise InvalidInputError(f"pointed object: expected a task, to which {noun!r} belongs, got none")
+
+    def exclude(self, point_m: PointM) -> None:
+        """Leave out the object at a point in the world. Raises InvalidInputError."""
+        del point_m
+        raise InvalidInputError("excluded: expected a task with objects, got none")
+
     def state(self) -> State:
         """Return everything that the next frame's relevance depends on, except the frame, as named arrays."""
         return {}
@@ -160,6 +170,14 @@ class DetectingEstimator(RelevanceEstimator):
     def complete(self, frame: Frame, relevance: RelevanceMap) -> RelevanceMap:
         """Return an earlier frame's relevance with the objects that became known since."""
         return self._tracker.complete(frame, relevance)
+
+    def point_at(self, noun: str, mask: Bool[ndarray, "h w"], frame: Frame) -> None:
+        """Add the object that a person points at, by its mask on a frame. Raises InvalidInputError."""
+        self._tracker.point_at(noun, mask, frame)
+
+    def exclude(self, point_m: PointM) -> None:
+        """Leave out the object at a point in the world. Raises InvalidInputError."""
+        self._tracker.exclude(point_m)
 
     def state(self) -> State:
         """Return the tracker's state as named arrays, without running detections."""

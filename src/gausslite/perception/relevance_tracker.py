@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.domain.errors import MapFileError
+from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch, NounReport, ObjectLandmark, is_generic
 from gausslite.domain.pose import require_rigid, rotation_angle_deg, translation_m, unit_up_axis
-from gausslite.domain.relevance import NO_TARGET, Detection, RelevanceMap
+from gausslite.domain.relevance import NO_TARGET, Detection, PointM, RelevanceMap
 from gausslite.domain.state import (
     State,
     add_prefix,
@@ -29,6 +29,7 @@ from gausslite.domain.state import (
 )
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.colours import ColourFilter, no_colours
+from gausslite.perception.detector import bounding_box
 from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
 from gausslite.perception.lifting import lift_detections
 from gausslite.perception.object_map import Landmark, ObjectMap, describe_landmarks
@@ -82,7 +83,8 @@ class RelevanceTracker:
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
         """The confirmed objects of the task, targets before anchors, the most confident first."""
-        return describe_landmarks(self._evidence.confirmed(self.landmarks), self._graph)
+        confirmed = self._evidence.confirmed(self.landmarks)
+        return describe_landmarks([found for found in confirmed if not self._targets.is_excluded(found)], self._graph)
 
     def report(self, match: NounMatch) -> NounReport:
         """Return what has been detected of a noun so far."""
@@ -107,6 +109,7 @@ class RelevanceTracker:
         floor = self._surfaces.floor
         levels = [] if floor.first_camera_m is None else [floor.first_camera_m]
         state |= {"floor_counts": floor.counts, "first_camera_m": np.array(levels, np.float64)}
+        state["excluded_m"] = self._targets.excluded_m
         state["count"] = int_array(len(self.landmarks))
         for i, landmark in enumerate(self.landmarks):
             state |= add_prefix(f"landmark-{i}", encode_landmark(landmark))
@@ -121,12 +124,37 @@ class RelevanceTracker:
         for pose in poses:
             require_rigid("state T_world_keyframe", pose)
         saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
+        self._targets.excluded_m = get_array(state, "excluded_m", (None, 3), np.float64).copy()
         self._surfaces.floor = decode_floor(state, self._settings.heights)
         self._object_map.restore([decode_landmark(saved, self._settings) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
         self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
         self._needs_observation = needs_observation > 0
         self._known_targets = list(get_counts(state, "known_targets", len(state.get("known_targets", ()))))
+
+    def point_at(self, noun: str, mask: Bool[ndarray, "h w"], frame: Frame) -> None:
+        """Add the object that a person points at: its mask on a frame. It is meant again if it was excluded.
+
+        Raises InvalidInputError for a mask with too little depth, or of a plane where the noun's kind is none.
+        """
+        detection = Detection(noun, 1.0, bounding_box(mask) or (0.0, 0.0, 0.0, 0.0), mask, is_exact=True)
+        lifted = lift_detections([detection], frame.depth_m, frame, self._settings)
+        if not lifted:
+            raise InvalidInputError(f"pointed object: expected a {noun!r} with depth on frame {frame.index}, got none")
+        ((_, observation),) = lifted
+        self._object_map.observe([observation])
+        landmark = self._object_map.match(observation)
+        assert landmark is not None
+        landmark.is_given = True
+        left = [point_m for point_m in self._targets.excluded_m if not landmark.contains(point_m)]
+        self._targets.excluded_m = np.array(left).reshape(-1, 3)
+
+    def exclude(self, point_m: PointM) -> None:
+        """Leave out the object at a point, now and when it is detected again. Raises InvalidInputError for too many."""
+        max_points = self._settings.object_map.max_objects
+        if len(self._targets.excluded_m) == max_points:
+            raise InvalidInputError(f"excluded: expected at most {max_points} points, got more")
+        self._targets.excluded_m = np.vstack([self._targets.excluded_m, point_m])
 
     def update_keyframe(self, frame: Frame) -> bool:
         """Return whether this frame needs a detection, and make it the keyframe if so.
@@ -273,7 +301,7 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
         "cells": landmark.cells,
         "counts": landmark.counts,
         "seen_missed": int_array(landmark.seen_count, landmark.missed_count, landmark.missed_in_a_row),
-        "weak_count": int_array(landmark.weak_count),
+        "weak_given": int_array(landmark.weak_count, landmark.is_given),
         "seen_ns_number": np.array([landmark.first_seen_ns, landmark.last_seen_ns, landmark.number], np.int64),
         "best_score_farthest_m": np.array([landmark.best_score, landmark.farthest_m]),
         "rival_names": encode_text("\n".join(landmark.rival_scores)),
@@ -294,7 +322,7 @@ def decode_landmark(state: State, settings: RelevanceTrackerSettings) -> Landmar
     if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
         raise MapFileError("state landmark: expected ascending cells with positive counts, got others")
     seen_count, missed_count, missed_in_a_row = get_counts(state, "seen_missed", 3)
-    (weak_count,) = get_counts(state, "weak_count", 1)
+    weak_count, is_given = get_counts(state, "weak_given", 2)
     best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
     first_ns, last_ns, number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
     keys = get_array(state, "vote_keys", (None,), np.int64).copy()
@@ -334,6 +362,7 @@ def decode_landmark(state: State, settings: RelevanceTrackerSettings) -> Landmar
         colours=colours,
         levels_m=levels_m,
         weak_count=weak_count,
+        is_given=is_given > 0,
         settings=settings.object_map,
     )
 

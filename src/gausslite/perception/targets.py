@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
@@ -27,6 +28,8 @@ class TargetSelector:
         self._objects = objects
         self._relations = relations
         self._surfaces = surfaces
+        self.excluded_m: Float64[ndarray, "n 3"] = np.zeros((0, 3))
+        """Points on objects that a person has excluded."""
 
     def select(self, T_world_camera: Float64[ndarray, "4 4"]) -> list[tuple[Landmark, str]]:
         """Return the confirmed landmarks that satisfy the relations of a target, with the target's name.
@@ -114,5 +117,17 @@ class TargetSelector:
     def _candidates(self, T_world_camera: Float64[ndarray, "4 4"]) -> dict[str, list[Landmark]]:
         """Return the confirmed landmarks that satisfy the relations of each target."""
         confirmed = self._objects.evidence.confirmed(self._objects.object_map.objects)
-        named = [(landmark, self.target_of(landmark.seen_from(T_world_camera[:3, 3]))) for landmark in confirmed]
+        named = [
+            (landmark, self._given_name(landmark) or self.target_of(landmark.seen_from(T_world_camera[:3, 3])))
+            for landmark in confirmed
+            if not self.is_excluded(landmark)
+        ]
         return {target: [landmark for landmark, name in named if name == target] for target in self._superlatives}
+
+    def is_excluded(self, landmark: Landmark) -> bool:
+        """Return True if a person has excluded this object."""
+        return any(landmark.contains(point_m) for point_m in self.excluded_m)
+
+    def _given_name(self, landmark: Landmark) -> str | None:
+        """Return the target of an object that a person has pointed at; None for other objects."""
+        return next(iter(self._names.get(landmark.phrase, ())), None) if landmark.is_given else None

@@ -89,29 +89,89 @@ Global___AgentState: _TypeAlias = AgentState  # noqa: Y015
 
 @_typing.final
 class AssignTaskRequest(_message.Message):
+    """With points alone, the current task stays and gets these objects, or is left by them."""
+
     DESCRIPTOR: _descriptor.Descriptor
 
     TEXT_FIELD_NUMBER: _builtins.int
     GRAPH_FIELD_NUMBER: _builtins.int
+    POINTED_FIELD_NUMBER: _builtins.int
+    EXCLUDED_FIELD_NUMBER: _builtins.int
     text: _builtins.str
     """Parsed by the agent's parser service."""
     @_builtins.property
     def graph(self) -> _task_pb2.TaskGraph: ...
+    @_builtins.property
+    def pointed(self) -> _containers.RepeatedCompositeFieldContainer[Global___PointedObject]:
+        """Objects that a person points at: targets that no detector has to find."""
+
+    @_builtins.property
+    def excluded(self) -> _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Point]:
+        """Points in the world on objects that are not meant; an object that is pointed at later is meant again."""
+
     def __init__(
         self,
         *,
         text: _builtins.str = ...,
         graph: _task_pb2.TaskGraph | None = ...,
+        pointed: _abc.Iterable[Global___PointedObject] | None = ...,
+        excluded: _abc.Iterable[_geometry_pb2.Point] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["graph", b"graph", "task", b"task", "text", b"text"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["graph", b"graph", "task", b"task", "text", b"text"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["excluded", b"excluded", "graph", b"graph", "pointed", b"pointed", "task", b"task", "text", b"text"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType_task: _TypeAlias = _typing.Literal["text", "graph"]  # noqa: Y015
     _WhichOneofArgType_task: _TypeAlias = _typing.Literal["task", b"task"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_task) -> _WhichOneofReturnType_task | None: ...
 
 Global___AssignTaskRequest: _TypeAlias = AssignTaskRequest  # noqa: Y015
+
+@_typing.final
+class PointedObject(_message.Message):
+    """One object, by points and boxes on a keyframe's image, or by a point in the world."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FRAME_INDEX_FIELD_NUMBER: _builtins.int
+    POINTS_PX_FIELD_NUMBER: _builtins.int
+    BOXES_PX_FIELD_NUMBER: _builtins.int
+    POINT_M_FIELD_NUMBER: _builtins.int
+    NOUN_FIELD_NUMBER: _builtins.int
+    frame_index: _builtins.int
+    """A keyframe that the agent keeps; the newest one if it is missing."""
+    noun: _builtins.str
+    """What it is, for the team; empty if that is not said."""
+    @_builtins.property
+    def points_px(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """x, y of each point in pixels of the image."""
+
+    @_builtins.property
+    def boxes_px(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """Left, top, right, bottom of each box in pixels of the image."""
+
+    @_builtins.property
+    def point_m(self) -> _geometry_pb2.Point:
+        """On a surface that a keyframe shows; excludes pixels."""
+
+    def __init__(
+        self,
+        *,
+        frame_index: _builtins.int | None = ...,
+        points_px: _abc.Iterable[_builtins.float] | None = ...,
+        boxes_px: _abc.Iterable[_builtins.float] | None = ...,
+        point_m: _geometry_pb2.Point | None = ...,
+        noun: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_frame_index", b"_frame_index", "frame_index", b"frame_index", "point_m", b"point_m"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_frame_index", b"_frame_index", "boxes_px", b"boxes_px", "frame_index", b"frame_index", "noun", b"noun", "point_m", b"point_m", "points_px", b"points_px"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__frame_index: _TypeAlias = _typing.Literal["frame_index"]  # noqa: Y015
+    _WhichOneofArgType__frame_index: _TypeAlias = _typing.Literal["_frame_index", b"_frame_index"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__frame_index) -> _WhichOneofReturnType__frame_index | None: ...
+
+Global___PointedObject: _TypeAlias = PointedObject  # noqa: Y015
 
 @_typing.final
 class AssignTaskResponse(_message.Message):

@@ -79,6 +79,8 @@ class _TargetRoleEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_TargetRole
     """The robot uses it."""
     TARGET_ROLE_OBSTACLE: _TargetRole.ValueType  # 4
     """Not to be hit, touched or harmed."""
+    TARGET_ROLE_POINTED: _TargetRole.ValueType  # 5
+    """A person points at it; no detector searches it."""
 
 class TargetRole(_TargetRole, metaclass=_TargetRoleEnumTypeWrapper):
     """What the robot does with a target. docs/guides/task.md defines the whole graph."""
@@ -93,6 +95,8 @@ TARGET_ROLE_TOOL: TargetRole.ValueType  # 3
 """The robot uses it."""
 TARGET_ROLE_OBSTACLE: TargetRole.ValueType  # 4
 """Not to be hit, touched or harmed."""
+TARGET_ROLE_POINTED: TargetRole.ValueType  # 5
+"""A person points at it; no detector searches it."""
 Global___TargetRole: _TypeAlias = TargetRole  # noqa: Y015
 
 class _Superlative:

@@ -21,6 +21,7 @@ from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport, TeamObject
+from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
@@ -94,12 +95,18 @@ class AgentClient(ServiceChannel):
         super().__init__(address, deadline_s, tls)
         self._stub = agent_service_pb2_grpc.AgentServiceStub(self._channel)
 
-    def assign_task(self, task: str | TaskGraph) -> TaskGraph:
-        """Assign a task as text or graph; returns the graph of the current task. Raises TaskError, UnavailableError."""
-        if isinstance(task, str):
-            request = agent_service_pb2.AssignTaskRequest(text=task)
-        else:
-            request = agent_service_pb2.AssignTaskRequest(graph=convert_task.graph_to_message(task))
+    def assign_task(
+        self,
+        task: str | TaskGraph | None = None,
+        pointed: Sequence[PointedObject] = (),
+        excluded_m: Sequence[PointM] = (),
+    ) -> TaskGraph:
+        """Assign a task as text or graph; returns the graph of the current task.
+
+        pointed: its objects that a person points at; excluded_m: points on objects that are not meant. With these
+        alone, the current task stays. Raises TaskError, InvalidInputError, UnavailableError.
+        """
+        request = convert_task.assigned_to_message(task, pointed, excluded_m)
         return convert_task.graph_from_message(self._call(self._stub.AssignTask, request).graph)
 
     def ingest(

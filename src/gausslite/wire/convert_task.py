@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
 
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.objects import (
+    MAX_OBJECT_COORDINATE_M,
     MAX_OBJECTS_PER_AGENT,
     ObjectLandmark,
     ObjectObserver,
@@ -13,6 +18,7 @@ from gausslite.domain.objects import (
     ObjectRole,
     TeamObject,
 )
+from gausslite.domain.relevance import UNNAMED, PointedObject, PointM
 from gausslite.domain.task import (
     ObjectAttributes,
     Predicate,
@@ -20,11 +26,13 @@ from gausslite.domain.task import (
     Superlative,
     TargetRole,
     TaskGraph,
+    noun_of,
     require_graph,
 )
-from gausslite.v1 import fusion_service_pb2, geometry_pb2, objects_pb2, task_pb2
+from gausslite.v1 import agent_service_pb2, fusion_service_pb2, geometry_pb2, objects_pb2, task_pb2
 from gausslite.wire.convert import box_from_message, box_to_message
 
+_MAX_POINTED: Final = 64
 _PREDICATE_NUMBERS = {predicate: task_pb2.Predicate.Value(f"PREDICATE_{predicate.name}") for predicate in Predicate}
 _PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
 _ROLE_NUMBERS = {role: task_pb2.TargetRole.Value(f"TARGET_ROLE_{role.name}") for role in TargetRole}
@@ -96,6 +104,88 @@ def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
     )
     require_graph(graph)
     return graph
+
+
+@dataclass(frozen=True, slots=True)
+class AssignedTask:
+    """What an AssignTask call states: a graph, objects that a person points at, and points on excluded ones.
+
+    Without a graph, the current task stays.
+    """
+
+    graph: TaskGraph | None
+    pointed: tuple[PointedObject, ...] = ()
+    excluded_m: tuple[PointM, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.graph is None and not (self.pointed or self.excluded_m):
+            raise InvalidInputError("task: expected a text, a graph or points, got none")
+        if max(len(self.pointed), len(self.excluded_m)) > _MAX_POINTED:
+            raise InvalidInputError(f"task: expected at most {_MAX_POINTED} objects pointed at or excluded, got more")
+
+
+def assigned_to_message(
+    task: str | TaskGraph | None,
+    pointed: Sequence[PointedObject] = (),
+    excluded_m: Sequence[PointM] = (),
+) -> agent_service_pb2.AssignTaskRequest:
+    """Encode the request of an AssignTask call."""
+    return agent_service_pb2.AssignTaskRequest(
+        text=task if isinstance(task, str) else None,
+        graph=graph_to_message(task) if isinstance(task, TaskGraph) else None,
+        pointed=map(_pointed_to_message, pointed),
+        excluded=map(_point_to_message, excluded_m),
+    )
+
+
+def assigned_from_message(
+    message: agent_service_pb2.AssignTaskRequest, parse: Callable[[str], TaskGraph]
+) -> AssignedTask:
+    """Decode the request of an AssignTask call; a text is parsed. Raises TaskError, InvalidInputError."""
+    pointed = tuple(map(_pointed_from_message, message.pointed))
+    excluded_m = tuple(_point_from_message("excluded", point) for point in message.excluded)
+    match message.WhichOneof("task"):
+        case "text":
+            return AssignedTask(parse(message.text), pointed, excluded_m)
+        case "graph":
+            return AssignedTask(graph_from_message(message.graph), pointed, excluded_m)
+        case _:
+            return AssignedTask(None, pointed, excluded_m)
+
+
+def _pointed_to_message(pointed: PointedObject) -> agent_service_pb2.PointedObject:
+    return agent_service_pb2.PointedObject(
+        frame_index=pointed.frame_index,
+        points_px=[value for point in pointed.points_px for value in point],
+        boxes_px=[value for box in pointed.boxes_px for value in box],
+        point_m=None if pointed.point_m is None else _point_to_message(pointed.point_m),
+        noun=pointed.noun,
+    )
+
+
+def _pointed_from_message(message: agent_service_pb2.PointedObject) -> PointedObject:
+    points, boxes = np.array(message.points_px), np.array(message.boxes_px)
+    if len(points) % 2 or len(boxes) % 4 or not np.isfinite([*points, *boxes]).all():
+        raise InvalidInputError("pointed object: expected two finite numbers a point and four a box, got others")
+    return PointedObject(
+        tuple((x, y) for x, y in points.reshape(-1, 2).tolist()),
+        tuple((left, top, right, bottom) for left, top, right, bottom in boxes.reshape(-1, 4).tolist()),
+        _point_from_message("point_m", message.point_m) if message.HasField("point_m") else None,
+        message.frame_index if message.HasField("frame_index") else None,
+        noun_of(message.noun) or UNNAMED,
+    )
+
+
+def _point_to_message(point_m: PointM) -> geometry_pb2.Point:
+    return geometry_pb2.Point(x=point_m[0], y=point_m[1], z=point_m[2])
+
+
+def _point_from_message(name: str, message: geometry_pb2.Point) -> PointM:
+    """Decode a point on a surface. Raises InvalidInputError."""
+    point_m = message.x, message.y, message.z
+    if not all(abs(value) <= MAX_OBJECT_COORDINATE_M for value in point_m):
+        raise InvalidInputError(f"{name}: expected coordinates within ±{MAX_OBJECT_COORDINATE_M:g} m, got {point_m}")
+    return point_m
 
 
 def _require_known_numbers(message: task_pb2.TaskGraph) -> None:

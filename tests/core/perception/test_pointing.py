@@ -11,7 +11,10 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import Region
-from gausslite.perception.pointing import region_at, region_on_image
+from gausslite.domain.task import TaskGraph
+from gausslite.perception.detector import RegionDetector
+from gausslite.perception.pointing import mask_on_image, region_at, region_on_image
+from gausslite.perception.relevance import TaskRelevanceEstimator
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +97,22 @@ def test_a_point_outside_the_image_or_without_depth_is_refused(prompt, depth_m, 
 def test_a_point_that_no_frame_shows_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="target 0,0,2: expected a point on a surface that a frame shows"):
         region_at((0.0, 0.0, 2.0), [wall(1.0)])
+
+
+def test_what_a_person_said_is_saved_with_the_objects(home) -> None:
+    frames, mug = home
+    frame, (row, column) = best_view(frames, mug)
+    mask = mask_on_image(frame, [(column + 0.5, row + 0.5)])
+    graph = TaskGraph("id", "", (), (), ()).with_pointed(["mug"])
+    first, second = (TaskRelevanceEstimator(graph, RegionDetector({})) for _ in range(2))
+    first.point_at("mug", mask, frame)
+    first.exclude((9.0, 9.0, 9.0))
+    second.restore(first.state())
+    before, after = (estimator.estimate(frame).relevance for estimator in (first, second))
+    assert before.roi.any()
+    np.testing.assert_array_equal(before.roi, after.roi)
+    for estimator in (first, second):
+        estimator.exclude(estimator.objects[0].centroid_m)
+        assert not estimator.estimate(frame).relevance.roi.any()
+        estimator.point_at("mug", mask, frame)
+        np.testing.assert_array_equal(estimator.estimate(frame).relevance.roi, before.roi)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import grpc
 import numpy as np
 import pytest
-from agent_running import TASK, Gate, agent, ball_estimator
+from agent_running import TASK, Agent, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 from waiting import wait_until
 
@@ -24,8 +24,8 @@ from gausslite.domain.errors import (
 )
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Twist
-from gausslite.domain.relevance import BallRegion
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.relevance import BallRegion, PointedObject
+from gausslite.domain.task import TargetRole, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.perception.detector import RegionDetector
@@ -57,6 +57,67 @@ def test_nouns_that_cannot_be_found_are_in_the_status_notes() -> None:
     assert searched == "'mug' is searched as 'mug_1' (ground truth): 0 detections, best score 0.00, 0 confirmed"
     assert unsupported.startswith("no region matches 'table'")
     assert not_seen.startswith("no class of the detector is a 'table': the height of what an object stands on decides")
+
+
+def stepped(index: int) -> Frame:
+    """A view of a box in front of the wall."""
+    plain = frame(index)
+    depth_m = plain.depth_m.copy()
+    depth_m[8:16, 12:20] = 1.0
+    return replace(plain, depth_m=depth_m)
+
+
+def no_detector(graph: TaskGraph) -> RelevanceEstimator:
+    return TaskRelevanceEstimator(graph, RegionDetector({}))
+
+
+def active_gaussians(a: Agent) -> int:
+    return int(a.worker.run(lambda mapper: mapper.gaussians()).result(20).active.sum())
+
+
+def test_an_object_that_a_person_points_at_is_mapped_from_the_next_frame_on() -> None:
+    with agent(no_detector) as a:
+        a.client.assign_task("Find the chair")
+        for index in range(2):
+            a.worker.submit(stepped(index)).result(20)
+        assert active_gaussians(a) == 0
+        graph = a.client.assign_task(pointed=[PointedObject(points_px=((16.0, 12.0),), noun="mug")])
+        assert dict(zip(graph.targets, graph.roles, strict=True)) == {
+            "chair": TargetRole.OBJECT,
+            "mug": TargetRole.POINTED,
+        }
+        assert graph.queries == ("chair",)
+        a.worker.submit(stepped(2)).result(20)
+        assert active_gaussians(a) > 0
+        (mug,) = a.worker.status().objects
+        assert (mug.noun, mug.confidence) == ("mug", 1.0)
+        assert mug.centroid_m == pytest.approx((0.0, 0.0, 1.0), abs=0.1)
+
+        a.client.assign_task(excluded_m=[mug.centroid_m])
+        report = a.worker.submit(stepped(3)).result(20)
+        assert (report.roi_share, a.worker.status().objects) == (0.0, ())
+        a.client.assign_task(pointed=[PointedObject(point_m=(0.0, 0.0, 1.0), noun="mug")])
+        assert a.worker.submit(stepped(4)).result(20).roi_share > 0
+        a.client.assign_task("Find the table")
+        assert a.worker.status().objects == ()
+
+
+@pytest.mark.parametrize(
+    ("pointed", "match"),
+    [
+        (PointedObject(points_px=((99.0, 0.0),)), "expected a pixel of the image"),
+        (PointedObject(points_px=((5.0, 5.0),), frame_index=7), "expected a keyframe that is kept, such as 0; got 7"),
+        (PointedObject(point_m=(0.0, 0.0, 3.0)), "expected a point on a surface that a frame shows"),
+        (PointedObject(points_px=((5.0, 5.0),), noun="a\nb"), "printable"),
+    ],
+)
+def test_pointing_at_nothing_is_refused_and_changes_nothing(pointed: PointedObject, match: str) -> None:
+    with agent(no_detector) as a:
+        a.client.assign_task(TASK)
+        a.worker.submit(stepped(0)).result(20)
+        with pytest.raises(InvalidInputError, match=match):
+            a.client.assign_task(pointed=[pointed])
+        assert convert_task.graph_from_message(a.client.status().graph) == RuleParser().parse(TASK)
 
 
 def test_an_invalid_task_is_refused() -> None:
