@@ -250,7 +250,7 @@ class FusionEngine:
         stored = StoredSubset.exact(subset)
         stored = replace(stored, voxels=stored.voxels.with_computed_sums())
         future = self._enqueue(PendingUpdate(session_id, agent_id, stored))
-        self._committer.commit()
+        self.commit_updates()
         # another thread may be committing it
         return future.result()
 
@@ -273,6 +273,7 @@ class FusionEngine:
     def commit_updates(self) -> None:
         """Commit the queued updates. Call it after each `enqueue_update`."""
         self._committer.commit()
+        self._mission.traffic.save_if_due()
 
     def align_due(self, at_most: int | None = None) -> bool:
         """Compare the frames of the agents with enough new updates; returns whether the fused map changed.
@@ -303,8 +304,7 @@ class FusionEngine:
 
     def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
-        with self._lock:
-            self._mission.traffic.record(agent_id, traffic)
+        self._mission.traffic.record(agent_id, traffic)
 
     def add_keyframe(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store a keyframe for the refinement; the agent's others that are not `selected` are deleted.
@@ -370,9 +370,11 @@ class FusionEngine:
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
         """Return the fused map, all agents' keyframes, and the map's revision. Raises MismatchError if one is empty."""
+        # before the map is read: what changes meanwhile counts as changed
+        revision, gaussians = self.revision, self._mission.maps.voted_map().gaussians
         with self._lock:
-            revision = self._mission.maps.revision()
-            encoded, gaussians = self._mission.keyframes.encoded(), self._mission.maps.voted_map().gaussians
+            names = self._mission.keyframes.names()
+        encoded = self._mission.keyframes.read(names)
         if not encoded or len(gaussians) == 0:
             raise MismatchError(
                 f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
@@ -382,10 +384,11 @@ class FusionEngine:
 
     def store_refined(self, gaussians: Gaussians, revision: int) -> None:
         """Store the result of a refinement of the vote at this revision. Raises RevisionGoneError, StorageError."""
+        shown = self._mission.maps.show_refined(gaussians, revision)
         # no update may be in the store without being in the change log
         with self._committer.committing:
-            stored = self._mission.maps.show_refined(gaussians, revision)
-        save_refinement(self._store, stored)
+            changed = self._mission.maps.changed_since(revision)
+        save_refinement(self._store, shown.without(changed))
 
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
         """Return the keyframes with camera poses in the fused map's frame.
@@ -404,8 +407,7 @@ class FusionEngine:
 
     def save_counters(self) -> None:
         """Save the agents' counters, which are otherwise saved every 10 s. Raises StorageError."""
-        with self._lock:
-            self._mission.traffic.save()
+        self._mission.traffic.save()
 
     def close(self) -> None:
         """Close the store."""
@@ -446,4 +448,3 @@ class FusionEngine:
         self._mission.maps.record_all(changed)
         for agent_id in changed:
             self._mission.agents.drop_outgrown(agent_id)
-        self._mission.traffic.save_if_due()

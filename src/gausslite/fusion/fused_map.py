@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import reduce
@@ -28,10 +28,11 @@ from gausslite.domain.voxels import (
     merge_batches,
     select_keys,
     select_voxels,
+    tiles_of,
 )
 from gausslite.fusion.change_log import ChangeLog, TileIndex, VoxelLog
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.vote import FusedMap, VoteResult, fuse, rank_voxels, union_maps
+from gausslite.fusion.vote import VoteResult, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
 
 # no agent can have an empty id
@@ -45,11 +46,6 @@ class RefinedMap:
     batch: VoxelBatch
     revision: int
 
-    def replace_changed(self, newer: FusedMap, changed: Int64[ndarray, " c"]) -> VoxelBatch:
-        """Return the refined voxels, with the newer vote in place of the voxels in `changed`."""
-        kept = select_voxels(self.batch, ~np.isin(self.batch.keys, changed))
-        return merge_batches(kept, newer.batch)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredRefinement:
@@ -62,12 +58,11 @@ class StoredRefinement:
     voted_keys: Int64[ndarray, " v"]
     winner_hashes: UInt64[ndarray, " v"]
 
-    @classmethod
-    def of(cls, refined: RefinedMap, vote: VoteResult, changed: Int64[ndarray, " c"]) -> StoredRefinement:
-        """Return what is stored of a refinement; changed: the voxels that changed since it started."""
-        unchanged = ~np.isin(vote.keys, changed)
-        batch = select_voxels(refined.batch, ~np.isin(refined.batch.keys, changed))
-        return cls(batch, vote.keys[unchanged], _winner_hashes(vote)[unchanged])
+    def without(self, changed: Int64[ndarray, " c"]) -> StoredRefinement:
+        """Return the refinement without these voxels, which changed since it started."""
+        unchanged = ~np.isin(self.voted_keys, changed)
+        batch = select_voxels(self.batch, ~np.isin(self.batch.keys, changed))
+        return StoredRefinement(batch, self.voted_keys[unchanged], self.winner_hashes[unchanged])
 
     def changed_voxels(self, vote: VoteResult) -> Int64[ndarray, " c"]:
         """Return the voxels of the vote that have another winner, or another update of it, than in the refinement."""
@@ -132,6 +127,10 @@ class WonVoxels:
 
     batch: VoxelBatch
     keys_by_winner: Mapping[str, Sequence[int]]
+
+    def of(self, agent_id: str) -> VoxelBatch:
+        """Return the voxels that this agent wins."""
+        return select_keys(self.batch, np.array(self.keys_by_winner.get(agent_id, ()), np.int64))
 
     def without(self, agent_id: str) -> WonVoxels:
         """Return the voxels that this agent does not win."""
@@ -222,11 +221,10 @@ class FusedMapLayers:
 
     def voted_map(self, only_agent: str = "") -> VoxelBatch:
         """Return the fused map, or its voxels that one agent wins."""
-        fused = fuse(self._votes.batches())
-        if not only_agent:
-            return fused.batch
-        self._require_contributor(only_agent)
-        return select_voxels(fused.batch, fused.won_by(only_agent))
+        if only_agent:
+            self._require_contributor(only_agent)
+        tiles = self._read_tiles(MapLayer.VOTE)
+        return merge_batches(*(won.of(only_agent) if only_agent else won.batch for won in tiles))
 
     def union_map(self, only_agent: str = "") -> VoxelBatch:
         """Return all agents' Gaussians, or one agent's."""
@@ -237,34 +235,47 @@ class FusedMapLayers:
         return union_maps(batches)
 
     def show_refined(self, gaussians: Gaussians, revision: int) -> StoredRefinement:
-        """Show the result of a refinement that started from the vote at this revision; returns it for the store.
+        """Show the result of a refinement that started from the vote at this revision, one tile after the other.
 
-        Raises RevisionGoneError if the change log no longer reaches back.
+        Returns it for the store, with voxels that have changed since. Raises RevisionGoneError if the change log no
+        longer reaches back.
         """
         refined = RefinedMap(group_by_voxel(gaussians, self._grid), revision)
+        own: dict[int, set[int]] = {}
+        for key, tile in zip(refined.batch.keys.tolist(), tiles_of(refined.batch.keys).tolist(), strict=True):
+            own.setdefault(tile, set()).add(key)
         with self._lock:
             changed = set(self._change_log.changed_since(revision).tolist())
             if self._refined is None:
                 self._refined_log = self._change_log.voxels.copy()
-            before = self._refined_log.tiles.all_keys()
-            shown = (set(refined.batch.keys.tolist()) - changed) | (before & changed)
-            self._refined_log.record(sorted(shown - changed), sorted(before - shown))
-            self._refined = refined
-            vote = rank_voxels(self._votes.scores())
-        return StoredRefinement.of(refined, vote, np.array(sorted(changed), np.int64))
+            self._refined, seen = refined, self._change_log.revision
+            known = {*self._refined_log.tiles.tiles().tolist(), *self._change_log.tiles.tiles().tolist()}
+        keys, hashes = [np.zeros(0, np.int64)], [np.zeros(0, np.uint64)]
+        for tile in sorted(known | own.keys()):
+            with self._lock:
+                changed.update(self._change_log.changed_since(seen).tolist())
+                seen = self._change_log.revision
+                self._show_tile(tile, own.get(tile, set()), changed)
+                vote = rank_voxels(self._votes.scores(self._change_log.tiles.keys(tile)))
+            keys.append(vote.keys)
+            hashes.append(_winner_hashes(vote))
+        voted = np.concatenate(keys)
+        order = np.argsort(voted)
+        return StoredRefinement(refined.batch, voted[order], np.concatenate(hashes)[order])
+
+    def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
+        """Return the voxels of the vote that changed or became empty after this revision. Raises RevisionGoneError."""
+        with self._lock:
+            return self._change_log.changed_since(revision)
 
     def refined_map(self) -> VoxelBatch:
         """Return the refined map; voxels that changed after the refinement started show the newer vote.
 
-        Raises MismatchError before the first refinement, RevisionGoneError if the change log no longer reaches back.
+        Raises MismatchError before the first refinement.
         """
-        with self._lock:
-            refined = self._refined
-            if refined is None:
-                raise MismatchError("refined map: expected a refinement first, got none yet; see `gausslite refine`")
-            changed = self._change_log.changed_since(refined.revision)
-            batches = self._votes.batches(changed)
-        return refined.replace_changed(fuse(batches), changed)
+        if self._refined is None:
+            raise MismatchError("refined map: expected a refinement first, got none yet; see `gausslite refine`")
+        return merge_batches(*(won.batch for won in self._read_tiles(MapLayer.REFINED)))
 
     def tiles(self, layer: MapLayer) -> tuple[int, Int64[ndarray, " t"]]:
         """Return the layer's revision and the tiles of its voxels, ascending."""
@@ -283,6 +294,10 @@ class FusedMapLayers:
 
     def _log_of(self, layer: MapLayer) -> VoxelLog:
         return self._change_log.voxels if layer is MapLayer.VOTE else self._refined_log
+
+    def _read_tiles(self, layer: MapLayer) -> Iterator[WonVoxels]:
+        """Yield the tiles of a layer. Messages are served in between, so that later tiles may be newer."""
+        yield from (self.tile(layer, tile) for tile in self.tiles(layer)[1].tolist())
 
     def _tiles_of(self, layer: MapLayer) -> TileIndex:
         return self._log_of(layer).tiles
@@ -319,6 +334,13 @@ class FusedMapLayers:
         self._refined = RefinedMap(stored.without_removed(vote), self._change_log.revision)
         self._change_log.mark_changed(changed)
         return np.union1d(self._refined.batch.keys, changed)
+
+    def _show_tile(self, tile: int, refined: set[int], changed: set[int]) -> None:
+        """Record a tile of the refined layer; changed: the voxels that show the vote."""
+        before = set(self._refined_log.tiles.keys(tile).tolist())
+        updated, removed = sorted(refined - changed), sorted(before - refined - changed)
+        if updated or removed:
+            self._refined_log.record(updated, removed)
 
     def _require_contributor(self, agent_id: str) -> None:
         agents = self._votes.agents()

@@ -142,13 +142,14 @@ class KeyframePool:
             kept.append(index)
         return {index: stored[index] for index in reversed(kept)}
 
-    def encoded(self) -> list[tuple[str, bytes]]:
-        """Return the agent id and the bytes of all keyframes, sorted by agent id and frame index."""
-        return [
-            (agent_id, self._store.keyframe(agent_id, index))
-            for agent_id in sorted(self._stored)
-            for index in sorted(self._stored[agent_id])
-        ]
+    def names(self) -> list[tuple[str, int]]:
+        """Return the agent id and the frame index of all keyframes, sorted."""
+        return [(agent_id, index) for agent_id in sorted(self._stored) for index in sorted(self._stored[agent_id])]
+
+    def read(self, names: Iterable[tuple[str, int]]) -> list[tuple[str, bytes]]:
+        """Return the agent id and the bytes of those of these keyframes that still exist; needs no lock."""
+        found = ((agent_id, self._store.keyframe(agent_id, index)) for agent_id, index in names)
+        return [(agent_id, data) for agent_id, data in found if data]
 
     def decode(self, encoded: Iterable[tuple[str, bytes]]) -> list[AgentKeyframe]:
         """Return these keyframes decoded; needs no lock. Raises CodecError for damaged ones."""

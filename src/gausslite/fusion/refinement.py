@@ -23,7 +23,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.fused_map import MapLayer
+from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mapping.density import densify, prune
@@ -254,44 +254,21 @@ class LayerView:
     revision: int
 
 
-class MapRenderer:
-    """Renders on one thread, from its own copy of a layer; the rasterizer is created with the first view.
+class _LayerCopy:
+    """The rows of a map layer, brought up to date tile by tile, so that the map is held for one tile at a time."""
 
-    The copy is brought up to date tile by tile, so that the map is held for one tile at a time.
-    """
-
-    def __init__(self, engine: FusionEngine, create_rasterizer: Callable[[], Rasterizer]) -> None:
-        self._engine, self._create_rasterizer = engine, create_rasterizer
-        self._rasterizer: Rasterizer | None = None
-        self._shown: tuple[MapLayer, int] | None = None
+    def __init__(self) -> None:
+        self.rows = np.zeros((0, ROW_WIDTH), np.float32)
+        self._revision = 0
         # the revision and the rows of each tile
         self._tiles: dict[int, tuple[int, Float32[ndarray, "n 16"]]] = {}
-        self._rows = np.zeros((0, ROW_WIDTH), np.float32)
 
-    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer) -> LayerView:
-        """Return a view of a layer. Raises QuotaError above two megapixels, KernelError."""
-        pixels = camera.width_px * camera.height_px
-        if pixels > _MAX_VIEW_PX:
-            raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
-        revision = self._update(layer)
-        size = camera.height_px, camera.width_px
-        rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
-        if len(self._rows):
-            if self._rasterizer is None:
-                self._rasterizer = self._create_rasterizer()
-            rendering = self._rasterizer.forward(self._rows, camera, inverse(T_world_camera))
-            rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
-            depth_m = rendering.expected_depth_m()
-        return LayerView(rgb, depth_m, revision)
-
-    def _update(self, layer: MapLayer) -> int:
-        """Read the tiles that have changed since the latest view; returns the layer's revision before."""
-        maps = self._engine.maps
+    def update(self, maps: FusedMapLayers, layer: MapLayer) -> int:
+        """Read the tiles that have changed since the latest update; returns the layer's revision before."""
         revision, tiles = maps.tiles(layer)
-        if self._shown == (layer, revision):
+        if self._revision == revision:
             return revision
-        kept = self._tiles if self._shown is not None and self._shown[0] is layer else {}
-        self._tiles = {}
+        kept, self._tiles = self._tiles, {}
         for tile in tiles.tolist():
             # read before the tile: a change in between makes the copy newer than its revision, never older
             changed_at = maps.tile_revision(layer, tile)
@@ -299,6 +276,32 @@ class MapRenderer:
                 self._tiles[tile] = kept[tile]
             else:
                 self._tiles[tile] = changed_at, gaussians_to_rows(maps.tile(layer, tile).batch.gaussians)
-        self._rows = np.concatenate([np.zeros((0, ROW_WIDTH), np.float32), *(rows for _, rows in self._tiles.values())])
-        self._shown = layer, revision
+        self.rows = np.concatenate([np.zeros((0, ROW_WIDTH), np.float32), *(rows for _, rows in self._tiles.values())])
+        self._revision = revision
         return revision
+
+
+class MapRenderer:
+    """Renders on one thread, from an own copy of each layer; the rasterizer is created with the first view."""
+
+    def __init__(self, engine: FusionEngine, create_rasterizer: Callable[[], Rasterizer]) -> None:
+        self._engine, self._create_rasterizer = engine, create_rasterizer
+        self._rasterizer: Rasterizer | None = None
+        self._copies: dict[MapLayer, _LayerCopy] = {}
+
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer) -> LayerView:
+        """Return a view of a layer. Raises QuotaError above two megapixels, KernelError."""
+        pixels = camera.width_px * camera.height_px
+        if pixels > _MAX_VIEW_PX:
+            raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
+        copy = self._copies.setdefault(layer, _LayerCopy())
+        revision = copy.update(self._engine.maps, layer)
+        size = camera.height_px, camera.width_px
+        rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
+        if len(copy.rows):
+            if self._rasterizer is None:
+                self._rasterizer = self._create_rasterizer()
+            rendering = self._rasterizer.forward(copy.rows, camera, inverse(T_world_camera))
+            rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
+            depth_m = rendering.expected_depth_m()
+        return LayerView(rgb, depth_m, revision)

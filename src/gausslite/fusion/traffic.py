@@ -139,19 +139,20 @@ class TrafficCounters:
 
 
 class TrafficLog:
-    """The counters of each agent, saved in the store every 10 s. Not thread-safe; FusionEngine holds a lock."""
+    """The counters of each agent, saved in the store every 10 s. Thread-safe: counting waits for no commit."""
 
     def __init__(self, store: FusionStore, clock_s: Callable[[], float] = time.monotonic) -> None:
         """Raises CodecError if the stored counters are damaged."""
-        self._store, self._clock_s = store, clock_s
+        self._store, self._clock_s, self._lock = store, clock_s, Lock()
         self._by_agent = _decode(store.records(TRAFFIC_RECORD).get(_OWNER, b"{}"))
         self._is_saved, self._next_save_s = True, clock_s() + _SAVE_INTERVAL_S
 
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         newer = replace(traffic, last_seen_ns=time.time_ns())
-        self._by_agent[agent_id] = self.of(agent_id).plus(newer)
-        self._is_saved = False
+        with self._lock:
+            self._by_agent[agent_id] = self.of(agent_id).plus(newer)
+            self._is_saved = False
 
     def save_if_due(self) -> None:
         """Save the counters if 10 s have passed; a store that refuses is asked again after as long."""
@@ -163,9 +164,15 @@ class TrafficLog:
 
     def save(self) -> None:
         """Save the counters. Raises StorageError."""
-        if not self._is_saved:
-            self._store.save_record(_OWNER, TRAFFIC_RECORD, _encode(self._by_agent))
-            self._is_saved = True
+        with self._lock:
+            if self._is_saved:
+                return
+            data, self._is_saved = _encode(self._by_agent), True
+        try:
+            self._store.save_record(_OWNER, TRAFFIC_RECORD, data)
+        except StorageError:
+            self._is_saved = False
+            raise
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""
@@ -173,7 +180,8 @@ class TrafficLog:
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete the counters of the agent."""
-        self._is_saved &= self._by_agent.pop(agent_id, None) is None
+        with self._lock:
+            self._is_saved &= self._by_agent.pop(agent_id, None) is None
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,10 +154,12 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     store = MemoryStore()
     limits = KeyframeLimits(2, 18 * 24, bytes_in_all=9)
     pool = KeyframePool(store, limits)
-    for index, data in ((3, b"first"), (1, b""), (2, b""), (3, b"again")):
+    for index, data in ((3, b"first"), (1, b"1"), (2, b"2"), (3, b"again")):
         pool.add(encoded("ant", index, data))
     pool.add(encoded("aardvark", 7))
-    assert pool.encoded() == [("aardvark", b""), ("ant", b""), ("ant", b"again")]
+    names = pool.names()
+    assert pool.read(names) == [("ant", b"2"), ("ant", b"again")]
+    assert names == [("aardvark", 7), ("ant", 2), ("ant", 3)]
     assert (len(pool), pool.count("ant"), pool.indices("ant"), pool.count("bee")) == (3, 2, (2, 3), 0)
     # the store keeps them for the next process
     assert KeyframePool(store, limits).indices("ant") == (2, 3)
@@ -226,4 +228,4 @@ def test_a_damaged_keyframe_is_named() -> None:
     pool = KeyframePool(MemoryStore(), KeyframeLimits(4, 18 * 24), decode_frame)
     pool.add(encoded("ant", 1, b"\xff\xff"))
     with pytest.raises(CodecError, match="expected an EncodedFrame"):
-        pool.decode(pool.encoded())
+        pool.decode(pool.read(pool.names()))

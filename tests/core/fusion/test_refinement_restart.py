@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,12 +14,13 @@ from fusion_running import GRID, keys, make_subset
 from gausslite.domain.errors import CodecError, MismatchError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxel_changes import hash_columns
+from gausslite.domain.voxels import VoxelBatch, select_voxels
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store import MissionConfig, VoxelScoreTable
 from gausslite.fusion.traffic import TrafficCounters, TrafficLog
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
@@ -88,6 +91,63 @@ def test_the_refined_map_is_the_same_after_a_restart_at_every_step(tmp_path: Pat
     # the vote is again what the refinement started from, so the refinement is shown again
     assert {key for key in before if before[key] != after[key]} == set(keys(6).tolist())
     assert after[keys(6).item()][1][:12] == np.array([1, 0, 0], np.float32).tobytes()
+    engine.close()
+
+
+class WatchedStore(SqliteStore):
+    """Notes the largest read of updates, and calls `during` at a read of scores."""
+
+    largest_read = 0
+    during: Callable[[], None] | None = None
+
+    def batch(self, agent_id: str, keys: np.ndarray | None = None) -> VoxelBatch:
+        batch = super().batch(agent_id, keys)
+        self.largest_read = max(self.largest_read, len(batch))
+        return batch
+
+    def batches(self, keys: np.ndarray | None = None) -> dict[str, VoxelBatch]:
+        batches = super().batches(keys)
+        self.largest_read = max(self.largest_read, *map(len, batches.values()))
+        return batches
+
+    def scores(self, keys: np.ndarray | None = None) -> VoxelScoreTable:
+        during, self.during = self.during, None
+        if during is not None:
+            during()
+        table = super().scores(keys)
+        self.largest_read = max(self.largest_read, len(table.keys))
+        return table
+
+
+def test_a_refinement_reads_and_shows_tiles_and_messages_in_between_are_shown_and_kept(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    store = WatchedStore(path)
+    engine = FusionEngine(store, FusionSettings(grid=GRID))
+    ant, bee = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
+    engine.contribute(ant, make_subset("ant", 1, {cell: [5] for cell in range(200)}), GRID)
+    revision = engine.revision
+    store.largest_read = 0
+    voted = engine.maps.voted_map()
+    # of all voxels, except one that the refinement loses
+    refined = red(select_voxels(voted, voted.keys != keys(30)).gaussians)
+
+    def send() -> None:
+        for seq, cells in enumerate(({150: [90]}, {3: [90]}, {180: [90], 40: [90]}), start=1):
+            engine.contribute(bee, make_subset("bee", seq, cells), GRID)
+        engine.contribute(ant, make_subset("ant", 2, {100: [], 190: []}), GRID)
+
+    sender = threading.Thread(target=send)
+    store.during = sender.start
+    engine.store_refined(refined, revision)
+    sender.join()
+    # each cube of 16 voxels alone
+    assert 0 < store.largest_read <= 32
+    before = shown(engine)
+    assert not set(keys(30, 100, 190).tolist()) & before.keys()
+    red_voxels = {key for key, (_, rgb) in before.items() if rgb[:12] == np.array([1, 0, 0], np.float32).tobytes()}
+    assert before.keys() - red_voxels == set(keys(3, 40, 150, 180).tolist())
+    engine = restart(engine, path)
+    assert shown(engine) == before
     engine.close()
 
 

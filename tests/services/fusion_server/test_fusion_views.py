@@ -135,6 +135,8 @@ def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the
             (lambda: engine.evict("ant"), 0),
         ):
             change()
+            # a view of the other layer in between costs no copy of this one
+            renderer.render(CAMERA, np.eye(4), MapLayer.VOTE)
             read.reset_mock()
             shown = renderer.render(CAMERA, np.eye(4), MapLayer.REFINED)
             assert read.call_count == tiles
