@@ -25,14 +25,19 @@ from gausslite_view.agent_panel import AgentPanel
 from gausslite_view.pages import open_page
 
 
-def assign(tab: Any, task: str) -> None:
-    """Write a task and press the button; write until it stays, as a page that is still being built ignores it."""
-    field = tab.get_by_role("textbox").first
+def write(tab: Any, number: int, text: str) -> None:
+    """Write into a field until the text stays, as a page that is still being built ignores it."""
+    field = tab.get_by_role("textbox").nth(number)
     for _ in range(60):
-        field.fill(task)
+        field.fill(text)
         tab.wait_for_timeout(500)
-        if field.input_value() == task:
+        if field.input_value() == text:
             break
+
+
+def assign(tab: Any, task: str) -> None:
+    """Write a task and press the button."""
+    write(tab, 0, task)
     tab.get_by_role("button", name="Assign task").click()
 
 
@@ -103,6 +108,32 @@ def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe():
         finally:
             panel.close()
             page.close()
+
+
+def test_a_click_in_the_scene_is_a_target_until_it_is_left_out():
+    with (
+        agent(lambda graph: TaskRelevanceEstimator(graph, RegionDetector({}))) as running,
+        open_browser((1200, 900)) as browser,
+        live_page(0, running.client.address, is_agent=True) as url,
+    ):
+        running.client.assign_task("Find the chair")
+        for index in range(4):
+            report = next(running.client.ingest([frame(index)]))
+        tab = browser.new_page()
+        tab.goto(url)
+        tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
+        write(tab, 1, "wall")
+        tab.get_by_role("button", name="Point at an object").click()
+        tab.get_by_text("click the object in the map").wait_for()
+        tab.mouse.click(450, 450)
+        tab.get_by_text("is a target").wait_for()
+        assert next(running.client.ingest([frame(4)])).roi_share > 0
+        (wall,) = running.worker.status().objects
+        assert wall.noun == "wall"
+        tab.locator(f"input[role=combobox][value='{wall.object_id} (1.00)']").wait_for()
+        tab.get_by_role("button", name="Not this one").click()
+        tab.get_by_text(f"{wall.object_id} is left out").wait_for()
+        assert next(running.client.ingest([frame(5)])).roi_share == 0
 
 
 def wait_for_map(panel: AgentPanel) -> None:
