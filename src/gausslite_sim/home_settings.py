@@ -12,7 +12,7 @@ from gausslite.domain.errors import DatasetError, InvalidInputError
 
 TRAJECTORY_COUNT = 3
 _SIDES_PX = (16, 4096)
-_NUMBERS = ("seed", "trajectory", "frames")
+_NUMBERS = ("seed", "trajectory", "frames", "laps")
 _STRENGTHS = {"noise": "noise", "holes": "holes", "flying": "flying_pixels", "exposure": "exposure", "gloss": "gloss"}
 """Fields of HomeSettings by the names in a spec."""
 _TIMES = {"shutter": "readout_ms", "blur": "exposure_ms"}
@@ -26,7 +26,8 @@ class HomeSettings:
     depth and of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections. readout_ms: readout time
     of a rolling shutter. exposure_ms: exposure time of a row. lens: distortion of both images. speed_deg_s: mean
     angular speed, which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose poses the frames
-    have, in percent of the distance moved and of the angle turned; 0 for exact poses.
+    have, in percent of the distance moved and of the angle turned; 0 for exact poses. laps: how often the path is
+    walked, every second time backwards.
     """
 
     home: int = 0
@@ -44,6 +45,7 @@ class HomeSettings:
     lens: Lens | None = None
     speed_deg_s: float = 0.0
     drift_percent: float = 0.0
+    laps: int = 1
 
     def __post_init__(self) -> None:
         low, high = _SIDES_PX
@@ -51,6 +53,7 @@ class HomeSettings:
             ("seed", self.seed, "0 to 4294967295", 0 <= self.seed < 2**32),
             ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
             ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
+            ("laps", self.laps, "1 to 100", 1 <= self.laps <= 100),
             ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
             ("shutter", self.readout_ms, "0ms to 100ms", 0.0 <= self.readout_ms <= 100.0),
             ("blur", self.exposure_ms, "0ms to 100ms", 0.0 <= self.exposure_ms <= 100.0),

@@ -31,6 +31,7 @@ from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
 from gausslite_sim.scene import HomeScene, require_ray_caster
 from gausslite_sim.sensor import colour_image, noisy_colour, noisy_depth
+from gausslite_sim.trajectory import TrajectorySampler, walked_laps
 from gausslite_sim.view import View, render_view
 
 _RATE_HZ = 30
@@ -177,7 +178,11 @@ class SimulatedHome:
 
     @cached_property
     def _poses(self) -> Float64[ndarray, "n 4 4"]:
-        return self._home.plan.trajectories[self._settings.trajectory](self._settings.frames)
+        return self._path(self._settings.frames)
+
+    @property
+    def _path(self) -> TrajectorySampler:
+        return walked_laps(self._home.plan.trajectories[self._settings.trajectory], self._settings.laps)
 
     @cached_property
     def _odometry_poses(self) -> Float64[ndarray, "n 4 4"]:
@@ -206,7 +211,7 @@ class SimulatedHome:
         if settings.readout_ms == 0 and settings.exposure_ms == 0:
             return render_view(scene, RayCamera(self._camera, self._poses[i], settings.lens), settings.gloss)
         camera = RecordingCamera(self._camera, settings.lens, settings.readout_ms / 1e3, settings.exposure_ms / 1e3)
-        path = self._home.plan.trajectories[settings.trajectory]
+        path = self._path
 
         def poses_at(seconds: Float64[ndarray, " n"]) -> Float64[ndarray, "n 4 4"]:
             return path(settings.frames, i + seconds / self._interval_s)

@@ -43,6 +43,17 @@ def spline_trajectory(keys: Sequence[Waypoint]) -> TrajectorySampler:
     return poses
 
 
+def walked_laps(path: TrajectorySampler, laps: int) -> TrajectorySampler:
+    """Return the trajectory that follows the path so many times, every second time backwards."""
+
+    def poses(frames: int, numbers: Float64[ndarray, " n"] | None = None) -> Float64[ndarray, "n 4 4"]:
+        walked = laps * (np.arange(frames, dtype=np.float64) if numbers is None else numbers)
+        lap, place = np.divmod(walked, max(frames - 1, 1))
+        return path(frames, np.where(lap % 2 == 0, place, frames - 1 - place))
+
+    return path if laps == 1 else poses
+
+
 def look_at_poses(eyes_m: Float64[ndarray, "n 3"], targets_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 4 4"]:
     """Return T_world_camera of cameras at the eyes that look at the targets."""
     return np.stack([_look_at(eye, target) for eye, target in zip(eyes_m, targets_m, strict=True)])

@@ -12,6 +12,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import require_rigid, transform_points
 from gausslite.domain.voxels import VoxelGrid
 from gausslite_sim.home_settings import TRAJECTORY_COUNT
+from gausslite_sim.trajectory import walked_laps
 from gausslite_sim.two_room_layout import TABLE_CENTRE_M, furnish
 from gausslite_sim.two_room_trajectories import TRAJECTORIES
 
@@ -175,3 +176,8 @@ def test_textures_hold_fine_detail() -> None:
     image = home(0, 12, "320x240", "0").frame(2).rgb.astype(np.float64).mean(axis=2)
     gradient = np.abs(np.diff(image, axis=1))
     assert (gradient > 4).mean() > 0.3
+
+
+def test_every_second_lap_is_the_same_path_backwards() -> None:
+    once, laps = TRAJECTORIES[1](11), walked_laps(TRAJECTORIES[1], 3)(11)
+    np.testing.assert_allclose(laps[[0, 1, 4, 5, 10]], once[[0, 3, 8, 5, 10]], atol=1e-9)
