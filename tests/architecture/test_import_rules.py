@@ -32,7 +32,12 @@ CLIENTS = (
 )
 SERVERS = ("gausslite.wire.server", *SERVICES)
 ROW_COLUMNS = ("MEAN", "QUAT", "LOG_SCALE", "OPACITY_LOGIT", "RGB", "UPDATE_COUNT")
-MAY_USE_ROW_ENCODING = ("gausslite.mapping.density", "gausslite.mapping.splat_table", "gausslite.render")
+MAY_USE_ROW_ENCODING = (
+    "gausslite.mapping.anchors",
+    "gausslite.mapping.density",
+    "gausslite.mapping.splat_table",
+    "gausslite.render",
+)
 HEAVY = ("torch", "onnxruntime", "onnx", "embreex", "matplotlib", "scipy.spatial", "gausslite.render._kernels")
 
 

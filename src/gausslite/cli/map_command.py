@@ -281,6 +281,7 @@ class _Run:
             "resumed_from": None if options.resume is None else str(options.resume),
             **result.summary(),
             **trajectory_report(self._inputs.source, self._inputs.stream.source, self._mapper),
+            "loops": asdict(self._mapper.loops),
             "frames_corrupt": self._corrupt.count,
             "gaussians": len(self._gaussians),
             "active_gaussians": int(self._gaussians.active.sum()),

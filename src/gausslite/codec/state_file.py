@@ -99,7 +99,7 @@ def read_png(path: Path) -> UInt8[ndarray, "h w 3"]:
 
 FORMAT = "gausslite-state"
 VERSION = "2"
-_TYPES = {"BOOL", "U8", "I16", "U32", "I64", "U64", "F32", "F64"}
+_TYPES = {"BOOL", "U8", "I16", "I32", "U32", "I64", "U64", "F32", "F64"}
 _LENGTH_BYTES = 8
 _MAX_HEADER_BYTES = 1 << 24
 

@@ -108,8 +108,14 @@ def move_gaussians(gaussians: Gaussians, T: Float64[ndarray, "4 4"]) -> Gaussian
     if np.array_equal(T, np.eye(4)) or len(gaussians) == 0:
         return gaussians
     means = transform_points(T, gaussians.means_m.astype(np.float64)).astype(np.float32)
-    quats = _multiply(_quaternion(T[:3, :3]), gaussians.quats_wxyz.astype(np.float64)).astype(np.float32)
+    quats = (gaussians.quats_wxyz.astype(np.float64) @ left_product(T[:3, :3]).T).astype(np.float32)
     return replace(gaussians, means_m=means, quats_wxyz=quats)
+
+
+def left_product(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4 4"]:
+    """Return the matrix that multiplies quaternions (w, x, y, z) by a rotation from the left."""
+    w, x, y, z = _quaternion(R)
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 def _quaternion(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
@@ -126,11 +132,3 @@ def _quaternion(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
     _, vectors = np.linalg.eigh(K)
     quaternion: Float64[ndarray, "4"] = vectors[:, -1]
     return quaternion
-
-
-def _multiply(left: Float64[ndarray, "4"], right: Float64[ndarray, "n 4"]) -> Float64[ndarray, "n 4"]:
-    """Return the Hamilton products of one quaternion (w, x, y, z) with many."""
-    w, x, y, z = left
-    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product: Float64[ndarray, "n 4"] = right @ matrix.T
-    return product

@@ -32,8 +32,8 @@ def densify(table: SplatTable, settings: DensitySettings, extent_m: float) -> De
 
     The Gaussians with the largest gradients have priority. The two children render nearly like their parent, because
     online mapping has no time to repair copies of full opacity and random offsets (Kerbl et al. 2023). They inherit
-    active, kappa and target, and have no optimiser state. The first half of a split takes the parent's row. Resets the
-    density statistics.
+    active, kappa, target and anchor, and have no optimiser state. The first half of a split takes the parent's row.
+    Resets the density statistics.
     """
     max_added = min(table.free_slots, math.ceil(settings.max_growth * table.count))
     chosen = _largest_above(_mean_gradient(table), settings.min_mean_gradient, max_added)
@@ -77,7 +77,7 @@ def _clone(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
         rows[parents, OPACITY_LOGIT] = np.log(-np.expm1(-half_depth)) + half_depth
     rows = table.rows[parents]
     rows[:, UPDATE_COUNT] = 0.0
-    table.append_rows(rows, table.active[parents], table.kappa[parents], table.target[parents])
+    table.append_rows(rows, table.active[parents], table.kappa[parents], table.target[parents], table.anchor[parents])
 
 
 def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
@@ -97,7 +97,7 @@ def _split(table: SplatTable, parents: Int64[ndarray, " m"]) -> None:
     table.ema_rows[parents] = first
     table.first_moment[parents] = 0.0
     table.second_moment[parents] = 0.0
-    table.append_rows(second, table.active[parents], table.kappa[parents], table.target[parents])
+    table.append_rows(second, table.active[parents], table.kappa[parents], table.target[parents], table.anchor[parents])
 
 
 def _rotate(quats_wxyz: Float32[ndarray, "m 4"], vectors: Float32[ndarray, "m 3"]) -> Float32[ndarray, "m 3"]:

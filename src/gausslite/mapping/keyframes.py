@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame, without_depth_edges
-from gausslite.domain.pose import Twist, inverse
+from gausslite.domain.pose import Twist, inverse, orthonormal
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.mapping.settings import KeyframeSettings
@@ -122,18 +122,30 @@ class Keyframe:
     """A frame with its per-pixel relevance to the task (Sec. III-B).
 
     recorded: the frame with the source's pose and colours, if `frame` has refined ones; otherwise None.
-    evaluated: False until the relevance to the present task is known; `relevance` is empty until then.
+    evaluated: False until the relevance to the present task is known; `relevance` is empty until then. anchor: number
+    of the keyframe that the frame follows when poses are corrected; its own one, if it is a keyframe.
     """
 
     frame: Frame
     relevance: RelevanceMap
     recorded: Frame | None = None
     evaluated: bool = True
+    anchor: int = 0
 
     @property
     def as_recorded(self) -> Frame:
         """The frame with the source's pose and colours."""
         return self.frame if self.recorded is None else self.recorded
+
+    def moved(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> Keyframe:
+        """Return the keyframe moved with its anchor, given the motions by keyframe number."""
+        T = T_corrected_earlier[self.anchor]
+        frame, recorded = (
+            None if frame is None else replace(frame, T_world_camera=orthonormal(T @ frame.T_world_camera))
+            for frame in (self.frame, self.recorded)
+        )
+        assert frame is not None
+        return replace(self, frame=frame, recorded=recorded)
 
     def state(self) -> State:
         """Return the keyframe as named arrays."""
@@ -142,7 +154,7 @@ class Keyframe:
             **add_prefix("frame", frame_state(self.frame)),
             **add_prefix("relevance", relevance_state(self.relevance)),
             **add_prefix("recorded", recorded),
-            "evaluated": int_array(self.evaluated),
+            "counts": int_array(self.evaluated, self.anchor),
         }
 
     @classmethod
@@ -151,8 +163,8 @@ class Keyframe:
         frame = frame_from_state(select_prefix(state, "frame"))
         recorded = select_prefix(state, "recorded")
         relevance = relevance_from_state(select_prefix(state, "relevance"), frame)
-        [evaluated] = get_counts(state, "evaluated", 1)
-        return cls(frame, relevance, frame_from_state(recorded) if recorded else None, bool(evaluated))
+        evaluated, anchor = get_counts(state, "counts", 2)
+        return cls(frame, relevance, frame_from_state(recorded) if recorded else None, bool(evaluated), anchor)
 
 
 def is_same_frame(a: Keyframe, b: Keyframe) -> bool:
@@ -258,10 +270,25 @@ class KeyframeStore:
         """Every keyframe of the buffer and of the window once, by capture time."""
         return tuple(sorted(self._keyframes(), key=lambda keyframe: keyframe.frame.capture_time_ns))
 
+    @property
+    def next_anchor(self) -> int:
+        """Number of the keyframe that the next frame follows: its own, or that of the newest keyframe."""
+        return self._mapped_frames // self._settings.every
+
+    @property
+    def count(self) -> int:
+        """Number of keyframes of the mission."""
+        return -(-self._mapped_frames // self._settings.every)
+
+    @property
+    def next_is_keyframe(self) -> bool:
+        """True if the next frame is a keyframe."""
+        return self._mapped_frames % self._settings.every == 0
+
     def add(self, view: WindowView) -> None:
         """Store a mapped frame if it shows the ROI or is the next `every`th frame."""
         self._limit_for(view.keyframe)
-        is_keyframe = self._mapped_frames % self._settings.every == 0
+        is_keyframe = self.next_is_keyframe
         self._mapped_frames += 1
         if self._is_long_term(view):
             self._set_long_term([*self._long_term, view])
@@ -289,11 +316,17 @@ class KeyframeStore:
         keyframes = self._keyframes()
         empty = {k.frame.depth_m.shape: RelevanceMap.empty(*k.frame.depth_m.shape) for k in keyframes}
         fresh = {id(old): replace(old, relevance=empty[old.frame.depth_m.shape], evaluated=False) for old in keyframes}
+        self._replace_all(fresh, lambda view: replace(view, roi=_no_tiles(view.keyframe.frame)))
+
+    def move(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> None:
+        """Move all keyframes with their anchors, given the motions by keyframe number."""
+        moved = {id(old): old.moved(T_corrected_earlier) for old in self._keyframes()}
+        self._replace_all(moved, lambda view: replace(view, T_camera_world=inverse(view.keyframe.frame.T_world_camera)))
+
+    def _replace_all(self, fresh: Mapping[int, Keyframe], update: Callable[[WindowView], WindowView]) -> None:
+        """Replace all keyframes, given by id of the old ones, and update their views."""
         self._buffer = [fresh[id(keyframe)] for keyframe in self._buffer]
-        views = {
-            id(view.keyframe): replace(view, keyframe=fresh[id(view.keyframe)], roi=_no_tiles(view.keyframe.frame))
-            for view in self.window
-        }
+        views = {id(view.keyframe): update(replace(view, keyframe=fresh[id(view.keyframe)])) for view in self.window}
         self._recent = [views[id(view.keyframe)] for view in self._recent]
         self._long_term = [views[id(view.keyframe)] for view in self._long_term]
 

@@ -10,12 +10,14 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import inverse
+from gausslite.domain.pose import inverse, orthonormal
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
+from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.keyframes import (
     Keyframe,
     KeyframeStore,
@@ -24,15 +26,17 @@ from gausslite.mapping.keyframes import (
     restore_generator,
     window_view,
 )
+from gausslite.mapping.loops import LoopCloser, LoopCounts
 from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
 from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
-from gausslite.mapping.splat_table import SplatTable
+from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.mapping.task_change import add_roi_evidence, clear_roi, update_roi_evidence
 from gausslite.mapping.training import CountedScheduler, SkippableStage, Stage, StageScheduler, Trainer
 from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
+_MAX_KEYFRAMES = 2**31 - 1
 _EXTENT_PER_DEPTH = 1.0 / 3.0
 """Scene extent as a fraction of the largest depth so far, as in SplaTAM's released configuration."""
 
@@ -42,6 +46,8 @@ class MappedFrame:
     """Result of mapping one frame: Gaussians added by seeding, iterations, and Gaussians in the map afterwards.
 
     skipped: why the frame was not mapped, or None. T_world_camera: the pose that it was mapped with; None if skipped.
+    anchor: number of the keyframe that it follows. T_corrected_earlier: motion of each keyframe, in world axes, if a
+    loop corrected the map after this frame.
     """
 
     index: int
@@ -50,6 +56,8 @@ class MappedFrame:
     gaussians: int
     skipped: str | None = None
     T_world_camera: Float64[ndarray, "4 4"] | None = None
+    anchor: int = 0
+    T_corrected_earlier: Float64[ndarray, "k 4 4"] | None = None
 
 
 class GaussianMapper:
@@ -78,6 +86,8 @@ class GaussianMapper:
         )
         self._refiner = ViewRefiner(refinement, self.render)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
+        self._loops = LoopCloser(self._table, rasterizer) if settings.closes_loops else None
+        self._T_corrected_odometry: Float64[ndarray, "4 4"] | None = None
         self._extent_m = 0.0
         self._revision = 0
         self._skipped = 0
@@ -121,15 +131,35 @@ class GaussianMapper:
         if not frame.has_depth:
             self._skipped += 1
             return MappedFrame(frame.index, 0, 0, self.count, "no pixel has a depth reading")
+        self._refiner.history.begin(odometry or frame, self._keyframes.next_anchor)
         with scheduler.timing(Stage.VIEW_PREPARATION):
             view = self._prepare_view(frame, relevance)
-        T_world_camera = view.keyframe.frame.T_world_camera
-        self._refiner.history.record(odometry or frame, T_world_camera)
+        self._refiner.history.record(frame, view.keyframe.frame.T_world_camera)
         seeded = 0 if scheduler.skips(SkippableStage.SEEDING) else self._seed(view.keyframe, rendered, scheduler)
         iterations = self._train(view, scheduler)
+        is_keyframe = self._keyframes.next_is_keyframe
         self._keyframes.add(view)
         self._revision += 1
-        return MappedFrame(frame.index, seeded, iterations, self.count, T_world_camera=T_world_camera)
+        motions = self._close_loop(frame, view.keyframe, scheduler) if is_keyframe else None
+        return MappedFrame(
+            frame.index,
+            seeded,
+            iterations,
+            self.count,
+            T_world_camera=view.keyframe.frame.T_world_camera,
+            anchor=view.keyframe.anchor,
+            T_corrected_earlier=motions,
+        )
+
+    def corrected(self, odometry: Frame) -> Frame:
+        """Return the frame with its pose as the loops so far correct it; the frame itself without a correction."""
+        T = self._T_corrected_odometry
+        return odometry if T is None else replace(odometry, T_world_camera=orthonormal(T @ odometry.T_world_camera))
+
+    @property
+    def loops(self) -> LoopCounts:
+        """What became of the loops so far."""
+        return LoopCounts() if self._loops is None else self._loops.counts
 
     def idle_step(self) -> bool:
         """Run one iteration on the window's keyframes. Return False if there are none yet."""
@@ -176,7 +206,7 @@ class GaussianMapper:
         if not relevance.roi.any():
             return 0
         seeds = self._seeder.seed_roi(frame, relevance, table.means_m[table.active])
-        return self._insert(Seeds(seeds, Gaussians.empty()))
+        return self._insert(Seeds(seeds, Gaussians.empty(), keyframe.anchor))
 
     def next_incomplete(self, known_objects: int) -> Keyframe | None:
         """The newest keyframe whose relevance was estimated with fewer known objects, or None."""
@@ -196,7 +226,7 @@ class GaussianMapper:
         self._keyframes.set_evaluated(completed, self._window_view)
         add_roi_evidence(self._table, keyframe.frame, relevance, added)
         seeds = self._seeder.seed_roi(keyframe.frame, added, self._table.means_m[self._table.active])
-        return self._insert(Seeds(seeds, Gaussians.empty()))
+        return self._insert(Seeds(seeds, Gaussians.empty(), keyframe.anchor))
 
     def insert_team_voxels(self, received: VoxelBatch, grid: VoxelGrid) -> InsertedVoxels:
         """Insert a teammate's voxels whose Σkappa exceeds the local one; they replace the local Gaussians there."""
@@ -253,6 +283,8 @@ class GaussianMapper:
             **add_prefix("keyframes", self._keyframes.state()),
             **add_prefix("trainer", self._trainer.state()),
             **add_prefix("refiner", self._refiner.state()),
+            **add_prefix("loops", {} if self._loops is None else self._loops.state()),
+            **({} if self._T_corrected_odometry is None else {"T_corrected_odometry": self._T_corrected_odometry}),
             "generator": generator_state(self._rng),
             "extent_m": np.array([self._extent_m]),
             "frames": int_array(self._revision, self._skipped),
@@ -268,20 +300,56 @@ class GaussianMapper:
         self._keyframes.restore(select_prefix(state, "keyframes"), self._window_view)
         self._trainer.restore(select_prefix(state, "trainer"))
         self._refiner.restore(select_prefix(state, "refiner"))
+        if self._loops is not None:
+            self._loops.restore(select_prefix(state, "loops"))
+        if "T_corrected_odometry" in state:
+            self._T_corrected_odometry = get_array(state, "T_corrected_odometry", (4, 4), np.float64).copy()
         restore_generator(self._rng, get_array(state, "generator", (6,), np.uint64))
         [self._extent_m] = get_floats(state, "extent_m", 1)
         self._revision, self._skipped = get_counts(state, "frames", 2)
+        self._require_known_anchors()
+
+    def _require_known_anchors(self) -> None:
+        """Raise MapFileError if a restored Gaussian, keyframe or pose follows an unknown keyframe."""
+        count = self._keyframes.count
+        anchors = [keyframe.anchor for keyframe in self._keyframes.kept]
+        newest = max([int(self._table.anchor.max(initial=NO_ANCHOR)), self.poses.newest_anchor, *anchors])
+        if newest >= count or self._table.anchor.min(initial=0) < NO_ANCHOR or count > _MAX_KEYFRAMES:
+            raise MapFileError(f"state anchors: expected the numbers of {count} keyframes, got others")
+        if self._loops is not None and self._loops.keyframes != count:
+            raise MapFileError(f"state loops: expected {count} keyframes, got {self._loops.keyframes}")
 
     def _prepare_view(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
         """Prepare the frame for training; refine its pose and exposure if the prior allows an error."""
         # beyond max_depth_m nothing is seeded, and one outlier would enlarge the extent for the whole mission
         largest_depth_m = min(float(frame.depth_m.max()), self._settings.seeding.max_depth_m)
         self._extent_m = max(self._extent_m, largest_depth_m * _EXTENT_PER_DEPTH)
+        anchor = self._keyframes.next_anchor
         if not self._refiner.enabled or self._table.count == 0:
-            return self._window_view(Keyframe(frame, relevance))
+            return self._window_view(Keyframe(frame, relevance, anchor=anchor))
         for view in self._refiner.next_views(self._keyframes.window):
             self._keyframes.replace_view(self._window_view(self._refiner.refine_keyframe(view.keyframe)))
-        return self._window_view(Keyframe(self._refiner.refine(frame), relevance, recorded=frame))
+        return self._window_view(Keyframe(self._refiner.refine(frame), relevance, recorded=frame, anchor=anchor))
+
+    def _close_loop(
+        self, prior: Frame, keyframe: Keyframe, scheduler: StageScheduler
+    ) -> Float64[ndarray, "k 4 4"] | None:
+        """Search a loop of a new keyframe; if it corrects poses, move Gaussians, keyframes and poses with them.
+
+        prior: the frame with the pose before refinement.
+        """
+        if self._loops is None:
+            return None
+        with scheduler.timing(Stage.LOOP_CLOSURE):
+            motions = self._loops.add(keyframe, prior, self._keyframes.kept)
+            if motions is None:
+                return None
+            move_with_anchors(self._table, motions)
+            self._keyframes.move(motions)
+            self._refiner.history.move(motions)
+            T_earlier = np.eye(4) if self._T_corrected_odometry is None else self._T_corrected_odometry
+            self._T_corrected_odometry = orthonormal(motions[-1] @ T_earlier)
+            return motions
 
     def _window_view(self, keyframe: Keyframe) -> WindowView:
         return window_view(keyframe, self._rasterizer, self._settings.keyframes)
@@ -293,7 +361,8 @@ class GaussianMapper:
             rendered = self.render_view(frame)
         with scheduler.timing(Stage.SEEDING):
             context = SeedingContext(table.free_slots, rendered, table.means_m[table.active])
-            return self._insert(self._seeder.seed(frame, keyframe.relevance, context))
+            seeds = self._seeder.seed(frame, keyframe.relevance, context)
+            return self._insert(replace(seeds, anchor=keyframe.anchor))
 
     def _insert(self, seeds: Seeds) -> int:
         """Add seeds within the cap; return how many."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -29,14 +30,29 @@ _RECENT_POSES = 32
 
 
 class _Pose(NamedTuple):
+    """The pose by the odometry; the odometry's pose as loops have corrected it; the refined pose; see Keyframe.anchor.
+
+    Until a loop corrects it, T_world_prior is the odometry's pose (of a tracked camera: the tracked one).
+    """
+
     T_world_odometry: Float64[ndarray, "4 4"]
+    T_world_prior: Float64[ndarray, "4 4"]
     T_world_map: Float64[ndarray, "4 4"]
+    anchor: int
 
     @property
     def correction(self) -> Float64[ndarray, "6"]:
-        """Translation (m) of the camera and rotation vector (rad), both in world axes."""
-        R = self.T_world_map[:3, :3] @ self.T_world_odometry[:3, :3].T
-        return np.concatenate([self.T_world_map[:3, 3] - self.T_world_odometry[:3, 3], cv2.Rodrigues(R)[0].ravel()])
+        """Translation (m) of the camera and rotation vector (rad) by refinement, both in world axes."""
+        R = self.T_world_map[:3, :3] @ self.T_world_prior[:3, :3].T
+        return np.concatenate([self.T_world_map[:3, 3] - self.T_world_prior[:3, 3], cv2.Rodrigues(R)[0].ravel()])
+
+    def moved(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> _Pose:
+        """Return the pose moved with its anchor."""
+        T = T_corrected_earlier[self.anchor]
+        return self._replace(T_world_prior=T @ self.T_world_prior, T_world_map=T @ self.T_world_map)
+
+
+_POSES = ("T_world_odometry", "T_world_prior", "T_world_map")
 
 
 class PoseHistory:
@@ -45,21 +61,41 @@ class PoseHistory:
     def __init__(self) -> None:
         self._poses: dict[tuple[int, int], _Pose] = {}
         self._correction_sum = np.zeros(6)
+        self._current: tuple[Frame, int] | None = None
 
     def __len__(self) -> int:
         return len(self._poses)
 
-    def record(self, odometry: Frame, T_world_map: Float64[ndarray, "4 4"]) -> None:
-        """Store the pose in the map of a frame, whose own pose is that of the odometry."""
-        key = (odometry.index, odometry.capture_time_ns)
+    def begin(self, odometry: Frame, anchor: int) -> None:
+        """Set the frame that is recorded next, with the odometry's pose, and the keyframe that it follows."""
+        self._current = odometry, anchor
+
+    def record(self, prior: Frame, T_world_map: Float64[ndarray, "4 4"]) -> None:
+        """Store the pose in the map of a frame, whose own pose is the one before refinement."""
+        key = (prior.index, prior.capture_time_ns)
         earlier = self._poses.get(key)
-        pose = _Pose(odometry.T_world_camera if earlier is None else earlier.T_world_odometry, T_world_map)
-        if earlier is not None:
+        if earlier is None:
+            odometry, anchor = self._current or (prior, 0)
+            if (odometry.index, odometry.capture_time_ns) != key:
+                return  # an earlier frame that has been removed
+            pose = _Pose(odometry.T_world_camera, prior.T_world_camera, T_world_map, anchor)
+        else:
+            pose = earlier._replace(T_world_map=T_world_map)
             self._correction_sum -= earlier.correction
         self._correction_sum += pose.correction
         self._poses[key] = pose
         if len(self._poses) > _MAX_POSES:
             self._thin()
+
+    @property
+    def newest_anchor(self) -> int:
+        """The highest number of a keyframe that a pose follows; -1 without poses."""
+        return max((pose.anchor for pose in self._poses.values()), default=-1)
+
+    def move(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> None:
+        """Move all poses in the map with their keyframes, given by keyframe number."""
+        self._poses = {key: pose.moved(T_corrected_earlier) for key, pose in self._poses.items()}
+        self._correction_sum = self._sum_corrections()
 
     @property
     def mean_correction(self) -> Float64[ndarray, "6"]:
@@ -71,6 +107,7 @@ class PoseHistory:
         if not self._poses:
             return None
         (_, time_ns), newest = next(reversed(self._poses.items()))
+        # loops correct all recent poses alike, so refinement alone makes successive corrections differ
         recent = np.array([pose.correction for pose in list(self._poses.values())[-_RECENT_POSES:]])
         changes = np.diff(recent, axis=0) if len(recent) > 1 else np.zeros((1, 6))
         translation_m, rotation_rad = (
@@ -97,27 +134,29 @@ class PoseHistory:
         """Return all poses as named arrays."""
         return {
             "frames": np.array(list(self._poses), np.int64).reshape(-1, 2),
-            "T_world_odometry": np.array([pose.T_world_odometry for pose in self._poses.values()]).reshape(-1, 4, 4),
-            "T_world_map": np.array([pose.T_world_map for pose in self._poses.values()]).reshape(-1, 4, 4),
+            **{
+                name: np.array([getattr(pose, name) for pose in self._poses.values()]).reshape(-1, 4, 4)
+                for name in _POSES
+            },
+            "anchor": int_array(*(pose.anchor for pose in self._poses.values())),
             "correction_sum": self._correction_sum,
         }
 
     def restore(self, state: State) -> None:
         """Continue from another history's state. Raises MapFileError, PoseError."""
         frames = get_array(state, "frames", (None, 2), np.int64)
-        shape = (len(frames), 4, 4)
-        T_world_odometry = get_array(state, "T_world_odometry", shape, np.float64)
-        T_world_map = get_array(state, "T_world_map", shape, np.float64)
+        poses = [get_array(state, name, (len(frames), 4, 4), np.float64) for name in _POSES]
+        anchors = get_counts(state, "anchor", len(frames))
         correction_sum = get_array(state, "correction_sum", (6,), np.float64)
         if len(frames) > _MAX_POSES:
             raise MapFileError(f"state poses: expected at most {_MAX_POSES}, got {len(frames)}")
-        for T in (*T_world_odometry, *T_world_map):
+        for T in itertools.chain(*poses):
             require_rigid("state poses", T)
             if np.abs(T[:3, 3]).max() > MAX_COORDINATE_M:
                 raise MapFileError(f"state poses: expected positions within {MAX_COORDINATE_M:g} m of the origin")
         self._poses = {
-            (int(index), int(time_ns)): _Pose(odometry.copy(), in_map.copy())
-            for (index, time_ns), odometry, in_map in zip(frames, T_world_odometry, T_world_map, strict=True)
+            (int(index), int(time_ns)): _Pose(*(T.copy() for T in transforms), anchor)
+            for (index, time_ns), *transforms, anchor in zip(frames, *poses, anchors, strict=True)
         }
         # the stored sum has the rounding errors of its history, which a bit-identical continuation needs
         if not np.allclose(correction_sum, self._sum_corrections(), atol=1e-3):

@@ -23,7 +23,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.settings import Components, SeedingSettings
-from gausslite.mapping.splat_table import SplatTable
+from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.render.rasterizer import NEAR_M, Rendering
 
 _CELL_PX = 8
@@ -226,10 +226,14 @@ class SeedingContext:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel)."""
+    """New Gaussians: N_ROI seeds of the ROI, inserted first, and N_bg of the background (without SB: of any pixel).
+
+    anchor: number of the keyframe that they follow when poses are corrected.
+    """
 
     roi: Gaussians
     background: Gaussians
+    anchor: int = NO_ANCHOR
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -377,18 +381,18 @@ def insert_seeds(
     """
     evicted = _evict_for_roi(table, len(seeds.roi) - table.free_slots, min_background)
     roi = seeds.roi.take(_random_subset(len(seeds.roi), table.free_slots + len(evicted), rng))
-    _write(table, roi, evicted)
+    _write(table, roi, evicted, seeds.anchor)
     evicted = _evict_for_background(table, len(seeds.background) - table.free_slots, seed_opacity)
     capacity = table.free_slots + len(evicted)
     background = seeds.background.take(_random_subset(len(seeds.background), capacity, rng))
-    _write(table, background, evicted)
+    _write(table, background, evicted, seeds.anchor)
     return len(roi) + len(background)
 
 
-def _write(table: SplatTable, seeds: Gaussians, evicted: Int64[ndarray, " m"]) -> None:
+def _write(table: SplatTable, seeds: Gaussians, evicted: Int64[ndarray, " m"], anchor: int) -> None:
     """Write the first seeds to the evicted rows and the others to free slots."""
-    table.replace(evicted, seeds.take(np.arange(len(evicted))))
-    table.append(seeds.take(np.arange(len(evicted), len(seeds))))
+    table.replace(evicted, seeds.take(np.arange(len(evicted))), anchor)
+    table.append(seeds.take(np.arange(len(evicted), len(seeds))), anchor)
 
 
 def _evict_for_roi(table: SplatTable, count: int, min_background: int) -> Int64[ndarray, " k"]:

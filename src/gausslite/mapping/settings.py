@@ -272,6 +272,7 @@ class MapperSettings:
     max_gaussians: hard cap; memory for exactly this number is allocated at the start. pose_prior: prior of the pose and
     exposure error of each view; keyframes are refined unless it is exact. pose_anchor_share: share of the mission's
     mean pose correction by which each refined pose moves back towards the odometry; 0 for poses without odometry.
+    closes_loops: keyframes that see an earlier pass again correct all poses and the map.
     """
 
     max_gaussians: int = 1_000_000
@@ -284,6 +285,7 @@ class MapperSettings:
     task_change: TaskChangeSettings = field(default_factory=TaskChangeSettings)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
     pose_anchor_share: float = 0.1
+    closes_loops: bool = False
 
     def __post_init__(self) -> None:
         _require(self.max_gaussians >= 1, "max_gaussians", "at least 1", self.max_gaussians)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int16, Int64, UInt32
+from jaxtyping import Bool, Float32, Int, Int16, Int32, Int64, UInt32
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array, require_finite
@@ -35,7 +35,10 @@ _COLUMNS: dict[str, tuple[int | None, type[np.generic]]] = {
     "kappa": (None, np.uint32),
     "target": (None, np.int16),
     "roi_evidence": (None, np.int16),
+    "anchor": (None, np.int32),
 }
+NO_ANCHOR = -1
+"""Anchor of Gaussians that follow no keyframe: those of an initial map and of teammates."""
 _MAX_LOG_SCALE = 80.0
 """The exponential of a larger value is not a finite float32."""
 _MAX_MOMENT_RATIO, _MOMENT_TOLERANCE = 1e6, 1e-30
@@ -67,9 +70,10 @@ class SplatTable:
             self._kappa = np.zeros(capacity, np.uint32)
             self._target = np.zeros(capacity, np.int16)
             self._roi_evidence = np.zeros(capacity, np.int16)
+            self._anchor = np.zeros(capacity, np.int32)
         except (OSError, MemoryError, OverflowError, ValueError):
             raise InvalidInputError(
-                f"max_gaussians: expected a table that fits in memory (270 bytes per Gaussian), got {capacity}"
+                f"max_gaussians: expected a table that fits in memory (274 bytes per Gaussian), got {capacity}"
             ) from None
 
     def __len__(self) -> int:
@@ -93,7 +97,7 @@ class SplatTable:
     @property
     def table_bytes(self) -> int:
         """Memory allocated for everything but the optimiser state."""
-        columns = (self._active, self._kappa, self._target, self._roi_evidence)
+        columns = (self._active, self._kappa, self._target, self._roi_evidence, self._anchor)
         return self._rows.nbytes + self._ema_rows.nbytes + sum(column.nbytes for column in columns)
 
     @property
@@ -145,6 +149,11 @@ class SplatTable:
         return self._roi_evidence[: self._count]
 
     @property
+    def anchor(self) -> Int32[ndarray, " n"]:
+        """Number of the keyframe that each Gaussian follows when poses are corrected; NO_ANCHOR for none."""
+        return self._anchor[: self._count]
+
+    @property
     def means_m(self) -> Float32[ndarray, "n 3"]:
         """Means in metres."""
         return self.rows[:, MEAN]
@@ -182,9 +191,9 @@ class SplatTable:
         for channel in self.rows[:, RGB].T:
             np.clip(channel, lowest, highest, out=channel)
 
-    def append(self, gaussians: Gaussians) -> None:
+    def append(self, gaussians: Gaussians, anchor: int = NO_ANCHOR) -> None:
         """Add Gaussians with zero optimiser state. Raises QuotaError if they do not fit."""
-        self.append_rows(gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
+        self.append_rows(gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target, anchor)
 
     def append_rows(
         self,
@@ -192,16 +201,20 @@ class SplatTable:
         active: Bool[ndarray, " m"],
         kappa: UInt32[ndarray, " m"],
         target: Int16[ndarray, " m"],
+        anchor: Int32[ndarray, " m"] | int = NO_ANCHOR,
     ) -> None:
         """Add encoded rows with zero optimiser state. Raises QuotaError if they do not fit."""
         if len(rows) > self.free_slots:
             raise QuotaError(f"table: expected at most {self.free_slots} more Gaussians, got {len(rows)}")
-        self._put(slice(self._count, self._count + len(rows)), rows, active, kappa, target)
+        place = slice(self._count, self._count + len(rows))
+        self._put(place, rows, active, kappa, target)
+        self._anchor[place] = anchor
         self._count += len(rows)
 
-    def replace(self, ids: Int[ndarray, " m"], gaussians: Gaussians) -> None:
+    def replace(self, ids: Int[ndarray, " m"], gaussians: Gaussians, anchor: int = NO_ANCHOR) -> None:
         """Overwrite the Gaussians `ids` with these, with zero optimiser state."""
         self._put(ids, gaussians_to_rows(gaussians), gaussians.active, gaussians.kappa, gaussians.target)
+        self._anchor[ids] = anchor
 
     def keep(self, mask: Bool[ndarray, " n"]) -> None:
         """Remove the Gaussians where mask is False; the others keep their optimiser state.

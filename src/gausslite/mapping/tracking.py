@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -40,6 +40,7 @@ _MIN_INLIERS = 25
 class _IndexedKeyframe:
     features: FeatureView
     T_world_camera: Float64[ndarray, "4 4"]
+    anchor: int
 
 
 class KeyframeIndex:
@@ -52,13 +53,13 @@ class KeyframeIndex:
     def __len__(self) -> int:
         return len(self._keyframes)
 
-    def add(self, features: FeatureView, T_world_camera: Float64[ndarray, "4 4"]) -> None:
-        """Store a tracked frame if no keyframe is near it."""
+    def add(self, features: FeatureView, T_world_camera: Float64[ndarray, "4 4"], anchor: int) -> None:
+        """Store a tracked frame if no keyframe is near it; anchor: see `Keyframe`."""
         for keyframe in self._keyframes:
             near = translation_m(keyframe.T_world_camera, T_world_camera) < _MIN_DISTANCE_M
             if near and rotation_angle_deg(keyframe.T_world_camera, T_world_camera) < _MIN_ANGLE_DEG:
                 return
-        self._keyframes = [*self._keyframes, _IndexedKeyframe(features, T_world_camera)][-_MAX_KEYFRAMES:]
+        self._keyframes = [*self._keyframes, _IndexedKeyframe(features, T_world_camera, anchor)][-_MAX_KEYFRAMES:]
 
     def candidates(self, features: FeatureView, camera: Camera) -> Iterator[Float64[ndarray, "4 4"]]:
         """Yield possible T_world_camera of a frame, from a few keyframes; further calls continue with the next ones."""
@@ -70,6 +71,13 @@ class KeyframeIndex:
             if pose is not None and pose.inliers >= _MIN_INLIERS:
                 yield keyframe.T_world_camera @ inverse(pose.T_current_reference)
 
+    def move(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> None:
+        """Move all keyframes with their anchors."""
+        self._keyframes = [
+            replace(keyframe, T_world_camera=T_corrected_earlier[keyframe.anchor] @ keyframe.T_world_camera)
+            for keyframe in self._keyframes
+        ]
+
     def restart(self) -> None:
         """Let the next call of `candidates` begin with the newest keyframe."""
         self._next_tried = 0
@@ -77,7 +85,8 @@ class KeyframeIndex:
     def state(self) -> State:
         """Return all keyframes as named arrays."""
         poses = np.array([keyframe.T_world_camera for keyframe in self._keyframes]).reshape(-1, 4, 4)
-        state = {"T_world_camera": poses, "next_tried": int_array(self._next_tried)}
+        anchors = int_array(*(keyframe.anchor for keyframe in self._keyframes))
+        state = {"T_world_camera": poses, "anchors": anchors, "next_tried": int_array(self._next_tried)}
         for i, keyframe in enumerate(self._keyframes):
             state |= add_prefix(str(i), keyframe.features.state())
         return state
@@ -89,9 +98,10 @@ class KeyframeIndex:
             raise MapFileError(f"state tracking keyframes: expected at most {_MAX_KEYFRAMES}, got {len(poses)}")
         for T in poses:
             require_rigid("state tracking keyframes", T)
+        anchors = get_counts(state, "anchors", len(poses))
         self._keyframes = [
-            _IndexedKeyframe(FeatureView.from_state(select_prefix(state, str(i))), T.copy())
-            for i, T in enumerate(poses)
+            _IndexedKeyframe(FeatureView.from_state(select_prefix(state, str(i))), T.copy(), anchor)
+            for i, (T, anchor) in enumerate(zip(poses, anchors, strict=True))
         ]
         [self._next_tried] = get_counts(state, "next_tried", 1)
 
@@ -174,8 +184,8 @@ class CameraTracker:
         self._pending = _LastFrame(frame.capture_time_ns, frame.T_world_camera, T_world_camera, features)
         return T_world_camera
 
-    def confirm(self, T_world_camera: Float64[ndarray, "4 4"]) -> None:
-        """Set the pose that the last tracked frame was mapped with."""
+    def confirm(self, T_world_camera: Float64[ndarray, "4 4"], anchor: int = 0) -> None:
+        """Set the pose that the last tracked frame was mapped with, and the keyframe that it follows."""
         pending, last = self._pending, self._last
         if pending is None:
             return
@@ -183,8 +193,15 @@ class CameraTracker:
         if last is not None and current.time_ns > last.time_ns:
             step = twist_of(inverse(last.T_world_camera) @ current.T_world_camera)
             self._velocity = step / (1e-9 * (current.time_ns - last.time_ns))
-        self._keyframes.add(current.features, current.T_world_camera)
+        self._keyframes.add(current.features, current.T_world_camera, anchor)
         self._last, self._pending = current, None
+
+    def move(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> None:
+        """Move the confirmed poses with their keyframes; the last frame follows the newest one."""
+        self._keyframes.move(T_corrected_earlier)
+        if self._last is not None:
+            T_world_camera = orthonormal(T_corrected_earlier[-1] @ self._last.T_world_camera)
+            self._last = replace(self._last, T_world_camera=T_world_camera)
 
     def _find(self, frame: Frame, features: FeatureView) -> tuple[Float64[ndarray, "4 4"], TrackingMethod] | None:
         last = self._last

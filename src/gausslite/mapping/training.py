@@ -132,6 +132,8 @@ class Stage(StrEnum):
     DENSIFICATION = "densification"
     FINALISATION = "finalisation"
     """Clamp colours and update the EMA after the iterations."""
+    LOOP_CLOSURE = "loop_closure"
+    """Find a loop of a keyframe, and correct poses and map."""
     PUBLISHING = "publishing"
     """Find the changed voxels of the region and pass them to the uplink."""
 

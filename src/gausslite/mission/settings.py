@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field, replace
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 
 from gausslite.config.option import check_options, option
@@ -97,6 +98,15 @@ class PoseMode(StrEnum):
     """The odometry's poses, refined within the pose prior."""
     TRACK = "track"
     """Tracking against the map; of the given poses, only the first one is used, as the start."""
+
+
+class LoopMode(StrEnum):
+    """Whether loops correct the map, where poses may err."""
+
+    AUTO = "auto"
+    """If the packages of the extra slam are installed."""
+    ON = "on"
+    OFF = "off"
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,6 +350,11 @@ class MissionSettings:
         "given: map with the given poses; refine: refine them within pose-prior; track: find poses by tracking the "
         "camera against the map, from the first given pose on",
     )
+    loops: LoopMode = option(
+        LoopMode.AUTO,
+        "a keyframe that sees an earlier place again corrects poses and map, unless poses are exact (extra: slam); "
+        "auto: if the extra is installed",
+    )
     motion: MotionModel = option(
         MotionModel.VELOCITY,
         "what predicts the motion between two frames without enough common features: the last velocity or the given "
@@ -377,7 +392,15 @@ class MissionSettings:
             optimization=optimization,
             pose_prior=self.refinement_prior,
             pose_anchor_share=0.0 if self.poses is PoseMode.TRACK else base.pose_anchor_share,
+            closes_loops=self.closes_loops,
         )
+
+    @property
+    def closes_loops(self) -> bool:
+        """True if loops correct the map: not where poses are exact, and only with GTSAM."""
+        if self.loops is LoopMode.OFF or not self.refinement_prior.has_pose_error:
+            return False
+        return self.loops is LoopMode.ON or find_spec("gtsam") is not None
 
     @property
     def refinement_prior(self) -> PoseExposurePrior:

@@ -16,6 +16,7 @@ from gausslite.domain.relevance import DetectedImage, PointM, RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
+from gausslite.mapping.loops import LoopCounts
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.poses import PoseHistory
 from gausslite.mapping.seeding import RenderedView
@@ -105,8 +106,9 @@ class TaskMapper:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages of the relevance estimator for the operator, one line each."""
-        return self._estimator.notes
+        """Messages of the relevance estimator and of the loops for the operator, one line each."""
+        loops = self._mapper.loops.describe()
+        return (*self._estimator.notes, loops) if loops else self._estimator.notes
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
@@ -181,14 +183,16 @@ class TaskMapper:
         odometry, tracked = frame, self._track(frame)
         if tracked is None:
             return self._lost(frame)
-        frame = tracked
+        frame = tracked if self._tracker is not None else self._mapper.corrected(frame)
         view = self._render(frame)
         estimate = self._estimate_relevance(frame, view)
         lag_frames = self._apply_delayed(estimate.delayed)
         reevaluation = self._reevaluate_keyframes()
         mapped = self._mapper.map_frame(frame, estimate.relevance, self._scheduler, view, odometry)
         if self._tracker is not None and mapped.T_world_camera is not None:
-            self._tracker.confirm(mapped.T_world_camera)
+            self._tracker.confirm(mapped.T_world_camera, mapped.anchor)
+            if mapped.T_corrected_earlier is not None:
+                self._tracker.move(mapped.T_corrected_earlier)
         changed_roi = self._publish_changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
             index=frame.index,
@@ -210,6 +214,11 @@ class TaskMapper:
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""
         return None if self._sent_voxels is None else self._sent_voxels.collect_changes(self._mapper.roi_gaussians())
+
+    @property
+    def loops(self) -> LoopCounts:
+        """What became of the loops so far."""
+        return self._mapper.loops
 
     @property
     def tracking_counts(self) -> Mapping[str, int]:

@@ -92,7 +92,7 @@ class PlaceMap:
             keyframe, T_world_keyframe = self._views[number]
             if any(_is_near(place.T_world_camera, T_world_keyframe) for place in found):
                 continue
-            for T_keyframe_camera in _guesses(view, keyframe):
+            for T_keyframe_camera in guessed_motions(view, keyframe):
                 registration = register(view.surface, keyframe.surface, T_keyframe_camera)
                 if registration is None:
                     continue
@@ -109,7 +109,7 @@ class PlaceMap:
         return max(found, key=lambda place: place.verification.texture, default=None)
 
 
-def _guesses(view: View, keyframe: View) -> Iterator[Float64[ndarray, "4 4"]]:
+def guessed_motions(view: View, keyframe: View) -> Iterator[Float64[ndarray, "4 4"]]:
     """Yield motions T_keyframe_camera, the likeliest first: from point features, if installed, then from the images."""
     if can_match_without_guess():
         matched = matched_motion(view.surface, keyframe.surface)

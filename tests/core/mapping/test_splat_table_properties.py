@@ -72,8 +72,8 @@ class CheckedTable(SplatTable):
         super().append_rows(*columns)
         self._check()
 
-    def replace(self, ids: np.ndarray, gaussians: Gaussians) -> None:
-        super().replace(ids, gaussians)
+    def replace(self, ids: np.ndarray, gaussians: Gaussians, anchor: int) -> None:
+        super().replace(ids, gaussians, anchor)
         self._check()
 
     def keep(self, mask: np.ndarray) -> None:

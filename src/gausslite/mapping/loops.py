@@ -1,0 +1,188 @@
+"""Close loops: register a keyframe with one of long ago that saw the same place, and correct all poses by the graph.
+
+Candidates are the nearest earlier keyframe by position, and the most similar one by its place descriptor. Their depth
+surfaces give the motion, to a centimetre. A motion that would move the map is verified: what earlier keyframes have
+mapped, rendered from the new pose, must agree with the image. The pose graph then decides which loops are true. One
+that it rejects, at once or later, is counted and reported, and does not correct the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera, CameraMotion
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
+from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
+from gausslite.mapping.keyframes import Keyframe
+from gausslite.mapping.pose_graph import Loop, PoseGraph, require_graph_solver
+from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
+from gausslite.places.descriptors import DESCRIPTOR_BYTES, PlaceDescriptor
+from gausslite.places.localisation import View, guessed_motions
+from gausslite.places.registration import register
+from gausslite.places.verification import verify
+from gausslite.process import print_message
+from gausslite.render.rasterizer import Rasterizer, Rendering, Subset
+
+_MIN_GAP = 8
+"""Keyframes between two passes; what lies closer together in time is aligned by the refinement of views."""
+_MAX_DISTANCE = 1.5
+"""Of a candidate by position: metres plus radians."""
+_MIN_SIMILARITY = 0.6
+"""Of the descriptors of a candidate by appearance."""
+_SETTLED_M, _SETTLED_DEG = 0.015, 0.5
+"""A loop that the poses contradict by less moves nothing until another one does."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopCounts:
+    """What became of the loops so far.
+
+    refused: keyframes whose rendering from the pose of a loop did not agree with their image. accepted, rejected: loops
+    by the latest solution of the pose graph. withdrawn: accepted by one solution and rejected by a later one.
+    corrections: how often the map moved.
+    """
+
+    refused: int = 0
+    accepted: int = 0
+    rejected: int = 0
+    withdrawn: int = 0
+    corrections: int = 0
+
+    def describe(self) -> str:
+        """Return the counts as one line; empty while there is nothing to report."""
+        if not (self.corrections or self.refused or self.rejected or self.withdrawn):
+            return ""
+        return (
+            f"loops: the map was corrected {self.corrections} times; not used: {self.refused} contradict the map, "
+            f"{self.rejected} other loops; taken back: {self.withdrawn}"
+        )
+
+
+class LoopCloser:
+    """Finds loops of the map in `table` and owns the pose graph of its keyframes. Not thread-safe."""
+
+    def __init__(self, table: SplatTable, rasterizer: Rasterizer) -> None:
+        """Raises InvalidInputError if GTSAM is not installed."""
+        require_graph_solver()
+        self._table = table
+        self._rasterizer = rasterizer
+        self._graph = PoseGraph()
+        self._descriptors: list[PlaceDescriptor] = []
+        self._refused = self._withdrawn = self._corrections = 0
+
+    @property
+    def counts(self) -> LoopCounts:
+        """What became of the loops so far."""
+        accepted = int(np.count_nonzero(self._graph.accepted))
+        rejected = len(self._graph.accepted) - accepted
+        return LoopCounts(self._refused, accepted, rejected, self._withdrawn, self._corrections)
+
+    def add(self, keyframe: Keyframe, prior: Frame, kept: Sequence[Keyframe]) -> Float64[ndarray, "k 4 4"] | None:
+        """Add the next keyframe; return the motion of each keyframe in world axes if a loop corrects them, else None.
+
+        prior: the frame with the pose before refinement, by the odometry or by tracking. kept: keyframes with images.
+        """
+        self._graph.add(prior.T_world_camera, keyframe.frame.T_world_camera)
+        view = View.of(keyframe.frame)
+        self._descriptors.append(view.descriptor)
+        loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - _MIN_GAP])
+        if loop is None:
+            return None
+        settled = self._is_settled(loop)
+        self._graph.add_loop(loop)
+        return None if settled else self._solve(loop)
+
+    def state(self) -> State:
+        """Return the pose graph and the counts."""
+        counts = int_array(self._refused, self._withdrawn, self._corrections)
+        descriptors = np.array([descriptor.values for descriptor in self._descriptors], np.uint8)
+        return {
+            "counts": counts,
+            "descriptors": descriptors.reshape(-1, DESCRIPTOR_BYTES),
+            **add_prefix("graph", self._graph.state()),
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from another state. Raises MapFileError, PoseError."""
+        self._refused, self._withdrawn, self._corrections = get_counts(state, "counts", 3)
+        self._graph.restore(select_prefix(state, "graph"))
+        descriptors = get_array(state, "descriptors", (len(self._graph), DESCRIPTOR_BYTES), np.uint8)
+        self._descriptors = [PlaceDescriptor(values.copy()) for values in descriptors]
+
+    def _solve(self, newest: Loop) -> Float64[ndarray, "k 4 4"]:
+        """Solve the pose graph and report the loops that it rejects."""
+        solution = self._graph.solve()
+        withdrawn = self._graph.accepted[:-1] & ~solution.accepted[:-1]
+        rejected = [newest] if not solution.accepted[-1] else []
+        for loop in (*rejected, *(self._graph.loops[i] for i in np.flatnonzero(withdrawn))):
+            print_message(
+                f"loop between keyframes {loop.earlier} and {loop.later} rejected: it contradicts the others; "
+                "it does not correct the map"
+            )
+        self._withdrawn += int(np.count_nonzero(withdrawn))
+        self._corrections += 1
+        return self._graph.apply(solution)
+
+    def _find(self, keyframe: Keyframe, view: View, earlier: Sequence[Keyframe]) -> Loop | None:
+        """Return the loop of a keyframe with one of these; None if it saw the place of none, or images disagree."""
+        if not earlier:
+            return None
+        frame = keyframe.frame
+        nearest = min(earlier, key=lambda old: _distance(old.frame, frame))
+        if _distance(nearest.frame, frame) < _MAX_DISTANCE:
+            guess = inverse(nearest.frame.T_world_camera) @ frame.T_world_camera
+            loop = self._registered(keyframe, view, nearest, guess)
+            if loop is not None:
+                return loop
+        similar = max(earlier, key=self._similarity)
+        if similar is nearest or self._similarity(similar) < _MIN_SIMILARITY:
+            return None
+        for guess in guessed_motions(view, View.of(similar.frame)):
+            loop = self._registered(keyframe, view, similar, guess)
+            if loop is not None:
+                return loop
+        return None
+
+    def _similarity(self, old: Keyframe) -> float:
+        """Return the similarity of an earlier keyframe to the newest one."""
+        return self._descriptors[old.anchor].similarity(self._descriptors[-1])
+
+    def _registered(self, keyframe: Keyframe, view: View, old: Keyframe, guess: Float64[ndarray, "4 4"]) -> Loop | None:
+        """Return the loop of two keyframes if their surfaces fit and, if it moves the map, the rendering agrees."""
+        registration = register(view.surface, View.of(old.frame).surface, guess)
+        if registration is None:
+            return None
+        T_world_camera = old.frame.T_world_camera @ registration.T_target_source
+        loop = Loop(old.anchor, keyframe.anchor, inverse(self._graph.poses[old.anchor]) @ T_world_camera)
+        if self._is_settled(loop) or self._is_verified(keyframe, T_world_camera):
+            return loop
+        self._refused += 1
+        return None
+
+    def _is_verified(self, keyframe: Keyframe, T_world_camera: Float64[ndarray, "4 4"]) -> bool:
+        """True if what earlier keyframes have mapped, rendered from this pose, agrees with the keyframe's image."""
+        table = self._table
+        earlier = (table.anchor <= keyframe.anchor - _MIN_GAP) & (table.anchor != NO_ANCHOR)
+        subset = Subset(None, np.flatnonzero(earlier).astype(np.uint32))
+
+        def render(camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None) -> Rendering:
+            return self._rasterizer.forward(table.rows, camera, inverse(T_world_camera), subset, motion)
+
+        return verify(render, keyframe.frame, T_world_camera).is_accepted
+
+    def _is_settled(self, loop: Loop) -> bool:
+        """True if the poses agree with a loop, so that it does not move the map."""
+        error_m, error_deg = self._graph.residual(loop)
+        return error_m < _SETTLED_M and error_deg < _SETTLED_DEG
+
+
+def _distance(a: Frame, b: Frame) -> float:
+    """Return the distance of two views: metres plus radians."""
+    turned_deg = rotation_angle_deg(a.T_world_camera, b.T_world_camera)
+    return translation_m(a.T_world_camera, b.T_world_camera) + float(np.radians(turned_deg))

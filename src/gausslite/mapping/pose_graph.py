@@ -1,0 +1,213 @@
+"""Correct the poses of keyframes by a pose graph: odometry, alignment to the map, and loops, which may be false.
+
+Nodes are keyframes. Between successive ones there are two factors, the motion by the odometry and that of the poses
+refined against the map. A loop states the motion between two keyframes far apart in time. Loops are robust by graduated
+non-convexity (GNC, Yang et al. 2020): each solution decides anew which ones count, so that a loop which later ones
+contradict no longer corrects the map. GTSAM solves the graph (extra: slam).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+
+from gausslite.domain.errors import MapFileError
+from gausslite.domain.pose import inverse, orthonormal, require_rigid, rotation_angle_deg, translation_m
+from gausslite.domain.state import State, get_array
+from gausslite.process import import_extra
+
+MAX_NODES = 2000
+"""Keyframes that a solution may move, the newest ones; loops with older ones are dropped."""
+_MAX_LOOPS = 1000
+_DRIFT_M, _DRIFT_DEG = 0.03, 1.0
+"""Standard deviations of the odometry after 1 m walked or 1 rad turned. They grow with the square root."""
+_LEAST_STD_M, _LEAST_STD_DEG = 0.002, 0.1
+_MAP_STD_M, _MAP_STD_DEG = 0.01, 0.3
+"""Error of the motion between two successive poses that are refined against the map."""
+_LOOP_STD_M, _LOOP_STD_DEG = 0.01, 0.5
+_START_STD = 1e-4
+_INLIER_PROBABILITY = 0.99
+_MIN_WEIGHT = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loop:
+    """Two keyframes, by number, that saw one place: the later one's pose in the frame of the earlier one's camera."""
+
+    earlier: int
+    later: int
+    T_earlier_later: Float64[ndarray, "4 4"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphSolution:
+    """T_world_keyframe of all keyframes, and which loops count."""
+
+    T_world_keyframe: Float64[ndarray, "k 4 4"]
+    accepted: Bool[ndarray, " l"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """Motion from one keyframe to the next: by the odometry and by the poses in the map."""
+
+    odometry: Float64[ndarray, "4 4"]
+    in_map: Float64[ndarray, "4 4"]
+
+
+def require_graph_solver() -> Any:
+    """Import GTSAM. Raises InvalidInputError, which names the command that installs it."""
+    return import_extra("gtsam", "slam", "loops")
+
+
+class PoseGraph:
+    """Keyframes by number, in the order of time, and the loops between them. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._T_world_keyframe: list[Float64[ndarray, "4 4"]] = []
+        self._T_world_prior = np.eye(4)
+        self._steps: list[_Step] = []
+        self._loops: list[Loop] = []
+        self._accepted = np.zeros(0, np.bool_)
+
+    def __len__(self) -> int:
+        return len(self._T_world_keyframe)
+
+    @property
+    def poses(self) -> Sequence[Float64[ndarray, "4 4"]]:
+        """T_world_keyframe of each keyframe."""
+        return self._T_world_keyframe
+
+    @property
+    def loops(self) -> Sequence[Loop]:
+        """All loops, accepted or not."""
+        return self._loops
+
+    @property
+    def accepted(self) -> Bool[ndarray, " l"]:
+        """Which loops count in the present poses."""
+        return self._accepted
+
+    def add(self, T_world_prior: Float64[ndarray, "4 4"], T_world_keyframe: Float64[ndarray, "4 4"]) -> None:
+        """Add the next keyframe, with its pose before refinement, as earlier loops correct it, and its refined pose."""
+        if self._T_world_keyframe:
+            odometry = inverse(self._T_world_prior) @ T_world_prior
+            self._steps.append(_Step(odometry, inverse(self._T_world_keyframe[-1]) @ T_world_keyframe))
+        self._T_world_prior = T_world_prior
+        self._T_world_keyframe.append(T_world_keyframe)
+
+    def add_loop(self, loop: Loop) -> None:
+        """Add a loop, which counts until the next solution; beyond 1000, the oldest ones are dropped."""
+        self._loops = [*self._loops, loop][-_MAX_LOOPS:]
+        self._accepted = np.append(self._accepted, True)[-_MAX_LOOPS:]
+
+    def residual(self, loop: Loop) -> tuple[float, float]:
+        """Return by how much the present poses contradict a loop, in metres and degrees."""
+        T = inverse(self._T_world_keyframe[loop.earlier]) @ self._T_world_keyframe[loop.later]
+        return translation_m(T, loop.T_earlier_later), rotation_angle_deg(T, loop.T_earlier_later)
+
+    def solve(self) -> GraphSolution:
+        """Return the poses that agree best with all factors. The newest 2000 keyframes may move."""
+        gtsam = require_graph_solver()
+        first = max(0, len(self) - MAX_NODES)
+        recent = np.array([loop.earlier >= first for loop in self._loops], np.bool_)
+        self._loops = [loop for loop, kept in zip(self._loops, recent, strict=True) if kept]
+        self._accepted = self._accepted[recent]
+        graph, values = self._chain(gtsam, first)
+        chain = list(range(graph.size()))
+        for loop in self._loops:
+            graph.add(_between(gtsam, (loop.earlier, loop.later), loop.T_earlier_later, _LOOP_NOISE))
+        parameters = gtsam.GncLMParams()
+        parameters.setKnownInliers(chain)
+        optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
+        optimizer.setInlierCostThresholdsAtProbability(_INLIER_PROBABILITY)
+        solved = optimizer.optimize()
+        poses = np.array(self._T_world_keyframe)
+        for number in range(first, len(self)):
+            poses[number] = orthonormal(solved.atPose3(number).matrix())
+        return GraphSolution(poses, optimizer.getWeights()[len(chain) :] > _MIN_WEIGHT)
+
+    def apply(self, solution: GraphSolution) -> Float64[ndarray, "k 4 4"]:
+        """Move the keyframes to a solution; return the motion of each in world axes, T_corrected_earlier."""
+        motions = np.array(
+            [
+                orthonormal(T @ inverse(earlier))
+                for T, earlier in zip(solution.T_world_keyframe, self._T_world_keyframe, strict=True)
+            ]
+        )
+        self._T_world_keyframe = list(solution.T_world_keyframe)
+        self._T_world_prior = motions[-1] @ self._T_world_prior
+        self._accepted = solution.accepted
+        return motions
+
+    def _chain(self, gtsam: Any, first: int) -> tuple[Any, Any]:
+        """Return the factors of successive keyframes from this one on, whose pose is fixed, and the present poses."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for number in range(first, len(self)):
+            values.insert(number, gtsam.Pose3(self._T_world_keyframe[number]))
+        start = gtsam.noiseModel.Isotropic.Sigma(6, _START_STD)
+        graph.add(gtsam.PriorFactorPose3(first, values.atPose3(first), start))
+        for number, step in enumerate(self._steps[first:], first):
+            for T, noise in ((step.odometry, _odometry_noise(step.odometry)), (step.in_map, _MAP_NOISE)):
+                graph.add(_between(gtsam, (number, number + 1), T, noise))
+        return graph, values
+
+    def state(self) -> State:
+        """Return all keyframes and loops."""
+        return {
+            "T_world_keyframe": np.array(self._T_world_keyframe).reshape(-1, 4, 4),
+            "T_world_prior": self._T_world_prior,
+            "odometry_steps": np.array([step.odometry for step in self._steps]).reshape(-1, 4, 4),
+            "map_steps": np.array([step.in_map for step in self._steps]).reshape(-1, 4, 4),
+            "loops": np.array([(loop.earlier, loop.later) for loop in self._loops], np.int64).reshape(-1, 2),
+            "T_earlier_later": np.array([loop.T_earlier_later for loop in self._loops]).reshape(-1, 4, 4),
+            "accepted": self._accepted,
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from another graph's state. Raises MapFileError, PoseError."""
+        poses = _rigid(state, "T_world_keyframe", None)
+        self._T_world_prior = get_array(state, "T_world_prior", (4, 4), np.float64).copy()
+        count = max(len(poses) - 1, 0)
+        odometry, in_map = (_rigid(state, name, count) for name in ("odometry_steps", "map_steps"))
+        loops = get_array(state, "loops", (None, 2), np.int64)
+        if not ((loops >= 0) & (loops < len(poses))).all():
+            raise MapFileError(f"state loops: expected keyframes from 0 to {len(poses) - 1}, got others")
+        measured = _rigid(state, "T_earlier_later", len(loops))
+        self._accepted = get_array(state, "accepted", (len(loops),), np.bool_).copy()
+        self._T_world_keyframe = poses
+        self._steps = [_Step(*step) for step in zip(odometry, in_map, strict=True)]
+        self._loops = [Loop(int(i), int(j), T) for (i, j), T in zip(loops, measured, strict=True)]
+
+
+def _rigid(state: State, name: str, count: int | None) -> list[Float64[ndarray, "4 4"]]:
+    transforms = get_array(state, name, (count, 4, 4), np.float64)
+    for T in transforms:
+        require_rigid(f"state {name}", T)
+    return [T.copy() for T in transforms]
+
+
+def _noise(translation_std_m: float, rotation_std_deg: float) -> Float64[ndarray, "6"]:
+    """Return standard deviations in GTSAM's order: rotation (rad), then translation (m)."""
+    return np.array([np.radians(rotation_std_deg)] * 3 + [translation_std_m] * 3)
+
+
+_MAP_NOISE, _LOOP_NOISE = _noise(_MAP_STD_M, _MAP_STD_DEG), _noise(_LOOP_STD_M, _LOOP_STD_DEG)
+
+
+def _odometry_noise(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
+    """Return the standard deviations of a motion by the odometry."""
+    walked = float(np.linalg.norm(T[:3, 3])) + np.radians(rotation_angle_deg(np.eye(4), T))
+    return _noise(_LEAST_STD_M + _DRIFT_M * walked**0.5, _LEAST_STD_DEG + _DRIFT_DEG * walked**0.5)
+
+
+def _between(
+    gtsam: Any, keyframes: tuple[int, int], T_first_second: Float64[ndarray, "4 4"], noise: Float64[ndarray, "6"]
+) -> Any:
+    pose = gtsam.Pose3(T_first_second)
+    return gtsam.BetweenFactorPose3(*keyframes, pose, gtsam.noiseModel.Diagonal.Sigmas(noise))
