@@ -83,6 +83,11 @@ class LoopCloser:
         rejected = len(self._graph.accepted) - accepted
         return LoopCounts(self._refused, accepted, rejected, self._withdrawn, self._corrections)
 
+    @property
+    def keyframes(self) -> int:
+        """The number of keyframes so far."""
+        return len(self._graph)
+
     def add(self, keyframe: Keyframe, prior: Frame, kept: Sequence[Keyframe]) -> Float64[ndarray, "k 4 4"] | None:
         """Add the next keyframe; return the motion of each keyframe in world axes if a loop corrects them, else None.
 
@@ -120,7 +125,7 @@ class LoopCloser:
         solution = self._graph.solve()
         withdrawn = self._graph.accepted[:-1] & ~solution.accepted[:-1]
         rejected = [newest] if not solution.accepted[-1] else []
-        for loop in (*rejected, *(self._graph.loops[i] for i in np.flatnonzero(withdrawn))):
+        for loop in (*rejected, *(self._graph.loops[i] for i in np.flatnonzero(withdrawn).tolist())):
             print_message(
                 f"loop between keyframes {loop.earlier} and {loop.later} rejected: it contradicts the others; "
                 "it does not correct the map"

@@ -155,8 +155,8 @@ class PoseHistory:
             if np.abs(T[:3, 3]).max() > MAX_COORDINATE_M:
                 raise MapFileError(f"state poses: expected positions within {MAX_COORDINATE_M:g} m of the origin")
         self._poses = {
-            (int(index), int(time_ns)): _Pose(*(T.copy() for T in transforms), anchor)
-            for (index, time_ns), *transforms, anchor in zip(frames, *poses, anchors, strict=True)
+            (int(index), int(time_ns)): _Pose(odometry.copy(), prior.copy(), in_map.copy(), anchor)
+            for (index, time_ns), odometry, prior, in_map, anchor in zip(frames, *poses, anchors, strict=True)
         }
         # the stored sum has the rounding errors of its history, which a bit-identical continuation needs
         if not np.allclose(correction_sum, self._sum_corrections(), atol=1e-3):

@@ -130,12 +130,14 @@ def assigned_to_message(
     excluded_m: Sequence[PointM] = (),
 ) -> agent_service_pb2.AssignTaskRequest:
     """Encode the request of an AssignTask call."""
-    return agent_service_pb2.AssignTaskRequest(
-        text=task if isinstance(task, str) else None,
-        graph=graph_to_message(task) if isinstance(task, TaskGraph) else None,
-        pointed=map(_pointed_to_message, pointed),
-        excluded=map(_point_to_message, excluded_m),
+    request = agent_service_pb2.AssignTaskRequest(
+        pointed=map(_pointed_to_message, pointed), excluded=map(_point_to_message, excluded_m)
     )
+    if isinstance(task, str):
+        request.text = task
+    elif task is not None:
+        request.graph.CopyFrom(graph_to_message(task))
+    return request
 
 
 def assigned_from_message(
