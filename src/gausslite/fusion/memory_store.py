@@ -96,12 +96,12 @@ class MemoryStore:
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
         with self._lock:
-            return read_batches(lambda: {agent_id: self._log.places(agent_id, keys)}, self._read)[agent_id]
+            return read_batches(self._log, self._lock, self._read, keys, (agent_id,))[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
         with self._lock:
-            return {agent_id: self.batch(agent_id, keys) for agent_id in self.agents()}
+            return read_batches(self._log, self._lock, self._read, keys)
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""

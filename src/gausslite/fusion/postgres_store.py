@@ -33,7 +33,7 @@ from gausslite.fusion.store import (
     require_storable,
 )
 from gausslite.fusion.store_migration import rows_of_voxels
-from gausslite.fusion.store_rows import SLOT_BITS, Places, UpdateLog, data_checksum, read_batches, require_intact
+from gausslite.fusion.store_rows import SLOT_BITS, UpdateLog, data_checksum, read_batches, require_intact
 from gausslite.fusion.traffic import PROBE_RECORD, TRAFFIC_RECORD
 
 SCHEMA_VERSION = 3
@@ -192,11 +192,11 @@ class PostgresStore:
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        return self._batches(lambda: (agent_id,), keys)[agent_id]
+        return read_batches(self._log, self._index_lock, self._read_rows, keys, (agent_id,))[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
-        return self._batches(lambda: self._log.index.agents, keys)
+        return read_batches(self._log, self._index_lock, self._read_rows, keys)
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
@@ -321,15 +321,6 @@ class PostgresStore:
             self._log.load(require_intact(cursor, self._damaged))
         timeline = db.execute(_SELECT_TIMELINE).fetchone()
         self._incarnation_id = f"{_property(db, 'incarnation_id')}-{'' if timeline is None else timeline[0]}"
-
-    def _batches(
-        self, agents: Callable[[], tuple[str, ...]], keys: Int64[ndarray, " k"] | None
-    ) -> dict[str, VoxelBatch]:
-        def locate() -> dict[str, Places]:
-            with self._index_lock:
-                return {agent_id: self._log.places(agent_id, keys) for agent_id in agents()}
-
-        return read_batches(locate, self._read_rows)
 
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         rows = itertools.chain.from_iterable(self._read(_SELECT_ROWS, part) for part in _by_slot(numbers))

@@ -10,7 +10,7 @@ import logging
 import os
 import secrets
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import RLock
@@ -33,7 +33,7 @@ from gausslite.fusion.store import (
     require_storable,
 )
 from gausslite.fusion.store_migration import rows_of_voxels
-from gausslite.fusion.store_rows import Places, UpdateLog, data_checksum, read_batches, require_intact
+from gausslite.fusion.store_rows import UpdateLog, data_checksum, read_batches, require_intact
 
 _log = logging.getLogger(__name__)
 SCHEMA_VERSION = 7
@@ -306,11 +306,11 @@ class SqliteStore:
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        return self._batches(lambda: (agent_id,), keys)[agent_id]
+        return read_batches(self._log, self._index_lock, self._read_rows, keys, (agent_id,))[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
-        return self._batches(lambda: self._log.index.agents, keys)
+        return read_batches(self._log, self._index_lock, self._read_rows, keys)
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
@@ -393,15 +393,6 @@ class SqliteStore:
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
             rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
             self._log.load(require_intact(rows, functools.partial(_damaged, self._path)))
-
-    def _batches(
-        self, agents: Callable[[], tuple[str, ...]], keys: Int64[ndarray, " k"] | None
-    ) -> dict[str, VoxelBatch]:
-        def locate() -> dict[str, Places]:
-            with self._index_lock:
-                return {agent_id: self._log.places(agent_id, keys) for agent_id in agents()}
-
-        return read_batches(locate, self._read_rows)
 
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         rows = self._read(_SELECT_ROWS, (json.dumps(numbers),))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from threading import RLock
 from typing import Any
 
 import google_crc32c
@@ -226,10 +227,21 @@ class UpdateLog:
             self._used += size
 
 
-def read_batches(locate: Callable[[], Mapping[str, Places]], read: ReadRows) -> dict[str, VoxelBatch]:
-    """Return the updates of agents at the places that the index names. Raises StorageError for damaged rows."""
+def read_batches(
+    log: UpdateLog,
+    index_lock: RLock,
+    read: ReadRows,
+    keys: Int64[ndarray, " k"] | None,
+    agents: Sequence[str] | None = None,
+) -> dict[str, VoxelBatch]:
+    """Return the updates of these agents, or of all, on these voxels, or on all. Raises StorageError for damaged rows.
+
+    index_lock: held while the log's index is read.
+    """
     for _ in range(_READ_ATTEMPTS):
-        places = locate()
+        with index_lock:
+            names = log.index.agents if agents is None else agents
+            places = {agent_id: log.places(agent_id, keys) for agent_id in names}
         numbers = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for _, rows in places.values())]))
         data = read(numbers.tolist()) if len(numbers) else {}
         # rows may have been moved after the index was asked

@@ -279,6 +279,10 @@ class CountingStore(MemoryStore):
         self.reads.append(-1 if keys is None else len(keys))
         return super().batch(agent_id, keys)
 
+    def batches(self, keys: np.ndarray | None = None) -> dict[str, VoxelBatch]:
+        self.reads.append(-1 if keys is None else len(keys))
+        return super().batches(keys)
+
 
 def test_comparing_and_correcting_read_slices_and_never_a_whole_map() -> None:
     store = CountingStore()
