@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
 import subprocess
@@ -9,11 +10,15 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fusion_running import COMMAND, GRID, make_subset, request, server_process
+from sample_gaussians import plain_gaussians
+from waiting import wait_until
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import UnavailableError
+from gausslite.domain.voxels import RoiSubset, group_by_voxel
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export, FusionClient
 from gausslite_fusion_server.program import run
@@ -52,6 +57,41 @@ def test_sigterm_ends_open_streams_and_the_process_with_code_0(tmp_path: Path) -
         assert process.wait(20) == 0
     assert "Traceback" not in log.read_text()
     assert log.read_text().rstrip().endswith("ended")
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that this one has started."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        # a process may end between two reads
+        with contextlib.suppress(OSError):
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(stat.parent.name))
+    return found
+
+
+def room_corner(agent_id: str, seed: int) -> RoiSubset:
+    """Gaussians on a floor and two walls of 2 m with a texture."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 2, (3000, 3))
+    points[np.arange(3000), rng.integers(0, 3, 3000)] = 0.0
+    texture = 0.5 + 0.4 * np.sin(points @ np.array([6.0, 4.0, 5.0]))
+    gaussians = plain_gaussians(points, rgb=np.repeat(texture[:, None], 3, 1), kappa=5)
+    return RoiSubset(agent_id, "", 1, 1, group_by_voxel(gaussians, GRID))
+
+
+def test_frames_are_compared_in_a_process_that_ends_with_the_server(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with server_process(log=log) as (process, client):
+        for seed, name in enumerate(("ant", "bee")):
+            session = client.join(name, GRID).session_id
+            list(client.contribute([request(session, room_corner(name, seed))], 20.0))
+        wait_until(lambda: client.status().agents[1].alignment.state == pb.ALIGNMENT_STATE_ALIGNED)
+        [child] = children(process.pid)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+        assert not Path(f"/proc/{child}").exists()
+    assert "Traceback" not in log.read_text()
 
 
 def test_a_database_without_the_extra_is_one_line_with_the_command_that_installs_it() -> None:
