@@ -174,20 +174,23 @@ class PendingUpdate:
 
 
 class UpdateQueue:
-    """Start-time fair queueing over the agents, by the bytes and Gaussians of their messages. Thread-safe.
+    """Fair queueing over the agents, by the bytes and Gaussians of their messages. Thread-safe.
 
-    It stands before decoding: a message costs its size, or what its header declares if that is more.
+    It stands before decoding: a message costs its size, or what its header declares if that is more. Messages are taken
+    in the order in which a server that works for all waiting agents at once, byte by byte, would finish them. So a
+    small message passes the large ones of any number of agents, until it has had its share.
 
-    Source: P. Goyal et al., "Start-time fair queueing", IEEE/ACM Transactions on Networking 5(5), 1997.
+    Source: A. Demers et al., "Analysis and simulation of a fair queueing algorithm", SIGCOMM 1989.
     """
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._pending: dict[str, deque[PendingUpdate]] = {}
-        # (virtual start time, order of arrival, agent id) of each agent with pending messages
+        # (round of the end, order of arrival, agent id) of each agent with pending messages
         self._waiting: list[tuple[float, int, str]] = []
         self._finish: dict[str, float] = {}
-        self._now = 0.0
+        # the bytes that each waiting agent would have had
+        self._round = 0.0
         self._arrivals = 0
         self._bytes = 0
 
@@ -222,11 +225,10 @@ class UpdateQueue:
         cost = 0
         with self._lock:
             while self._waiting and cost < max_bytes:
-                start, _, agent_id = heapq.heappop(self._waiting)
-                self._now = start
+                agent_id = heapq.heappop(self._waiting)[2]
                 update = self._pending[agent_id][0]
                 own_cost = update.cost
-                self._finish[agent_id] = start + own_cost
+                self._round += own_cost / len(self._pending)
                 cost += own_cost
                 # it is decoded now
                 self._bytes -= update.encoded_bytes
@@ -247,12 +249,13 @@ class UpdateQueue:
             if not self._pending:
                 # nobody waits, so no agent has an advantage or a debt
                 self._finish.clear()
-                self._now = 0.0
+                self._round = 0.0
 
     def _wait(self, agent_id: str) -> None:
-        start = max(self._now, self._finish.get(agent_id, 0.0))
+        finish = max(self._round, self._finish.get(agent_id, 0.0)) + self._pending[agent_id][0].cost
+        self._finish[agent_id] = finish
         self._arrivals += 1
-        heapq.heappush(self._waiting, (start, self._arrivals, agent_id))
+        heapq.heappush(self._waiting, (finish, self._arrivals, agent_id))
 
 
 def _encoded_bytes(update: PendingUpdate) -> int:

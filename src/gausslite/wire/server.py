@@ -127,6 +127,8 @@ _OPTIONS = (
     *connection_options(KEEPALIVE_S),
     # gRPC would close a connection whose client pings this often without sending data
     ("grpc.http2.min_ping_interval_without_data_ms", round(500 * KEEPALIVE_S)),
+    # else gRPC receives megabytes ahead on each stream, as fast as a client sends; a message that is read is exempt
+    ("grpc.http2.bdp_probe", 0),
     # a second server must fail to bind the port instead of sharing it
     ("grpc.so_reuseport", 0),
 )

@@ -65,6 +65,18 @@ def test_a_large_message_does_not_delay_the_messages_of_other_agents() -> None:
     assert max(np.diff([i for i, name in enumerate(order) if name == "ant"])) <= 4
 
 
+def test_a_small_message_comes_before_the_equal_large_ones_of_many_agents() -> None:
+    queue = UpdateQueue()
+    for number in range(20):
+        for _ in range(3):
+            queue.add(pending(f"hog-{number}", many_tombstones(f"hog-{number}", 1000)))
+    for turn in range(1, 6):
+        for _ in range(turn):
+            served(queue, 1)
+        queue.add(pending("ant", StoredSubset.exact(make_subset("ant", turn, {11: 1}))))
+        assert served(queue, 1) == ["ant"]
+
+
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 3 * SLICE_VOXELS)), max_size=12), st.integers(1, 9000))
 @settings(max_examples=30)
 def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tuple[str, int]], group: int) -> None:
@@ -127,8 +139,8 @@ def test_a_message_costs_what_its_header_declares() -> None:
         [update] = queue.take(1)
         order.append(update.agent_id)
         queue.put_back(update, True)
-    # after the first large message, all small ones come before the second
-    assert order == ["hog", *["ant"] * 20, "hog"]
+    # together, the small ones cost less than one that is short but declares much
+    assert order == [*["ant"] * 20, "hog", "hog"]
 
 
 def test_a_late_message_is_logged(caplog: pytest.LogCaptureFixture) -> None:
