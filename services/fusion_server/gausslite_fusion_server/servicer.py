@@ -144,8 +144,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._gate = DrainGate()
         find = functools.partial(self._work, session_of, engine)
         self._contributions = Contributions(find, self._store_message, engine.record_traffic, RejectionLog(_log))
-        # one map at a time is in memory
-        self._exports = asyncio.Semaphore(1)
+        # one map and one decoded keyframe at a time are in memory
+        self._exports, self._keyframes = asyncio.Semaphore(1), asyncio.Semaphore(1)
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
@@ -263,7 +263,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         response, caller = pb.ContributeKeyframesResponse(), Caller.of(context)
         async for request in self._gate.admit(request_iterator):
             try:
-                await self._work(store_keyframe, self._engine, request, caller)
+                async with self._keyframes:
+                    await self._work(store_keyframe, self._engine, request, caller)
                 response.accepted += 1
             except (InvalidInputError, QuotaError) as error:
                 if len(response.rejected) >= _MAX_REPORTED_REJECTIONS:

@@ -53,19 +53,21 @@ class FusedMapReader:
         return revision, self._tiles(self._in_region(tiles))
 
     def changes(self, since_revision: int) -> tuple[int, Parts]:
-        """Return the current revision and what changed since. Raises RevisionGoneError."""
-        if self.engine.maps.revision(self.watched.layer) == since_revision:
+        """Return the current revision and what changed since, or more. Raises RevisionGoneError."""
+        revision = self.engine.maps.revision(self.watched.layer)
+        if revision == since_revision:
             return since_revision, ()
-        changes = self.engine.maps.changes(since_revision, self.watched.layer)
 
+        # the map is read once for all watchers that follow closely
         def encode() -> tuple[EncodedPart, ...]:
+            changes = self.engine.maps.changes(since_revision, self.watched.layer)
             won = self._select(self.watched, changes.won)
             changed = np.union1d(changes.won.batch.keys, changes.removed)
             if self.watched.region is not None:
                 changed = changed[self.watched.region.contains(self.engine.grid.centres_m(changed))]
             return _encode(won, np.setdiff1d(changed, won.batch.keys), self.engine.grid)
 
-        return changes.revision, (self.cache.get((self.watched, since_revision, changes.revision), encode),)
+        return revision, (self.cache.get((self.watched, since_revision, revision), encode),)
 
     def _tiles(self, tiles: np.ndarray) -> Iterator[tuple[EncodedPart, ...]]:
         for tile in tiles.tolist():

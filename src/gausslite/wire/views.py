@@ -146,18 +146,34 @@ def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:
     return positions
 
 
+_NOTIFY_PAUSE_S = 0.1
+
+
 class ChangeNotifier:
-    """Subscribe, read the state, then wait on the subscription: so no change is missed. Use it on the event loop."""
+    """Subscribe, read the state, then wait on the subscription: so no change is missed. Use it on the event loop.
+
+    Subscribers wake together, at most every _NOTIFY_PAUSE_S, so that many of them read the same changes.
+    """
 
     def __init__(self) -> None:
         self._next_change = asyncio.Event()
+        self._earliest_s = 0.0
+        self._is_due = False
 
     def subscribe(self) -> asyncio.Event:
         """Return an event that the next `notify` sets."""
         return self._next_change
 
     def notify(self) -> None:
-        """Wake all subscribers."""
+        """Wake all subscribers, now or soon."""
+        if not self._is_due:
+            self._is_due = True
+            loop = asyncio.get_running_loop()
+            loop.call_at(max(self._earliest_s, loop.time()), self._wake)
+
+    def _wake(self) -> None:
+        self._is_due = False
+        self._earliest_s = asyncio.get_running_loop().time() + _NOTIFY_PAUSE_S
         self._next_change.set()
         self._next_change = asyncio.Event()
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from unittest.mock import Mock
 
+import pytest
 from fusion_running import GRID, keys, make_subset
 
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineSettings
@@ -17,8 +20,11 @@ from gausslite.fusion.store import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock
+from gausslite.wire.map_changes import EncodedPartCache
+from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
+from gausslite_fusion_server.watch import FusedMapReader, WatchedPart
 
 Contribute = Callable[[int, dict[int, list[int]]], None]
 
@@ -76,3 +82,40 @@ def test_a_watcher_that_missed_too_much_gets_a_snapshot() -> None:
         assert group_by_voxel(block).keys.tolist() == keys(3).tolist()
 
     watching(FusionSettings(grid=GRID, max_removed_voxels=1), body)
+
+
+def test_a_change_is_read_once_for_all_watchers(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID), first_revision=1)
+    session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
+    cache, part = EncodedPartCache(), WatchedPart(MapLayer.VOTE)
+    readers = [FusedMapReader(engine, part, cache) for _ in range(20)]
+    before, _ = readers[0].snapshot()
+    engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
+    monkeypatch.setattr(FusedMapLayers, "changes", Mock(wraps=engine.maps.changes))
+    answers = [reader.changes(before) for reader in readers]
+    assert all(answer == answers[0] and answer[1] for answer in answers)
+    assert FusedMapLayers.changes.call_count == 1
+
+
+def test_watchers_wake_together_after_many_changes() -> None:
+    async def run() -> None:
+        changes, woken = ChangeNotifier(), []
+
+        async def watch(number: int) -> None:
+            while True:
+                await changes.subscribe().wait()
+                woken.append(number)
+
+        watchers = [asyncio.ensure_future(watch(number)) for number in range(3)]
+        await asyncio.sleep(0)
+        for _ in range(20):
+            changes.notify()
+            await asyncio.sleep(0)
+        # the first change wakes them at once, the others together
+        await asyncio.wait_for(changes.subscribe().wait(), 30)
+        await asyncio.sleep(0)
+        assert sorted(woken) == [0, 0, 1, 1, 2, 2]
+        for watcher in watchers:
+            watcher.cancel()
+
+    asyncio.run(run())
