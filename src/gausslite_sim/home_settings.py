@@ -12,6 +12,8 @@ from gausslite.domain.errors import DatasetError, InvalidInputError
 
 TRAJECTORY_COUNT = 3
 _SIDES_PX = (16, 4096)
+_NUMBER = r"-?[0-9]{1,2}(?:\.[0-9]{1,3})?"
+_CHANGES = re.compile(rf"(\w+):(?:gone|({_NUMBER}):({_NUMBER})(?::({_NUMBER}))?)")
 _NUMBERS = ("seed", "trajectory", "frames", "laps")
 _STRENGTHS = {"noise": "noise", "holes": "holes", "flying": "flying_pixels", "exposure": "exposure", "gloss": "gloss"}
 """Fields of HomeSettings by the names in a spec."""
@@ -27,7 +29,8 @@ class HomeSettings:
     of a rolling shutter. exposure_ms: exposure time of a row. lens: distortion of both images. speed_deg_s: mean
     angular speed, which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose poses the frames
     have, in percent of the distance moved and of the angle turned; 0 for exact poses. laps: how often the path is
-    walked, every second time backwards.
+    walked, every second time backwards. changes: the objects that are not where the home has them, with their shift in
+    metres, or None if they are gone.
     """
 
     home: int = 0
@@ -46,6 +49,7 @@ class HomeSettings:
     speed_deg_s: float = 0.0
     drift_percent: float = 0.0
     laps: int = 1
+    changes: tuple[tuple[str, tuple[float, float, float] | None], ...] = ()
 
     def __post_init__(self) -> None:
         low, high = _SIDES_PX
@@ -91,11 +95,14 @@ class HomeSettings:
                 settings["speed_deg_s"] = float(value)
             elif key == "drift" and (match := re.fullmatch(r"([0-9]{1,2}(?:\.[0-9]{1,3})?)%", value)):
                 settings["drift_percent"] = float(match.group(1))
+            elif key == "changes" and all(_CHANGES.fullmatch(change) for change in value.split(",")):
+                settings["changes"] = tuple(_read_change(change) for change in value.split(","))
             else:
                 expected = "&".join(
                     [
                         *(f"{name}=N" for name in _NUMBERS),
                         *("size=WxH", "shutter=Xms", "blur=Xms", "lens=MODEL:K1,...", "speed=N", "drift=X%"),
+                        "changes=OBJECT:gone,OBJECT:DX:DY[:DZ],...",
                         *(f"{name}=X" for name in _STRENGTHS),
                     ]
                 )
@@ -103,6 +110,16 @@ class HomeSettings:
                     f"{name_of_home(home)}: {key}={value}: expected {expected}, each optional; N whole, X 0 to 10"
                 )
         return cls(home, **settings)
+
+
+def _read_change(text: str) -> tuple[str, tuple[float, float, float] | None]:
+    match = _CHANGES.fullmatch(text)
+    assert match is not None
+    name, *shift_m = match.groups()
+    if shift_m[0] is None:
+        return name, None
+    x_m, y_m, z_m = (float(number or 0.0) for number in shift_m)
+    return name, (x_m, y_m, z_m)
 
 
 def _read_lens(text: str, home: int) -> Lens:

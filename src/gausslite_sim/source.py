@@ -51,9 +51,9 @@ _build_lock = threading.Lock()
 
 
 @lru_cache(maxsize=2)
-def _build_home(home: int, seed: int) -> _BuiltHome:
+def _build_home(home: int, seed: int, changes: tuple[tuple[str, tuple[float, float, float] | None], ...]) -> _BuiltHome:
     """Return the home, shared by all sources of the process; call it with `_build_lock` held."""
-    plan = plan_home(home, seed)
+    plan = plan_home(home, seed).with_changes(dict(changes))
     scene = HomeScene(plan)
     images = InstanceImageCache(scene)
     regions = {name: InstanceRegion(name, scene.names.index(name), images) for name in scene.object_names}
@@ -174,7 +174,7 @@ class SimulatedHome:
     @cached_property
     def _home(self) -> _BuiltHome:
         with _build_lock:
-            return _build_home(self._settings.home, self._settings.seed)
+            return _build_home(self._settings.home, self._settings.seed, self._settings.changes)
 
     @cached_property
     def _poses(self) -> Float64[ndarray, "n 4 4"]:

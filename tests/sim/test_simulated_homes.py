@@ -7,6 +7,7 @@ import pytest
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import require_rigid
 from gausslite_sim.exposure import camera_gain
 from gausslite_sim.home_catalogue import HOME_COUNT, HOMES
@@ -122,3 +123,19 @@ def test_the_seed_moves_movable_objects_only() -> None:
 
     assert 1e-4 < np.linalg.norm(middle("drill", 0) - middle("drill", 1)) < 0.1
     np.testing.assert_array_equal(middle("workbench", 0), middle("workbench", 1))
+
+
+def test_objects_can_be_shifted_or_left_out() -> None:
+    pytest.importorskip("embreex", reason="simulated homes come with the extra sim")
+    small = "sim:home-2?size=64x48&noise=0"
+    before, after = (open_source(f"{small}{changes}") for changes in ("", "&changes=stool:-0.3:0.2,mug:gone"))
+    assert before.regions().keys() - after.regions().keys() == {"mug"}
+    stool_m = [
+        next(item for item in source._home.plan.items if item.name == "stool").parts[0].mesh.positions_m.mean(axis=0)  # type: ignore[attr-defined]
+        for source in (before, after)
+    ]
+    np.testing.assert_allclose(stool_m[1] - stool_m[0], (-0.3, 0.2, 0.0), atol=1e-6)
+    with pytest.raises(DatasetError, match=r"changes: expected objects among .*stool.*, got sofa"):
+        open_source(f"{small}&changes=sofa:gone").frame(0)
+    with pytest.raises(DatasetError, match="changes=mug"):
+        open_source(f"{small}&changes=mug")

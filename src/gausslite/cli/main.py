@@ -25,6 +25,7 @@ SUMMARIES = {
     "fuse": "fuse map files into one by a vote in every voxel",
     "export": "write a map for other tools: splat viewers, point clouds, planners, meshes",
     "report": "show the results of one or several runs on one HTML page: pictures, plots and tables",
+    "diff": "say what changed between the maps of two runs: objects that are gone, moved or new",
     "view": "show a map, a run, an agent or a fusion server on a page in the browser",
     "status": "print the state of a running agent or fusion server",
     "end": "end the mission of a running agent: send what waits, hand over, save",

@@ -9,14 +9,14 @@ from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
+from gausslite.cli.map_prior import PriorRun
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
     RecordingOptions,
-    depth_unit_advice,
+    depth_notes,
     report_region_file,
+    require_mappable_depth,
     selected_regions,
     stated_values,
 )
@@ -28,9 +28,9 @@ from gausslite.config.program import Program
 from gausslite.datasets.open import open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
-from gausslite.domain.errors import DatasetError, PoseError, StorageError
+from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import found_text
+from gausslite.domain.objects import ObjectLandmark, found_text
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text
 from gausslite.domain.task import TaskGraph, noun_of
@@ -38,10 +38,10 @@ from gausslite.evaluation.compare import MapScores, score_training_views
 from gausslite.evaluation.metrics import trajectory_error
 from gausslite.evaluation.pictures import render_preview
 from gausslite.evaluation.views import view_map
-from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
+from gausslite.mission.map_diff import Change
 from gausslite.mission.results import (
     PREVIEW,
     locked_folder,
@@ -68,36 +68,6 @@ from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, Sibling, import_extra, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.channel import MAX_PORT
-
-_LEAST_DEPTH_M = 0.05
-
-
-def require_mappable_depth(source: str, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
-    """Raise DatasetError for frames that gave no Gaussian: without depth, or with depth too far away."""
-    if result.totals.frames == 0:
-        raise DatasetError(f"{source}: expected frames with depth, got none in {result.processed}")
-    if result.stopped_by is None:
-        raise DatasetError(
-            f"{source}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
-            f"{_median_depth_m(keyframes):.3g} m; {depth_unit_advice(source)}"
-        )
-
-
-def depth_notes(source: str, keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
-    """Return a note if the median depth is nearer than any depth camera measures."""
-    median_m = _median_depth_m(keyframes)
-    if median_m >= _LEAST_DEPTH_M:
-        return ()
-    return (f"the median depth is {median_m:.2g} m; {depth_unit_advice(source)}",)
-
-
-def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:
-    medians = [
-        float(np.median(keyframe.frame.depth_m[keyframe.frame.depth_m > 0]))
-        for keyframe in keyframes
-        if keyframe.frame.has_depth
-    ]
-    return float(np.median(medians)) if medians else np.inf
 
 
 def trajectory_report(settings: SourceSettings, source: Source, mapper: TaskMapper) -> dict[str, object]:
@@ -163,6 +133,11 @@ class MapOptions:
     )
     save_state: Path | None = option(None, "save the whole run here at its end, for resume", metavar="FILE")
     resume: Path | None = option(None, "continue a saved run with the frames after its last one", metavar="FILE")
+    prior: Path | None = option(
+        None,
+        "continue the map of an earlier run, in its world frame; its folder, as --out of `map` or an agent",
+        metavar="RUN",
+    )
 
 
 def configure(parser: CommandParser) -> None:
@@ -170,7 +145,7 @@ def configure(parser: CommandParser) -> None:
     Program.of(
         *(MapOptions, TaskSettings, RecordingOptions, SourceSettings, PerceptionSettings, MissionSettings),
         flags="task detector frames size max-gaussians iterations rate roi objects policy seed poses test-every out "
-        "overwrite",
+        "overwrite prior",
         positional="source",
         defaults={"policy": None},
         computed={"policy": policy_of},
@@ -184,6 +159,8 @@ def run(options: argparse.Namespace) -> int:
     require_name("world-frame", options.world_frame or "")
     if options.view is not None:
         import_extra("viser", "view", "--view")
+    if options.prior is not None and options.resume is not None:
+        raise InvalidInputError("--prior: expected it without resume; a saved run knows the map that it continues")
     if options.resume is None and not options.overwrite:
         require_no_map(options.out)
     with locked_folder(options.out):
@@ -210,11 +187,19 @@ def _map(options: argparse.Namespace) -> int:
     if saved is None:
         stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
         inputs = inputs.calibrated(replace(stated, force=options.force))
-    mapper = build_task_mapper(inputs.mission, estimators, roi)
+    prior = None if saved is None else PriorRun.resumed(saved.extra)
+    if options.prior is not None:
+        prior = PriorRun.localise(options.prior, inputs)
+    recorded = inputs
+    if prior is not None:
+        inputs = prior.moved(recorded)
+        estimators = estimators.in_scene(lambda: SceneInfo.of(inputs.stream.source))
+        roi = _first_roi(options, inputs, resumed_after)
+    mapper = build_task_mapper(inputs.mission, estimators, roi, None if prior is None else prior.gaussians_for(inputs))
     if saved is not None:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
-    mapping = _Run(options, inputs, mapper)
+    mapping = _Run(options, inputs, mapper, recorded, prior)
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
         result = mapping.map_frames(estimators, resumed_after)
@@ -232,8 +217,17 @@ def _map(options: argparse.Namespace) -> int:
 class _Run:
     """One run: its frame loop and its results."""
 
-    def __init__(self, options: argparse.Namespace, inputs: MapInputs, mapper: TaskMapper) -> None:
-        self._options = options
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        inputs: MapInputs,
+        mapper: TaskMapper,
+        recorded: MapInputs,
+        prior: PriorRun | None,
+    ) -> None:
+        """Recorded: the inputs in the sequence's own world frame, which differs from theirs with a prior map."""
+        self._options, self._recorded, self._prior = options, recorded, prior
+        self._changes: list[Change] = []
         self._inputs = inputs
         self._mapper = mapper
         self._corrupt = CorruptFrames(print_above_bar)
@@ -276,6 +270,10 @@ class _Run:
             *_unreached_notes(self._inputs.schedule, result.last_index),
             *depth_notes(options.source, self._mapper.keyframes()),
         )
+        objects: Sequence[ObjectLandmark] = self._mapper.objects
+        if self._prior is not None:
+            self._changes = self._prior.changes(self._mapper, self._gaussians, self._inputs)
+            objects = self._prior.objects(objects, self._changes)
         self._report = {
             **self._inputs.report(),
             "resumed_from": None if options.resume is None else str(options.resume),
@@ -287,9 +285,10 @@ class _Run:
             "active_gaussians": int(self._gaussians.active.sum()),
             "peak_rss_mib": peak_rss_mib(),
             "memory_mib": self._mapper.memory_mib(),
-            "objects": [object_as_json(landmark) for landmark in self._mapper.objects],
+            "objects": [object_as_json(landmark) for landmark in objects],
             "nouns": [noun_as_json(noun) for noun in self._mapper.nouns],
             "notes": list(self._notes),
+            **({} if self._prior is None else self._prior.report(self._changes)),
         }
         prepare_folder(options.out)
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
@@ -346,6 +345,8 @@ class _Run:
         # the notes repeat what is missing among the nouns
         for line in dict.fromkeys((*(noun.describe() for noun in self._mapper.nouns), *self._notes)):
             print(f"  {line}")
+        for change in self._changes:
+            print(f"  {change.describe()}")
         print(self._outcome(result.last_index))
 
     def _outcome(self, last_index: int) -> str:
@@ -363,7 +364,9 @@ class _Run:
     def _save(self, last_index: int) -> None:
         prepare_folder(self._options.save_state.parent)
         extra: State = {FRAMES_KEY: encode_text(self._options.frames)}
-        config = self._inputs.resume_config(last_index)
+        if self._prior is not None:
+            extra = {**extra, **self._prior.state()}
+        config = self._recorded.resume_config(last_index)
         try:
             save_run(self._options.save_state, self._mapper, config, last_index, extra)
         except StorageError as error:

@@ -8,6 +8,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+import numpy as np
+
 from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
 from gausslite.config.option import option
 from gausslite.config.values import (
@@ -29,7 +31,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
-from gausslite.mission.runner import region_file_note
+from gausslite.mapping.keyframes import Keyframe
+from gausslite.mission.runner import MissionResult, region_file_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
 from gausslite.process import Sibling, print_message, sibling
 
@@ -171,3 +174,34 @@ def report_region_file(spec: str, source: Source) -> None:
     note = region_file_note(spec, source)
     if note is not None:
         print_message(note)
+
+
+_LEAST_DEPTH_M = 0.05
+
+
+def require_mappable_depth(source: str, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
+    """Raise DatasetError for frames that gave no Gaussian: without depth, or with depth too far away."""
+    if result.totals.frames == 0:
+        raise DatasetError(f"{source}: expected frames with depth, got none in {result.processed}")
+    if result.stopped_by is None:
+        raise DatasetError(
+            f"{source}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
+            f"{_median_depth_m(keyframes):.3g} m; {depth_unit_advice(source)}"
+        )
+
+
+def depth_notes(source: str, keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
+    """Return a note if the median depth is nearer than any depth camera measures."""
+    median_m = _median_depth_m(keyframes)
+    if median_m >= _LEAST_DEPTH_M:
+        return ()
+    return (f"the median depth is {median_m:.2g} m; {depth_unit_advice(source)}",)
+
+
+def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:
+    medians = [
+        float(np.median(keyframe.frame.depth_m[keyframe.frame.depth_m > 0]))
+        for keyframe in keyframes
+        if keyframe.frame.has_depth
+    ]
+    return float(np.median(medians)) if medians else np.inf

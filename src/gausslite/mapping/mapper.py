@@ -18,6 +18,7 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
+from gausslite.mapping.free_space import contradicted_rows
 from gausslite.mapping.keyframes import (
     Keyframe,
     KeyframeStore,
@@ -71,12 +72,14 @@ class GaussianMapper:
     ) -> None:
         """Allocate memory for `settings.max_gaussians` Gaussians; seed initialises all random choices.
 
-        Raises QuotaError if initial_map exceeds the cap.
+        initial_map: an earlier map to continue; keyframes that contradict it remove its Gaussians, and those that show
+        it set its active flags. Raises QuotaError if it exceeds the cap.
         """
         self._settings = settings
         self._rasterizer = rasterizer
         self._rng = np.random.default_rng(seed)
         self._table = SplatTable(settings.max_gaussians)
+        self._has_prior = initial_map is not None
         if initial_map is not None:
             self._table.append(initial_map)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
@@ -139,6 +142,8 @@ class GaussianMapper:
         iterations = self._train(view, scheduler)
         is_keyframe = self._keyframes.next_is_keyframe
         self._keyframes.add(view)
+        if self._has_prior and self._keyframes.buffer[-1] is view.keyframe:
+            self._revise(view.keyframe)
         self._revision += 1
         motions = self._close_loop(frame, view.keyframe, scheduler) if is_keyframe else None
         return MappedFrame(
@@ -287,7 +292,7 @@ class GaussianMapper:
             **({} if self._T_corrected_odometry is None else {"T_corrected_odometry": self._T_corrected_odometry}),
             "generator": generator_state(self._rng),
             "extent_m": np.array([self._extent_m]),
-            "frames": int_array(self._revision, self._skipped),
+            "frames": int_array(self._revision, self._skipped, self._has_prior),
         }
 
     def restore(self, state: State) -> None:
@@ -306,7 +311,8 @@ class GaussianMapper:
             self._T_corrected_odometry = get_array(state, "T_corrected_odometry", (4, 4), np.float64).copy()
         restore_generator(self._rng, get_array(state, "generator", (6,), np.uint64))
         [self._extent_m] = get_floats(state, "extent_m", 1)
-        self._revision, self._skipped = get_counts(state, "frames", 2)
+        self._revision, self._skipped, has_prior = get_counts(state, "frames", 3)
+        self._has_prior = bool(has_prior)
         self._require_known_anchors()
 
     def _require_known_anchors(self) -> None:
@@ -363,6 +369,16 @@ class GaussianMapper:
             context = SeedingContext(table.free_slots, rendered, table.means_m[table.active])
             seeds = self._seeder.seed(frame, keyframe.relevance, context)
             return self._insert(replace(seeds, anchor=keyframe.anchor))
+
+    def _revise(self, keyframe: Keyframe) -> None:
+        """Set the active flags of what a keyframe shows, and remove the Gaussians that the keyframes see through."""
+        update_roi_evidence(self._table, keyframe.frame, keyframe.relevance)
+        frames = (earlier.frame for earlier in self._keyframes.buffer)
+        contradicted = contradicted_rows(self._table.means_m, keyframe.frame, frames)
+        if len(contradicted):
+            keep = np.ones(self._table.count, np.bool_)
+            keep[contradicted] = False
+            self._table.keep(keep)
 
     def _insert(self, seeds: Seeds) -> int:
         """Add seeds within the cap; return how many."""

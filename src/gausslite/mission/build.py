@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
@@ -36,10 +38,13 @@ EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 """Returns the relevance estimator of a task."""
 
 
-def build_mapper(settings: MissionSettings) -> GaussianMapper:
-    """Return a mapper with an empty map. Raises KernelError, InvalidInputError."""
+def build_mapper(settings: MissionSettings, prior: Gaussians | None = None) -> GaussianMapper:
+    """Return a mapper with an empty map, or with an earlier one to continue.
+
+    Raises KernelError, InvalidInputError, QuotaError if the earlier map exceeds max-gaussians.
+    """
     rasterizer = choose_rasterizer(settings.backend, settings.threads)
-    return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed)
+    return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed, initial_map=prior)
 
 
 def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTracker | None:
@@ -66,14 +71,17 @@ def region_estimator(regions: Sequence[Region]) -> RelevanceEstimator:
 
 
 def build_task_mapper(
-    settings: MissionSettings, estimators: EstimatorFactory, roi: TaskGraph | Sequence[Region]
+    settings: MissionSettings,
+    estimators: EstimatorFactory,
+    roi: TaskGraph | Sequence[Region],
+    prior: Gaussians | None = None,
 ) -> TaskMapper:
-    """Return a mapper with an empty map. roi: a task, or regions of space; without both, mapping is uniform.
+    """Return a mapper of an empty map, or of an earlier one. roi: a task, or regions of space; neither: uniform.
 
-    Raises KernelError, and InvalidInputError for a task without a detector.
+    Raises KernelError, QuotaError, and InvalidInputError for a task without a detector.
     """
     estimator = estimators.build(roi) if isinstance(roi, TaskGraph) else region_estimator(roi)
-    mapper = build_mapper(settings)
+    mapper = build_mapper(settings, prior)
     scheduler = FrameScheduler(settings.scheduler_settings)
     return TaskMapper(estimator, mapper, scheduler=scheduler, tracker=build_tracker(settings, mapper))
 
@@ -90,6 +98,12 @@ class EstimatorFactory:
         self._scene = functools.cache(scene)
         self._models = open_models(perception)
         self._executor: ThreadPoolExecutor | None = None
+
+    def in_scene(self, scene: Callable[[], SceneInfo]) -> EstimatorFactory:
+        """Return a factory with the same models for another scene."""
+        other = copy.copy(self)
+        other._scene = functools.cache(scene)
+        return other
 
     def require_detector(self) -> None:
         """Raise InvalidInputError if there is neither a model file nor ground truth."""

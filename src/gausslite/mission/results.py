@@ -54,7 +54,7 @@ def _photograph(keyframe: Keyframe) -> ViewImage:
     return ViewImage(keyframe.frame.index, keyframe.frame.rgb, keyframe.relevance.roi)
 
 
-_MAP, _REPORT = "map.ply", "report.json"
+MAP, _REPORT = "map.ply", "report.json"
 _FIRST_BYTES = 512
 PREVIEW = "preview.png"
 REPORT_PAGE = "report.html"
@@ -130,7 +130,7 @@ def prepare_file(path: Path, kind: FileKind | None = None) -> None:
 def require_additional_file(path: Path, results_folder: Path) -> None:
     """Check that a saved run can be written and replaces no other file or result. Raises StorageError."""
     if path.resolve() in {
-        (results_folder / name).resolve() for name in (_MAP, _REPORT, PREVIEW, MAP_TO_ODOM, TRAJECTORY)
+        (results_folder / name).resolve() for name in (MAP, _REPORT, PREVIEW, MAP_TO_ODOM, TRAJECTORY)
     }:
         raise StorageError(f"{path}: expected a name other than that of a result in {results_folder}")
     if path.is_dir():
@@ -141,7 +141,7 @@ def require_additional_file(path: Path, results_folder: Path) -> None:
 
 def require_no_map(folder: Path) -> None:
     """Raise StorageError if the folder holds a map already."""
-    require_absent(folder / _MAP)
+    require_absent(folder / MAP)
 
 
 def require_absent(path: Path) -> None:
@@ -157,7 +157,7 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
     """
     with contextlib.suppress(OSError):
         (folder / EVALUATION).unlink()
-    write_ply(folder / _MAP, gaussians, world_frame)
+    write_ply(folder / MAP, gaussians, world_frame)
     write_json(folder / _REPORT, report)
 
 

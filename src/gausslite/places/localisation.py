@@ -77,12 +77,7 @@ class PlaceMap:
 
     def add_rendered(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> None:
         """Add the map's rendering from a pose as a keyframe."""
-        width = min(_WIDTH_PX, camera.width_px)
-        camera = camera.resized(width, max(round(camera.height_px * width / camera.width_px), 1))
-        rendering = self._render(camera, T_world_camera, None)
-        rgb = np.rint(255.0 * np.clip(rendering.rgb, 0.0, 1.0)).astype(np.uint8)
-        depth_m = np.maximum(rendering.expected_depth_m(OPAQUE_ALPHA), np.float32(0.0))
-        self.add(View.of(Frame(0, 0, rgb, depth_m, camera, T_world_camera)), T_world_camera)
+        self.add(View.of(rendered_frame(self._render, camera, T_world_camera)), T_world_camera)
 
     def localise(self, frame: Frame) -> Localisation | None:
         """Return the frame's pose in the map; None if no place is verified, or more than one is."""
@@ -107,6 +102,15 @@ class PlaceMap:
         ):
             return None
         return max(found, key=lambda place: place.verification.texture, default=None)
+
+
+def rendered_frame(render: RenderMap, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Frame:
+    """Return what a camera of at most 320 pixels would record of a map; depth 0 where the map is not opaque."""
+    width = min(_WIDTH_PX, camera.width_px)
+    camera = camera.resized(width, max(round(camera.height_px * width / camera.width_px), 1))
+    rendering = render(camera, T_world_camera, None)
+    rgb = np.rint(255.0 * np.clip(rendering.rgb, 0.0, 1.0)).astype(np.uint8)
+    return Frame(0, 0, rgb, rendering.expected_depth_m(OPAQUE_ALPHA), camera, T_world_camera)
 
 
 def guessed_motions(view: View, keyframe: View) -> Iterator[Float64[ndarray, "4 4"]]:

@@ -111,11 +111,14 @@ def verify(render: RenderMap, frame: Frame, T_world_camera: Float64[ndarray, "4 
     if covered < _MIN_COVERED:
         return Verification(T, covered)
     agreement = float((found.depth[found.compared] < 1.0).mean())
+    texture = _texture_correlation(found, photograph)
+    if agreement < _MIN_AGREEMENT or texture < _MIN_TEXTURE:
+        return Verification(T, covered, agreement, texture)
     sigmas = min(
         _sigmas(found, _Residuals.of(render(photograph.camera, T @ displacement, None), photograph))
         for displacement in _displacements()
     )
-    return Verification(T, covered, agreement, _texture_correlation(found, photograph), sigmas)
+    return Verification(T, covered, agreement, texture, sigmas)
 
 
 def _small(frame: Frame) -> Frame:

@@ -1,0 +1,96 @@
+"""Decide which surfaces depth images contradict: a camera that measures a depth behind a point sees through it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from numpy import ndarray
+
+from gausslite.domain.camera import Camera, project
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, transform_points
+from gausslite.render.rasterizer import NEAR_M
+
+_THROUGH_M, _THROUGH_SHARE = 0.04, 0.02
+"""A point is seen through if the depth behind it is farther by this: 10 cm at 3 m."""
+_SHOWN_M, _SHOWN_SHARE = 0.02, 0.01
+"""A surface is at a point if it is within this: 5 cm at 3 m. Between both limits nothing is decided."""
+_NEIGHBOURS = np.ones((5, 5), np.uint8)
+_MIN_VIEWS = 3
+_MIN_RATIO = 2
+"""Views that see through a point must be at least three, and twice those that show a surface there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthView:
+    """The nearest and the farthest depth around each pixel of a depth image; both are 0 beside unmeasured pixels."""
+
+    camera: Camera
+    T_camera_world: Float64[ndarray, "4 4"]
+    nearest_m: Float32[ndarray, "h w"]
+    farthest_m: Float32[ndarray, "h w"]
+
+    @classmethod
+    def of(cls, depth_m: Float32[ndarray, "h w"], camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> DepthView:
+        """Return the view of a depth image; depth 0 means no measurement."""
+        nearest_m = cv2.erode(depth_m, _NEIGHBOURS)
+        farthest_m = np.where(nearest_m > 0, cv2.dilate(depth_m, _NEIGHBOURS), np.float32(0.0))
+        return cls(camera, inverse(T_world_camera), nearest_m, farthest_m)
+
+    @classmethod
+    def of_frame(cls, frame: Frame) -> DepthView:
+        """Return the view of a frame."""
+        return cls.of(frame.depth_m, frame.camera, frame.T_world_camera)
+
+    def classify(self, points_m: Float32[ndarray, "n 3"]) -> tuple[Bool[ndarray, " n"], Bool[ndarray, " n"]]:
+        """Return which points the camera sees through, and at which it sees a surface; all others are unknown."""
+        through, shown = (np.zeros(len(points_m), np.bool_) for _ in range(2))
+        points = transform_points(self.T_camera_world, points_m)
+        ids = np.flatnonzero(points[:, 2] > NEAR_M)
+        columns, rows = np.floor(project(points[ids], self.camera)).astype(np.int64).T
+        inside = (rows >= 0) & (rows < self.camera.height_px) & (columns >= 0) & (columns < self.camera.width_px)
+        ids, rows, columns = ids[inside], rows[inside], columns[inside]
+        z_m, nearest_m = points[ids, 2], self.nearest_m[rows, columns]
+        through_m, shown_m = (
+            np.float32(base_m) + np.float32(share) * z_m
+            for base_m, share in ((_THROUGH_M, _THROUGH_SHARE), (_SHOWN_M, _SHOWN_SHARE))
+        )
+        measured = nearest_m > 0
+        through[ids] = measured & (z_m < nearest_m - through_m)
+        farthest_m = self.farthest_m[rows, columns]
+        shown[ids] = measured & (z_m >= nearest_m - shown_m) & (z_m <= farthest_m + shown_m)
+        return through, shown
+
+
+def view_counts(
+    points_m: Float32[ndarray, "n 3"], views: Iterable[DepthView]
+) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " n"]]:
+    """Return how many views see through each point, and how many show a surface there."""
+    through, shown = (np.zeros(len(points_m), np.int64) for _ in range(2))
+    for view in views:
+        view_through, view_shown = view.classify(points_m)
+        through += view_through
+        shown += view_shown
+    return through, shown
+
+
+def seen_through(points_m: Float32[ndarray, "n 3"], views: Iterable[DepthView]) -> Bool[ndarray, " n"]:
+    """Return the points that these views contradict: at least three see through them, and few show a surface there."""
+    through, shown = view_counts(points_m, views)
+    contradicted: Bool[ndarray, " n"] = (through >= _MIN_VIEWS) & (through >= _MIN_RATIO * shown)
+    return contradicted
+
+
+def contradicted_rows(
+    means_m: Float32[ndarray, "n 3"], newest: Frame, keyframes: Iterable[Frame]
+) -> Int64[ndarray, " m"]:
+    """Return the rows of the means that the newest frame sees through and that these keyframes contradict."""
+    rows = np.flatnonzero(DepthView.of_frame(newest).classify(means_m)[0])
+    if len(rows) == 0:
+        return rows
+    contradicted: Int64[ndarray, " m"] = rows[seen_through(means_m[rows], map(DepthView.of_frame, keyframes))]
+    return contradicted
