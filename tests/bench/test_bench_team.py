@@ -86,6 +86,23 @@ def test_frames_of_pairs_are_judged_without_a_false_alarm(tmp_path: Path, capsys
     assert "| whole | gross |" in (tmp_path / "frame-pairs.md").read_text()
 
 
+def test_the_frame_of_a_second_map_is_found_from_anywhere_and_no_wrong_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("kiss_matcher")
+    size = ("--size", "160x120", "--frames", "16", "--views", "1", "--max-gaussians", "15000", "--iterations", "2")
+    arguments = ("bench", "team", "--unknown-frames", "1", "--homes", "3", "--policies", "uniform", "--threads", "1")
+    assert main([*arguments, *size, "--json", "--out", str(tmp_path)]) == 0
+    searches = json.loads(capsys.readouterr().out)["scenes"]
+    outcomes = {search["outcome"] for search in searches}
+    assert len(searches) == 9
+    assert outcomes == {"aligned", "abstained"}
+    aligned = [search for search in searches if search["outcome"] == "aligned"]
+    assert sum(search["place"] == "same scene" for search in aligned) >= 2
+    assert max(search["error_m"] for search in aligned) < 0.03
+    assert "| same scene | voxels | 1 |" in (tmp_path / "unknown-frames.md").read_text()
+
+
 def test_parts_of_a_recording_make_a_team(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_seven_scenes(tmp_path / "wall", tuple(range(18)))
     voxels = np.stack(np.meshgrid(range(-4, 4), range(-4, 4), [19, 20], indexing="ij"), axis=-1).reshape(-1, 3)

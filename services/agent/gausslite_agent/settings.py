@@ -201,7 +201,7 @@ class AgentSettings:
 PROGRAM = Program.of(
     *(AgentSettings, TlsFiles),
     flags="listen agent-id task source frames size detector parser fusion out state policy poses max-gaussians "
-    "iterations rate exit-when-done",
+    "iterations rate exit-when-done frame",
     defaults={
         "source": None,
         "keyframes": None,

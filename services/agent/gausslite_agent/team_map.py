@@ -113,7 +113,7 @@ class TeamMapFollower:
     def follow_once(self) -> None:
         """Read the changes since the last call and insert those of the task's region. Raises GaussLiteError."""
         graph = self._task()
-        if graph is None:
+        if graph is None or self._agent_id in self._client.unlocalised():
             return
         region = TeamRegion.of(graph, self._client.query_objects())
         if region != self._region:

@@ -132,6 +132,7 @@ _STATES = {
     AlignmentState.ALIGNED: pb.ALIGNMENT_STATE_ALIGNED,
     AlignmentState.CORRECTED: pb.ALIGNMENT_STATE_CORRECTED,
     AlignmentState.QUARANTINED: pb.ALIGNMENT_STATE_QUARANTINED,
+    AlignmentState.UNLOCALISED: pb.ALIGNMENT_STATE_UNLOCALISED,
 }
 _LAYERS: dict[int, MapLayer] = {
     pb.MAP_LAYER_UNSPECIFIED: MapLayer.VOTE,
@@ -154,10 +155,24 @@ def view_to_message(view: LayerView) -> pb.RenderFusedViewResponse:
     )
 
 
+def declare_frame(engine: FusionEngine, request: pb.JoinSessionRequest) -> None:
+    """Set what an agent says of its frame. Raises PoseError, InvalidInputError, StorageError."""
+    T_fused_agent = declared_frame_from_message(request)
+    if request.frame_is_unknown:
+        engine.declare_frame(request.agent_id, None)
+    elif T_fused_agent is not None:
+        engine.declare_frame(request.agent_id, T_fused_agent)
+    elif engine.alignment(request.agent_id).is_unknown:
+        # it knows its frame now
+        engine.declare_frame(request.agent_id, np.eye(4))
+
+
 def declared_frame_from_message(request: pb.JoinSessionRequest) -> Float64[ndarray, "4 4"] | None:
     """Decode T_fused_agent, None if the agent does not declare it. Raises PoseError, InvalidInputError."""
     if not request.HasField("t_fused_agent"):
         return None
+    if request.frame_is_unknown:
+        raise InvalidInputError("t_fused_agent: expected none of an unknown frame, got one")
     T_fused_agent = transform_from_message("t_fused_agent", request.t_fused_agent)
     if np.abs(T_fused_agent[:3, 3]).max() > MAX_COORDINATE_M:
         raise InvalidInputError(

@@ -134,7 +134,7 @@ async def _serve(settings: ServerSettings) -> None:
         return
     store = _open_store(settings)
     with contextlib.closing(store), contextlib.closing(FitProcess()) as fit:
-        engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, fit=fit)
+        engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, fit=fit, find=fit.find)
         refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
         servicer = FusionServicer(engine, refinement)
         try:

@@ -44,6 +44,7 @@ from gausslite_fusion_server.messages import (
     agent_of_session,
     alignment_to_message,
     contribution_to_message,
+    declare_frame,
     declared_frame_from_message,
     layer_from_message,
     read_keyframe,
@@ -211,10 +212,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         grid = grid_from_message(request.grid)
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
-        T_fused_agent = declared_frame_from_message(request)
+        declared_frame_from_message(request)
         joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map, request.token)
-        if T_fused_agent is not None:
-            await self._work(self._engine.declare_frame, request.agent_id, T_fused_agent)
+        await self._work(declare_frame, self._engine, request)
         if task is not None:
             report = ObjectReport(task, self._engine.reported_objects(request.agent_id, task))
             await self._work(self._engine.report_objects, joined.session.session_id, report)
@@ -270,6 +270,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 if len(response.rejected) >= _MAX_REPORTED_REJECTIONS:
                     raise
                 response.rejected.add(index=request.keyframe.index, reason=str(error))
+        # they may show where an unknown frame is
+        self._align_in_background()
         return response
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:

@@ -53,19 +53,21 @@ def configure(parser: CommandParser) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """The objects of a map; of a folder also its Gaussians and its last camera pose, None if it has none."""
+    """The objects of a map, with notes; of a folder also its Gaussians and last camera pose, None if it has none."""
 
     objects: Sequence[TeamObject]
     up_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     gaussians: Gaussians | None = None
     T_world_camera: Float64[ndarray, "4 4"] | None = None
+    notes: tuple[str, ...] = ()
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the objects, the most confident first. Returns 0, or 1 if there is none."""
     folder = Path(options.place)
-    place = _read_folder(folder) if folder.is_dir() else _Place(_query(options))
+    place = _read_folder(folder) if folder.is_dir() else _query(options)
     objects, notes = _select(place, options.question)
+    notes = (*notes, *place.notes)
     boxes = [oriented_box(team_object.landmark, place.gaussians, place.up_axis) for team_object in objects]
     if options.json:
         values = [_as_json(*pair) for pair in zip(objects, boxes, strict=True)]
@@ -102,14 +104,16 @@ def _count(count: int, question: str) -> str:
     return f"{count} object{'s' if count > 1 else ''}"
 
 
-def _query(options: argparse.Namespace) -> Sequence[TeamObject]:
+def _query(options: argparse.Namespace) -> _Place:
     # imported late, because the objects of a folder need no gRPC
     from gausslite.wire.channel import require_callable
     from gausslite.wire.clients import FusionClient
 
     require_callable("a fusion server or the output folder of a run", options.place)
     with FusionClient(options.place, tls=build(TlsFiles, options).read()) as client:
-        return client.query_objects()
+        left_out = client.unlocalised()
+        notes = tuple(f"the objects of {agent_id} are left out; {reason}" for agent_id, reason in left_out.items())
+        return _Place(client.query_objects(), notes=notes)
 
 
 def _read_folder(folder: Path) -> _Place:

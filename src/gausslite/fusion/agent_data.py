@@ -111,4 +111,5 @@ class AgentData:
     def _alignment_of_earlier(self, agent_id: str) -> FrameAlignment:
         own = self._alignments.get(agent_id)
         is_reference = own.state is AlignmentState.REFERENCE
-        return FrameAlignment(own.order, AlignmentState.REFERENCE if is_reference else AlignmentState.ALIGNED)
+        state = AlignmentState.REFERENCE if is_reference else AlignmentState.ALIGNED
+        return FrameAlignment(own.order, state, is_unknown=own.is_unknown)

@@ -21,7 +21,7 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid, gather_rows
 MIN_SAMPLES = 60
 _SAMPLES_PER_VOXEL = 3
 _MIN_OPACITY = 0.3
-_LUMINANCE = np.array([0.299, 0.587, 0.114])
+LUMINANCE = np.array([0.299, 0.587, 0.114])
 _NEIGHBOURS = 10
 _REACH_M = (0.15, 0.5, 1.0)
 """Longest distance of a match in the first registration of each trial; the later ones are shorter."""
@@ -108,7 +108,7 @@ class SurfaceSamples:
     def of(cls, batch: VoxelBatch) -> SurfaceSamples:
         """Return the samples of each voxel, in their order."""
         rows = opaque_rows(batch)
-        return cls(batch.gaussians.means_m[rows].astype(np.float64), batch.gaussians.rgb[rows] @ _LUMINANCE)
+        return cls(batch.gaussians.means_m[rows].astype(np.float64), batch.gaussians.rgb[rows] @ LUMINANCE)
 
     @classmethod
     def concatenate(cls, parts: list[SurfaceSamples]) -> SurfaceSamples:
@@ -132,8 +132,8 @@ Fit = Callable[[SurfaceSamples, SurfaceSamples], FrameFit | None]
 """`fit_frame`, in this process or in another one. Raises UnavailableError."""
 
 
-class _Target:
-    """Samples with a search tree and normals."""
+class TargetSurface:
+    """Samples with a search tree and normals, to which others are compared. cloud, tree: for small_gicp."""
 
     def __init__(self, samples: SurfaceSamples) -> None:
         self._samples = samples
@@ -158,6 +158,12 @@ class _Target:
         distance = np.where(matched, np.minimum(distance_m / _MAX_DISTANCE_M, 1.0), 1.0)
         return distance, np.where(matched, np.minimum(np.abs(colour) / _MAX_COLOUR, 1.0), 1.0), matched
 
+    def nearest_luminance(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
+        """Return the luminance of the sample nearest to each point."""
+        found = np.asarray(self.tree.batch_nearest_neighbor_search(points_m)[0], np.int64)
+        luminance: Float64[ndarray, " n"] = self._samples.luminance[found]
+        return luminance
+
 
 def fit_frame(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
     """Return the motion of the source that fits it best to the target; None if they share too little surface.
@@ -166,12 +172,12 @@ def fit_frame(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None
     """
     if min(len(source), len(target)) < MIN_SAMPLES:
         return None
-    shared = _in_shared_cubes(source.points_m, target.points_m)
-    blocks, is_first = _blocks(source.points_m)
+    shared = in_shared_cubes(source.points_m, target.points_m)
+    blocks, is_first = blocks_of(source.points_m)
     held_out = shared & ~is_first
-    if min(_occupied(blocks[held_out]), _occupied(blocks[shared & is_first])) < _MIN_BLOCKS:
+    if min(occupied_blocks(blocks[held_out]), occupied_blocks(blocks[shared & is_first])) < _MIN_BLOCKS:
         return None
-    places = _Target(target)
+    places = TargetSurface(target)
     centre_m = source.points_m[shared].mean(axis=0)
     # of what both see at first; so a motion cannot gain by covering more of the other map
     chosen, first = source.take(shared & is_first), source.take(is_first)
@@ -180,11 +186,11 @@ def fit_frame(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None
         for T in (np.eye(4), *_trials(first, places, centre_m))
     ]
     motion = min(costs, key=lambda cost: cost[0])[1]
-    return _evaluate(source.take(held_out), blocks[held_out], places, motion, centre_m)
+    return evaluate_motion(source.take(held_out), blocks[held_out], places, motion, centre_m)
 
 
 def _trials(
-    source: SurfaceSamples, target: _Target, centre_m: Float64[ndarray, "3"]
+    source: SurfaceSamples, target: TargetSurface, centre_m: Float64[ndarray, "3"]
 ) -> Iterator[Float64[ndarray, "4 4"]]:
     """Yield the motions that registrations with different first reaches find."""
     cloud = small_gicp.PointCloud(source.points_m)
@@ -198,13 +204,14 @@ def _trials(
             yield T
 
 
-def _evaluate(
+def evaluate_motion(
     held_out: SurfaceSamples,
     blocks: Int64[ndarray, " n"],
-    target: _Target,
+    target: TargetSurface,
     motion: Float64[ndarray, "4 4"],
     centre_m: Float64[ndarray, "3"],
 ) -> FrameFit:
+    """Return how samples of the source that no registration used, in their blocks, fit before and after a motion."""
     before, after = target.residuals(held_out), target.residuals(held_out.moved(motion))
     is_better = after[2].mean() >= _MIN_MATCHED and all(
         _lower_bound(old - new, blocks) > 0 for old, new in zip(before[:2], after[:2], strict=True)
@@ -233,7 +240,7 @@ def _lower_bound(values: Float64[ndarray, " n"], blocks: Int64[ndarray, " n"]) -
     return float(means.mean() - _SIGMAS * means.std(ddof=1) / np.sqrt(len(means)))
 
 
-def _in_shared_cubes(points_m: Float64[ndarray, "n 3"], others_m: Float64[ndarray, "m 3"]) -> Bool[ndarray, " n"]:
+def in_shared_cubes(points_m: Float64[ndarray, "n 3"], others_m: Float64[ndarray, "m 3"]) -> Bool[ndarray, " n"]:
     """Return which points are in cubes that hold at least ten of the other points, and half as many as of these."""
     keys = _SHARED_GRID.keys(points_m.astype(np.float32))
     other_keys = np.sort(_SHARED_GRID.keys(others_m.astype(np.float32)))
@@ -243,13 +250,13 @@ def _in_shared_cubes(points_m: Float64[ndarray, "n 3"], others_m: Float64[ndarra
     return shared
 
 
-def _blocks(points_m: Float64[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Bool[ndarray, " n"]]:
+def blocks_of(points_m: Float64[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Bool[ndarray, " n"]]:
     """Return the block of each point, and whether it belongs to the first half: a chessboard of blocks."""
     keys = _BLOCK_GRID.keys(points_m.astype(np.float32))
     return keys, _BLOCK_GRID.indices(keys).sum(axis=1) % 2 == 0
 
 
-def _occupied(blocks: Int64[ndarray, " n"]) -> int:
+def occupied_blocks(blocks: Int64[ndarray, " n"]) -> int:
     """Return the number of blocks with enough samples to count."""
     return int(np.count_nonzero(np.unique(blocks, return_counts=True)[1] >= _MIN_BLOCK))
 

@@ -48,6 +48,7 @@ from gausslite.fusion.traffic import (
     StorageProbe,
     TrafficCounters,
 )
+from gausslite.fusion.unknown_frames import Find, find_frame
 from gausslite.fusion.updates import (
     PendingUpdate,
     UpdateCommitter,
@@ -106,8 +107,9 @@ class FusionEngine:
 
     Updates, sessions, keyframes, objects, counters and the refined map persist with the store.
     first_revision must exceed the revisions from before a restart; by default it is the time in microseconds.
-    decode_keyframe reads keyframes as they were received; only a refinement needs it. fit compares two agents' maps.
-    others: finds what the other servers of the store know; this engine then has the store's part of the voxels.
+    decode_keyframe reads keyframes as they were received; a refinement and the search for an unknown frame need it. fit
+    and find compare two agents' maps. others: finds what the other servers of the store know; this engine then has the
+    store's part of the voxels.
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
@@ -118,6 +120,7 @@ class FusionEngine:
         first_revision: int | None = None,
         decode_keyframe: FrameDecoder = no_decoder,
         fit: Fit = fit_frame,
+        find: Find = find_frame,
         others: SharedRows | None = None,
     ) -> None:
         self._lock = RLock()
@@ -128,7 +131,10 @@ class FusionEngine:
         self._merged_objects = MergedObjects()
         if first_revision is None:
             first_revision = time.time_ns() // 1000
-        self._mission = MissionData.open(store, settings, self._lock, first_revision, decode_keyframe, fit, others)
+        comparisons = fit, find
+        self._mission = MissionData.open(
+            store, settings, self._lock, first_revision, decode_keyframe, comparisons, others
+        )
         self._committer = UpdateCommitter(
             store, self._lock, self._decode_update, self._check_update, self._record_updates
         )
@@ -282,6 +288,8 @@ class FusionEngine:
         time. Raises StorageError, UnavailableError if an agent could not be compared.
         """
         before = self.revision
+        if self._settings.alignment is not None:
+            self._mission.unknown_frames.run()
         self._mission.aligner.run(self._apply_frame, self._drop_contradicted, at_most)
         return self.revision != before
 
@@ -295,8 +303,8 @@ class FusionEngine:
         with self._lock:
             return self._mission.alignments.get(agent_id)
 
-    def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> None:
-        """Set the motion from the agent's frame to the fused map's that the agent declares. Raises StorageError."""
+    def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> None:
+        """Set the motion to the fused map's frame that the agent declares, None if unknown. Raises StorageError."""
         with self._lock:
             is_new = self._mission.aligner.declare(agent_id, T_fused_agent)
         if is_new:
@@ -333,7 +341,9 @@ class FusionEngine:
         """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
         with self._lock:
             reports, frames = self._mission.objects.reports(), self._mission.alignments.transforms()
-        return find_objects(self._merged_objects.of(reports, frames), noun)
+            unlocalised = self._mission.alignments.unlocalised
+        used = {name: report for name, report in reports.items() if name not in unlocalised}
+        return find_objects(self._merged_objects.of(used, frames), noun)
 
     def query_stored_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the same of the reports as they are in the store, whichever server has written them."""
@@ -393,11 +403,11 @@ class FusionEngine:
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
         """Return the keyframes with camera poses in the fused map's frame.
 
-        Those of quarantined agents, and those too far from the origin, are left out.
+        Those of agents that are quarantined or in an unknown frame, and those too far from the origin, are left out.
         """
         with self._lock:
-            frames, quarantined = self._mission.alignments.transforms(), self._mission.alignments.quarantined
-        moved = (in_fused_frame(keyframe, frames) for keyframe in keyframes if keyframe.agent_id not in quarantined)
+            frames, unused = self._mission.alignments.transforms(), self._mission.alignments.unused
+        moved = (in_fused_frame(keyframe, frames) for keyframe in keyframes if keyframe.agent_id not in unused)
         return [keyframe for keyframe in moved if keyframe is not None]
 
     def status(self) -> MissionStatus:

@@ -16,11 +16,13 @@ from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from threading import Lock, Timer
+from typing import Any
 
 import numpy as np
 
 from gausslite.domain.errors import UnavailableError
 from gausslite.fusion.alignment import FrameFit, SurfaceSamples, fit_frame
+from gausslite.fusion.unknown_frames import FrameSearch, find_frame
 
 _COMMAND = (sys.executable, "-m", "gausslite.fusion.fit_process")
 _NICENESS = 10
@@ -28,10 +30,14 @@ _LONGEST_S = 120.0
 """A comparison takes a second, and some more on a busy machine, whose other processes come first."""
 _ATTEMPTS = 2
 _ROW_VALUES = 4
+_FIT, _FIND = b"fit", b"find"
 
 
 class FitProcess:
-    """Calls `fit_frame` in a process that starts with the first call. Call it from one thread; `close` from any."""
+    """Calls `fit_frame` and `find_frame` in a process that starts with the first call.
+
+    Call it from one thread; `close` from any.
+    """
 
     def __init__(self, command: Sequence[str] = _COMMAND, longest_s: float = _LONGEST_S) -> None:
         """longest_s: a process that has not answered by then is killed."""
@@ -51,15 +57,25 @@ class FitProcess:
 
         A process that is killed, for example because memory ran out, is started again for the second attempt.
         """
+        fit = self._ask(_FIT, source, target)["fit"]
+        return None if fit is None else FrameFit.from_json(fit)
+
+    def find(self, source: SurfaceSamples, target: SurfaceSamples) -> FrameSearch:
+        """Return `find_frame` of the samples. Raises UnavailableError as a call does."""
+        answer = self._ask(_FIND, source, target)
+        return FrameSearch(None if answer["fit"] is None else FrameFit.from_json(answer["fit"]), answer["reason"])
+
+    def _ask(self, question: bytes, source: SurfaceSamples, target: SurfaceSamples) -> dict[str, Any]:
         for _ in range(_ATTEMPTS):
             process, connection = self._running()
             timer = Timer(self._longest_s, process.kill)
             timer.daemon = True
             timer.start()
             try:
+                connection.send_bytes(question)
                 for samples in (source, target):
                     connection.send_bytes(np.column_stack([samples.points_m, samples.luminance]).tobytes())
-                answer = json.loads(connection.recv_bytes())
+                answer: dict[str, Any] = json.loads(connection.recv_bytes())
                 break
             except (OSError, EOFError):
                 code = self._end()
@@ -69,7 +85,7 @@ class FitProcess:
             raise UnavailableError(f"the process of the comparisons ended {_ATTEMPTS} times, with code {code}")
         if "error" in answer:
             raise UnavailableError(answer["error"])
-        return None if answer["fit"] is None else FrameFit.from_json(answer["fit"])
+        return answer
 
     def close(self) -> None:
         """End the process; a call that runs raises UnavailableError, and so do later ones."""
@@ -112,17 +128,18 @@ def _serve(connection: Connection) -> None:
     """Answer comparisons until the other end of the connection is closed."""
     with suppress(OSError, EOFError):
         while True:
+            question = connection.recv_bytes()
             source, target = (_samples(connection.recv_bytes()) for _ in range(2))
-            connection.send_bytes(json.dumps(_answer(source, target)).encode())
+            connection.send_bytes(json.dumps(_answer(question, source, target)).encode())
 
 
-def _answer(source: SurfaceSamples, target: SurfaceSamples) -> dict[str, object]:
+def _answer(question: bytes, source: SurfaceSamples, target: SurfaceSamples) -> dict[str, object]:
     try:
-        fit = fit_frame(source, target)
+        found = FrameSearch(fit_frame(source, target)) if question == _FIT else find_frame(source, target)
     except Exception as error:
         # the next comparison may succeed
         return {"error": f"{type(error).__name__}: {error}"}
-    return {"fit": None if fit is None else fit.as_json()}
+    return {"fit": None if found.fit is None else found.fit.as_json(), "reason": found.reason}
 
 
 def _samples(data: bytes) -> SurfaceSamples:

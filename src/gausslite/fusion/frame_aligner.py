@@ -31,6 +31,8 @@ from gausslite.fusion.vote_input import SLICE_VOXELS
 
 _log = logging.getLogger(__name__)
 _MAX_VOXELS = 4096
+_MAX_THINNED_VOXELS = 12_000
+_NO_KEYS = np.zeros(0, np.int64)
 _SAMPLE_BLOCK = 8
 """Voxels on a side of the blocks that are sampled completely or not at all, so that surfaces stay dense."""
 _MAX_WITNESSES = 4
@@ -117,6 +119,7 @@ class FrameAligner:
         self._settings, self._fit = settings, fit
         self._maps: dict[str, _AgentMap] = {}
         self._comparisons: dict[frozenset[str], Comparison] = {}
+        self._moved: set[str] = set()
         self._epochs = self._compared = 0
         self._is_undecided = True
         if settings is not None:
@@ -124,6 +127,7 @@ class FrameAligner:
 
     def record(self, agent_id: str, accepted: Int64[ndarray, " a"]) -> None:
         """Note that these voxels of an agent changed; its first update fixes its rank."""
+        self._end_provisional_frame(agent_id)
         if agent_id not in self._alignments:
             alignment = self._alignments.get(agent_id)
             is_first = not any(self._alignments.get(name).is_used for name in self._alignments.names())
@@ -133,28 +137,70 @@ class FrameAligner:
             own.unread.update(accepted.tolist())
             own.changed += len(accepted)
 
-    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"]) -> bool:
-        """Set the motion that the agent declares; if it changed, estimates from before are dropped."""
-        current = self._alignments.get(agent_id)
-        if np.array_equal(current.declared, T_fused_agent):
-            return False
-        self._alignments.put(agent_id, FrameAlignment(current.order, declared=T_fused_agent))
+    def _end_provisional_frame(self, agent_id: str) -> None:
+        """Before the first update of the first agent that knows its frame: what was found without it is unknown."""
+        if self._settings is None or agent_id in self._maps or self._alignments.get(agent_id).is_unknown:
+            return
+        names = self._alignments.names()
+        if any(name in self._maps and not self._alignments.get(name).is_unknown for name in names):
+            return
+        for name in names:
+            alignment = self._alignments.get(name)
+            if alignment.is_unknown and alignment.is_localised:
+                reason = f"agent {agent_id} knows its frame, which is the team's now"
+                self.put_frame(name, alignment.unlocalised(reason))
+
+    def put_frame(self, agent_id: str, alignment: FrameAlignment) -> None:
+        """Replace the agent's alignment by one in another frame; the next run moves its map. Raises StorageError."""
+        self._alignments.put(agent_id, alignment)
+        self._moved.add(agent_id)
         self._drop_comparisons(agent_id)
         if agent_id in self._maps:
             own = self._maps[agent_id]
             own.epoch, own.first_seq, own.changed = self._next_epoch(), 0, max(own.changed, len(own.samples))
+
+    def samples(self, agent_id: str) -> SurfaceSamples:
+        """Return samples of the agent's whole map, a large one thinned evenly, in the fused frame if that is known."""
+        with self._lock:
+            alignment, table = self._alignments.get(agent_id), self._store.scores()
+        keys = table.keys[table.agent_index == table.agents.index(agent_id)] if agent_id in table.agents else _NO_KEYS
+        # the blocks of maps in different frames never coincide, so single voxels are chosen
+        keys = keys[np.argsort(hash_columns(keys), kind="stable")[:_MAX_THINNED_VOXELS]]
+        whole = _AgentMap(epoch=0)
+        for part, batch, update_seqs in self._slices(agent_id, np.sort(keys)):
+            whole.put(part, batch, update_seqs)
+        return whole.in_frame(alignment)
+
+    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> bool:
+        """Set the motion that the agent declares, None if it does not know its frame.
+
+        Returns whether that changed; then estimates from before are dropped. What was found of an unknown frame stays.
+        """
+        current = self._alignments.get(agent_id)
+        if T_fused_agent is None:
+            if current.is_unknown:
+                return False
+            reason = "this server compares no frames (frame-alignment = trust)"
+            declared = current.unlocalised(reason if self._settings is None else "")
+        elif current.is_unknown or not np.array_equal(current.declared, T_fused_agent):
+            declared = FrameAlignment(current.order, declared=T_fused_agent)
+        else:
+            return False
+        self.put_frame(agent_id, declared)
+        self._moved.discard(agent_id)  # the caller moves it at once
         return True
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete what is known of the agent. Those that contradicted it are decided again with the next run."""
         self._maps.pop(agent_id, None)
+        self._moved.discard(agent_id)
         self._drop_comparisons(agent_id)
 
     @property
     def is_due(self) -> bool:
         """Return whether an agent has enough new data for a comparison."""
         with self._lock:
-            return bool(self._due())
+            return bool(self._moved or self._due())
 
     def run(self, apply: Apply, drop_earlier: Callable[[str], bool], at_most: int | None = None) -> None:
         """Compare the maps of the agents with enough new data, then decide. Raises StorageError, UnavailableError.
@@ -166,7 +212,10 @@ class FrameAligner:
         if self._settings is None:
             return
         with self._lock:
+            moved, self._moved = self._moved, set()
             due = self._due()[:at_most]
+        for agent_id in sorted(moved):
+            apply(agent_id)
         failure: UnavailableError | None = None
         for agent_id in due:
             try:
@@ -229,7 +278,7 @@ class FrameAligner:
             (samples, fit)
             for (name, _, samples), fit in zip(witnesses, fits, strict=True)
             if self._alignments.get(name).is_used
-            and self._alignments.get(name).order < alignment.order
+            and self._alignments.get(name).rank < alignment.rank
             and not (fit is not None and self._settings.contradicts(fit))
         ]
         if len(earlier) == 1:
@@ -245,13 +294,16 @@ class FrameAligner:
         parts: dict[str, int] = {}
         if settings.contradicts(fit):
             parts = dict(before.contradicting) if before is not None else {}
-            parts[agent_id] = parts.get(agent_id, 0) + 1
+            # new data of either side count against a frame that the server has found
+            for member in {agent_id, *(member for member in pair if self._alignments.get(member).is_unknown)}:
+                parts[member] = parts.get(member, 0) + 1
         self._comparisons[pair] = Comparison(fit, parts)
 
     def _decide(self, apply: Apply, drop_earlier: Callable[[str], bool]) -> None:
         with self._lock:
             self._is_undecided = False
             names = [name for name in self._alignments.names() if name in self._maps]
+            names = [name for name in names if self._alignments.get(name).is_localised]
             quarantined = find_quarantined({name: i for i, name in enumerate(names)}, self._comparisons)
         for name, against in quarantined.items():
             if set(against) == {f"{name}:earlier"} and drop_earlier(name):
@@ -268,7 +320,9 @@ class FrameAligner:
                 if (after.state, after.message, after.against) == (before.state, before.message, before.against):
                     continue
                 self._alignments.put(name, after)
-                _log_change(name, before, after)
+                log_change(name, before, after)
+                if not after.is_localised:
+                    self._drop_comparisons(name)
             if after.is_used != before.is_used:
                 apply(name)
         return None
@@ -287,6 +341,7 @@ class FrameAligner:
         places = np.unique(_PLACE_GRID.keys(source.points_m.astype(np.float32)))
         with self._lock:
             others = [(name, own, self._alignments.get(name)) for name, own in self._maps.items() if name != agent_id]
+            others = [(name, own, alignment) for name, own, alignment in others if alignment.is_localised]
         found = []
         for name, own, alignment in others:
             self._read(name, own)
@@ -303,10 +358,17 @@ class FrameAligner:
         with self._lock:
             unread, own.unread = own.unread, set()
         keys = own.select(np.array(sorted(unread), np.int64), self._grid)
+        for part, batch, update_seqs in self._slices(agent_id, keys):
+            own.put(part, batch, update_seqs)
+
+    def _slices(
+        self, agent_id: str, keys: Int64[ndarray, " k"]
+    ) -> Iterator[tuple[Int64[ndarray, " s"], VoxelBatch, Int64[ndarray, " v"]]]:
+        """Yield slices of the voxels, with what the store has of them and its update_seqs."""
         for start in range(0, len(keys), SLICE_VOXELS):
             part = keys[start : start + SLICE_VOXELS]
             batch = self._store.batch(agent_id, part)
-            own.put(part, batch, self._store.stored(agent_id, batch.keys).update_seqs)
+            yield part, batch, self._store.stored(agent_id, batch.keys).update_seqs
 
     def _due(self) -> list[str]:
         """Return the agents with enough new data, those first whose latest comparison is the oldest."""
@@ -314,7 +376,10 @@ class FrameAligner:
             return []
         share = self._settings.refit_share
         due = [
-            name for name, own in self._maps.items() if own.changed >= max(1, share * self._store.totals(name).voxels)
+            name
+            for name, own in self._maps.items()
+            if own.changed >= max(1, share * self._store.totals(name).voxels)
+            and self._alignments.get(name).is_localised
         ]
         return sorted(due, key=lambda name: self._maps[name].compared)
 
@@ -326,7 +391,7 @@ class FrameAligner:
             own = self._map_of(agent_id)
             own.unread, own.changed = set(keys), len(keys)
             own.first_seq = self._store.totals(agent_id).highest_update_seq + 1
-        for name in self._alignments.quarantined:
+        for name in self._alignments.unused:
             alignment = self._alignments.get(name)
             for other in alignment.against:
                 if other in self._alignments and alignment.fit is not None:
@@ -349,7 +414,8 @@ class FrameAligner:
         return self._epochs
 
 
-def _log_change(agent_id: str, before: FrameAlignment, after: FrameAlignment) -> None:
+def log_change(agent_id: str, before: FrameAlignment, after: FrameAlignment) -> None:
+    """Log a new state of an agent, or a new reason for it."""
     if after.state is not before.state or after.message != before.message:
         level = logging.WARNING if after.against else logging.INFO
         reason = f": {after.message}" if after.message else ""

@@ -2,6 +2,7 @@
 
 The agent that contributes first defines the fused frame, unless it declares another one. Odometry drifts, so the motion
 is a sequence of segments: a correction from the agent's updates since the last one applies to these and to later ones.
+An agent that does not know its frame is unlocalised until the server has found it; until then nothing of it is fused.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ class AlignmentState(StrEnum):
     ALIGNED = "aligned"
     CORRECTED = "corrected"
     QUARANTINED = "quarantined"
+    UNLOCALISED = "unlocalised"
+    """Its frame is unknown to itself and to the server."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +72,8 @@ class FrameAlignment:
     """The state of one agent.
 
     segments: (lowest update_seq, T_fused_agent), ascending. order: rank of its first update among the agents.
-    against: the agents that it contradicts. message: why it is corrected, quarantined or about to be.
+    against: the agents that it contradicts. message: why it is corrected, quarantined or about to be. is_unknown: the
+    agent does not know its frame; `declared` is then what the server has found.
     """
 
     order: int
@@ -79,6 +83,7 @@ class FrameAlignment:
     message: str = ""
     declared: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     against: tuple[str, ...] = ()
+    is_unknown: bool = False
 
     @property
     def T_fused_agent(self) -> Float64[ndarray, "4 4"]:  # noqa: N802 - a transform names both frames
@@ -93,7 +98,17 @@ class FrameAlignment:
     @property
     def is_used(self) -> bool:
         """Return whether the vote reads the agent's updates."""
-        return self.state is not AlignmentState.QUARANTINED
+        return self.state not in (AlignmentState.QUARANTINED, AlignmentState.UNLOCALISED)
+
+    @property
+    def is_localised(self) -> bool:
+        """Return whether the agent's frame is known, to itself or to the server."""
+        return self.state is not AlignmentState.UNLOCALISED
+
+    @property
+    def rank(self) -> tuple[bool, int]:
+        """Agents that know their frame come first, then those that contributed first."""
+        return self.is_unknown, self.order
 
     def segment_of(self, update_seqs: Int64[ndarray, " n"]) -> Int64[ndarray, " n"]:
         """Return the index of each update's segment; -1 for updates before the first, which use the declared motion."""
@@ -109,8 +124,20 @@ class FrameAlignment:
         segment = (first_seq if self.segments else 0, fit.motion @ self.T_fused_agent)
         return replace(self, fit=fit, against=(), segments=(*self.segments[1 - _MAX_SEGMENTS :], segment))
 
+    def unlocalised(self, reason: str) -> FrameAlignment:
+        """Return the alignment of an agent whose frame nobody knows; reason: why not."""
+        message = f"frame unknown: not in the team's map yet{'; ' if reason else ''}{reason}"
+        return FrameAlignment(self.order, AlignmentState.UNLOCALISED, message=message, is_unknown=True)
+
+    def localised(self, fit: FrameFit) -> FrameAlignment:
+        """Return the alignment with the frame that the server has found."""
+        found = replace(self, state=AlignmentState.CORRECTED, declared=fit.motion, segments=(), fit=fit, message="")
+        return found.in_state({}, is_quarantined=False, is_first=False)
+
     def in_state(self, against: Mapping[str, FrameFit], is_quarantined: bool, is_first: bool) -> FrameAlignment:
         """Return the alignment in the state that follows from its contradictions. is_first: no other defines a frame"""
+        if is_quarantined and self.is_unknown:
+            return self.unlocalised(f"its former place contradicts {', '.join(against)}")
         message, last = "", self.fit if not self.against else None
         if against:
             name, last = next(iter(against.items()))
@@ -124,15 +151,18 @@ class FrameAlignment:
             state = AlignmentState.QUARANTINED
         elif is_first:
             state = AlignmentState.REFERENCE
-        elif self.segments:
+            if self.is_unknown:
+                message = message or "frame unknown: as the first agent, it defines the frame of the team's map"
+        elif self.segments or self.is_unknown:
             state = AlignmentState.CORRECTED
-            message = message or f"frame: corrected; {self._size()} in all"
+            found = "frame unknown: found by the server" if self.is_unknown else "frame: corrected"
+            message = message or f"{found}; {self._size()} in all"
         else:
             state = AlignmentState.UNKNOWN if last is None or against else AlignmentState.ALIGNED
         return replace(self, state=state, message=message, against=tuple(against), fit=last)
 
     def _size(self) -> str:
-        motion = self.T_fused_agent @ inverse(self.declared)
+        motion = self.T_fused_agent if self.is_unknown else self.T_fused_agent @ inverse(self.declared)
         return (
             f"{np.linalg.norm(motion[:3, 3]):.3f} m at the origin and {rotation_angle_deg(motion, np.eye(4)):.1f} deg"
         )
@@ -190,8 +220,8 @@ class FrameAlignments:
         return agent_id in self._by_agent
 
     def names(self) -> tuple[str, ...]:
-        """Return the agents that have an alignment, in the order of their first updates."""
-        return tuple(sorted(self._by_agent, key=lambda name: self._by_agent[name].order))
+        """Return the agents that have an alignment, by their rank."""
+        return tuple(sorted(self._by_agent, key=lambda name: self._by_agent[name].rank))
 
     def put(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Replace the agent's alignment. Raises StorageError."""
@@ -209,9 +239,14 @@ class FrameAlignments:
         }
 
     @property
-    def quarantined(self) -> set[str]:
+    def unused(self) -> set[str]:
         """The agents whose contribution is not used."""
         return {name for name, alignment in self._by_agent.items() if not alignment.is_used}
+
+    @property
+    def unlocalised(self) -> set[str]:
+        """The agents whose frame nobody knows."""
+        return {name for name, alignment in self._by_agent.items() if not alignment.is_localised}
 
 
 def _encode(alignment: FrameAlignment) -> bytes:
@@ -223,6 +258,7 @@ def _encode(alignment: FrameAlignment) -> bytes:
         "declared": alignment.declared.reshape(-1).tolist(),
         "message": alignment.message,
         "against": list(alignment.against),
+        "is_unknown": alignment.is_unknown,
         "fit": None if fit is None else fit.as_json(),
     }
     return json.dumps(value).encode()
@@ -246,6 +282,8 @@ def _decode(data: bytes) -> FrameAlignment:
             str(value["message"]),
             declared=_matrix(value["declared"]),
             against=tuple(str(name) for name in value["against"]),
+            # absent in records of an earlier version
+            is_unknown=bool(value.get("is_unknown")),
         )
     except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
         raise CodecError(f"alignment: expected the JSON of an alignment, got other bytes ({error})") from error

@@ -17,6 +17,7 @@ from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import TeamObjects
 from gausslite.fusion.store import FusionStore, SharedRows
 from gausslite.fusion.traffic import TrafficLog
+from gausslite.fusion.unknown_frames import Find, UnknownFrames
 from gausslite.fusion.updates import UpdateChecks
 from gausslite.fusion.vote_input import VoteInput
 
@@ -33,6 +34,7 @@ class MissionData:
     alignments: FrameAlignments
     votes: VoteInput
     aligner: FrameAligner
+    unknown_frames: UnknownFrames
     maps: FusedMapLayers
     agents: AgentData
 
@@ -44,7 +46,7 @@ class MissionData:
         lock: RLock,
         first_revision: int,
         decode: FrameDecoder,
-        fit: Fit,
+        comparisons: tuple[Fit, Find],
         others: SharedRows | None = None,
     ) -> MissionData:
         """Read the data; others: of the servers that share the store.
@@ -58,7 +60,7 @@ class MissionData:
         traffic = TrafficLog(store)
         alignments = FrameAlignments(store)
         votes = VoteInput(store, alignments, grid)
-        aligner = FrameAligner(store, alignments, lock, grid, settings.alignment, fit)
+        aligner = FrameAligner(store, alignments, lock, grid, settings.alignment, comparisons[0])
         # a refinement is of the whole map
         refined = load_refinement(store) if others is None else None
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
@@ -72,6 +74,7 @@ class MissionData:
             alignments=alignments,
             votes=votes,
             aligner=aligner,
+            unknown_frames=UnknownFrames(store, alignments, aligner, keyframes, lock, comparisons[1]),
             maps=maps,
             agents=AgentData(store, votes, maps, alignments, aligner, of_agents),
         )

@@ -124,7 +124,9 @@ def register(source: Surface, target: Surface, guess: Float64[ndarray, "4 4"] | 
     return evaluate(source, target, orthonormal(T))
 
 
-def matched_motion(source: Surface, target: Surface) -> Float64[ndarray, "4 4"] | None:
+def matched_motion(
+    source: Surface, target: Surface, min_inliers: int = _MIN_MATCHER_INLIERS
+) -> Float64[ndarray, "4 4"] | None:
     """Return T_target_source from matches of point features; None with too few consistent ones."""
     kiss_matcher = import_extra("kiss_matcher", "slam", "registration without a guess")
     spacing_m = max(source.spacing_m, target.spacing_m)
@@ -136,7 +138,7 @@ def matched_motion(source: Surface, target: Surface) -> Float64[ndarray, "4 4"] 
     config = kiss_matcher.KISSMatcherConfig(voxel_size=spacing_m, use_voxel_sampling=False)
     matcher = kiss_matcher.KISSMatcher(config)
     found = matcher.estimate(list(source.points_m.astype(np.float32)), list(target.points_m.astype(np.float32)))
-    if not found.valid or matcher.get_num_final_inliers() < _MIN_MATCHER_INLIERS:
+    if not found.valid or matcher.get_num_final_inliers() < min_inliers:
         return None
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = found.rotation, np.asarray(found.translation).ravel()

@@ -135,6 +135,8 @@ class _AlignmentStateEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Alignm
     """The misfit is within the bound; the agent's contribution is corrected by T_fused_agent."""
     ALIGNMENT_STATE_QUARANTINED: _AlignmentState.ValueType  # 4
     """It contradicts other agents' maps; the agent's contribution is stored but not fused."""
+    ALIGNMENT_STATE_UNLOCALISED: _AlignmentState.ValueType  # 5
+    """The agent does not know its frame, and the server has not found it yet; its contribution is stored but not fused."""
 
 class AlignmentState(_AlignmentState, metaclass=_AlignmentStateEnumTypeWrapper): ...
 
@@ -148,6 +150,8 @@ ALIGNMENT_STATE_CORRECTED: AlignmentState.ValueType  # 3
 """The misfit is within the bound; the agent's contribution is corrected by T_fused_agent."""
 ALIGNMENT_STATE_QUARANTINED: AlignmentState.ValueType  # 4
 """It contradicts other agents' maps; the agent's contribution is stored but not fused."""
+ALIGNMENT_STATE_UNLOCALISED: AlignmentState.ValueType  # 5
+"""The agent does not know its frame, and the server has not found it yet; its contribution is stored but not fused."""
 Global___AlignmentState: _TypeAlias = AlignmentState  # noqa: Y015
 
 @_typing.final
@@ -162,6 +166,7 @@ class JoinSessionRequest(_message.Message):
     TASK_FIELD_NUMBER: _builtins.int
     T_FUSED_AGENT_FIELD_NUMBER: _builtins.int
     TOKEN_FIELD_NUMBER: _builtins.int
+    FRAME_IS_UNKNOWN_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     """1 to 64 letters, digits and . _ -, beginning with a letter or a digit; so is the mission."""
     mission_id: _builtins.str
@@ -174,6 +179,11 @@ class JoinSessionRequest(_message.Message):
     """
     token: _builtins.str
     """A secret of this robot, the same in all of its joins. While the name's lease lasts, only its holder may join again."""
+    frame_is_unknown: _builtins.bool
+    """The agent does not know where its world frame lies in the fused map's. Its data stay out of the fused map until the
+    server has found t_fused_agent, which must be absent here. Without any agent that knows its frame, the frame of the
+    first one that does not becomes the fused map's.
+    """
     @_builtins.property
     def grid(self) -> _geometry_pb2.VoxelGrid: ...
     @_builtins.property
@@ -195,10 +205,11 @@ class JoinSessionRequest(_message.Message):
         task: _task_pb2.TaskGraph | None = ...,
         t_fused_agent: _geometry_pb2.RigidTransform | None = ...,
         token: _builtins.str = ...,
+        frame_is_unknown: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["grid", b"grid", "t_fused_agent", b"t_fused_agent", "task", b"task"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "fresh_map", b"fresh_map", "grid", b"grid", "mission_id", b"mission_id", "t_fused_agent", b"t_fused_agent", "task", b"task", "token", b"token", "world_frame", b"world_frame"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "frame_is_unknown", b"frame_is_unknown", "fresh_map", b"fresh_map", "grid", b"grid", "mission_id", b"mission_id", "t_fused_agent", b"t_fused_agent", "task", b"task", "token", b"token", "world_frame", b"world_frame"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -949,7 +960,7 @@ class FrameAlignment(_message.Message):
     compared: _builtins.int
     """Number of Gaussians compared."""
     message: _builtins.str
-    """Why the contribution is corrected, quarantined, or about to be; empty otherwise."""
+    """Why the contribution is corrected, quarantined, or about to be, and what is known of an unknown frame; empty otherwise."""
     @_builtins.property
     def t_fused_agent(self) -> _geometry_pb2.RigidTransform:
         """Correction in use for the agent's latest updates."""
@@ -1048,7 +1059,7 @@ class QueryObjectsResponse(_message.Message):
     OBJECTS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def objects(self) -> _containers.RepeatedCompositeFieldContainer[_objects_pb2.ObjectLandmark]:
-        """The most confident object first."""
+        """The most confident object first. Those of unlocalised agents are left out."""
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final, Literal
 
 import google_crc32c
 from google.protobuf.json_format import MessageToDict
@@ -177,6 +177,9 @@ def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
     return status.state == agent_service_pb2.AGENT_STATE_ENDED
 
 
+UNKNOWN: Final = "unknown"
+
+
 class FusionClient(ServiceChannel):
     """The fusion server."""
 
@@ -203,9 +206,11 @@ class FusionClient(ServiceChannel):
         world_frame: str = "",
         fresh_map: bool = False,
         task: TaskGraph | None = None,
-        T_fused_agent: Float64[ndarray, "4 4"] | None = None,
+        T_fused_agent: Float64[ndarray, "4 4"] | Literal["unknown"] | None = None,
     ) -> Session:
         """Join the mission; T_fused_agent declares the pose of the agent's frame in the fused map's.
+
+        None: the same frame. "unknown": the agent's map stays out of the fused one until the server has found its pose.
 
         Raises MismatchError if the grid, the world frame or the mission differ, NameInUseError while another robot
         holds the name's lease, NotPermittedError for a banned agent.
@@ -217,8 +222,9 @@ class FusionClient(ServiceChannel):
             world_frame=world_frame,
             fresh_map=fresh_map,
             task=None if task is None else convert_task.graph_to_message(task),
-            t_fused_agent=None if T_fused_agent is None else convert.transform_to_message(T_fused_agent),
+            t_fused_agent=convert.transform_to_message(T_fused_agent) if isinstance(T_fused_agent, ndarray) else None,
             token=self._token,
+            frame_is_unknown=isinstance(T_fused_agent, str),
         )
         response = self._call(self._stub.JoinSession, request)
         return Session(
@@ -363,6 +369,13 @@ class FusionClient(ServiceChannel):
         request = fusion_service_pb2.GetSessionStatusRequest(mission_id=self.mission_id)
         response: fusion_service_pb2.GetSessionStatusResponse = self._call(self._stub.GetSessionStatus, request)
         return response
+
+    def unlocalised(self) -> dict[str, str]:
+        """Return the agents whose frame nobody knows, with what the server says of it; their objects are left out."""
+        state = fusion_service_pb2.ALIGNMENT_STATE_UNLOCALISED
+        return {
+            agent.agent_id: agent.alignment.message for agent in self.status().agents if agent.alignment.state == state
+        }
 
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End an agent's session and delete its data; `ban` refuses its later joins. Returns the number of its voxels.

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from threading import Lock
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,7 +20,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.wire.clients import FusionClient, Session
+from gausslite.wire.clients import UNKNOWN, FusionClient, Session
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 
 _log = logging.getLogger(__name__)
@@ -89,7 +90,7 @@ class UplinkSettings:
     change of a voxel's Σkappa, as a share of the sent value, from which it is sent again; 0 while the uplink drains.
     round_bytes: size limit of a round. deadline_s: of each call. first_backoff_s: wait before the first retry.
     check_interval_s: how often an idle uplink asks the server whether it still has everything. T_fused_agent: declared
-    pose of the agent's frame in the fused map's; None: not declared.
+    pose of the agent's frame in the fused map's; None: not declared. frame: whether the agent's frame is the team's.
     """
 
     kbps: float | None = option(
@@ -109,7 +110,16 @@ class UplinkSettings:
         metavar="X,Y,Z[,QX,QY,QZ,QW]",
         plain_type=str,
         convert=read_rigid_transform,
+        excludes="frame",
     )
+    frame: str = option(
+        "team", "the agent's world frame; the server searches the pose of an unknown one", choices=("team", UNKNOWN)
+    )
+
+    @property
+    def declared_frame(self) -> Float64[ndarray, "4 4"] | Literal["unknown"] | None:
+        """What the agent says of its frame when it joins, see `FusionClient.join`."""
+        return UNKNOWN if self.frame == UNKNOWN else self.T_fused_agent
 
     def __post_init__(self) -> None:
         if self.kbps is not None and not self.kbps > 0:

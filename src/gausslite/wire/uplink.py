@@ -275,7 +275,7 @@ class Uplink:
             fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
             report, frame = self._objects.latest, self._settings.world_frame
             task = None if report is None else report.graph
-            session = self._client.join(self._agent_id, self._grid, frame, fresh, task, self._settings.T_fused_agent)
+            session = self._client.join(self._agent_id, self._grid, frame, fresh, task, self._settings.declared_frame)
             self._resend_missing(session)
             self._session = session
             self._spool.mark_keyframes_missing(session.keyframes)

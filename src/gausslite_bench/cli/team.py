@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.voxels import group_by_voxel
+from gausslite.domain.voxels import VoxelGrid, group_by_voxel
 from gausslite.fusion.alignment import SurfaceSamples
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import as_text, prepare_folder, write_json
@@ -27,10 +27,11 @@ from gausslite_bench.team.bench import TeamResult, TeamTrial, run_trial
 from gausslite_bench.team.frame_errors import FrameError
 from gausslite_bench.team.frame_pairs import judge_pairs, pairs_table
 from gausslite_bench.team.late_joiner import late_joiner_table, run_late_joiner
-from gausslite_bench.team.missions import map_agent
+from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.object_positions import PositionScore, measure_positions, positions_table
 from gausslite_bench.team.scenes import HomeTeamPlan, RecordingTeamPlan, TeamPlan
 from gausslite_bench.team.tables import team_table
+from gausslite_bench.team.unknown_frames import search_frames, searches_table
 
 _SIZE = (320, 240)
 _HOME_FRAMES = 60
@@ -91,6 +92,12 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
         type=int,
         help="only judge N pairs of parts of the agents' maps, half of them in wrong frames, as the server does",
     )
+    parser.add_argument(
+        "--unknown-frames",
+        metavar="N",
+        type=int,
+        help="only search N unknown frames of each kind of map, with any yaw and up to 10 m away, as the server does",
+    )
     add(
         "--detector",
         metavar="FILE.onnx",
@@ -104,10 +111,13 @@ def configure_team(parser: argparse.ArgumentParser) -> None:
 
 def run_team(options: argparse.Namespace) -> int:
     """Run the trials; the files are rewritten after each, so that an interrupt loses one trial at most."""
-    if sum((options.late_joiner, options.positions, options.frame_pairs is not None)) > 1:
-        raise InvalidInputError("--late-joiner, --positions and --frame-pairs: expected one of them, got several")
-    if options.frame_pairs is not None and options.frame_pairs < 1:
-        raise InvalidInputError(f"--frame-pairs: expected at least 1, got {options.frame_pairs}")
+    counts = {"--frame-pairs": options.frame_pairs, "--unknown-frames": options.unknown_frames}
+    given = {name: count for name, count in counts.items() if count is not None}
+    if options.late_joiner + options.positions + len(given) > 1:
+        raise InvalidInputError(f"--late-joiner, --positions, {', '.join(counts)}: expected one of them, got several")
+    for name, count in given.items():
+        if count < 1:
+            raise InvalidInputError(f"{name}: expected at least 1, got {count}")
     if options.detector is not None and not options.positions:
         raise InvalidInputError("--detector: expected --positions, which uses it; other trials have exact masks")
     plans, size = _plans(options)
@@ -119,6 +129,8 @@ def run_team(options: argparse.Namespace) -> int:
         return _run_late_joiner(options, trials)
     if options.frame_pairs is not None:
         return _run_frame_pairs(options, trials)
+    if options.unknown_frames is not None:
+        return _run_unknown_frames(options, trials)
     results: list[TeamResult] = []
     with progress_bar(0, "team", "frame") as bar:
         for plan, plan_trials in trials:
@@ -152,21 +164,38 @@ def _run_late_joiner(options: argparse.Namespace, trials: Sequence[tuple[TeamPla
 
 def _run_frame_pairs(options: argparse.Namespace, trials: Sequence[tuple[TeamPlan, Sequence[TeamTrial]]]) -> int:
     """Map every scene once, judge pairs of parts of its first two maps; write frame-pairs.md and .json."""
-    maps = []
+    grid = trials[0][1][0].grid
+    maps = [(_samples(first, grid), _samples(second, grid)) for _, first, second in _first_two_maps(trials)]
+    pairs = judge_pairs(maps, options.frame_pairs, options.seeds[0])
+    _write_table(options, "frame-pairs", pairs_table(pairs), [asdict(pair) for pair in pairs])
+    return 0
+
+
+def _run_unknown_frames(options: argparse.Namespace, trials: Sequence[tuple[TeamPlan, Sequence[TeamTrial]]]) -> int:
+    """Map every scene once, search the second map in the first; write unknown-frames.md and .json."""
+    scenes, grid = list(_first_two_maps(trials)), trials[0][1][0].grid
+    searches = []
+    for search in search_frames(scenes, options.unknown_frames, grid, options.seeds[0]):
+        searches.append(search)
+        print_above_bar(f"{search.scene}, {search.place}, {search.data}: {search.outcome} {search.reason}")
+    _write_table(options, "unknown-frames", searches_table(searches), [asdict(search) for search in searches])
+    return 0
+
+
+def _first_two_maps(
+    trials: Sequence[tuple[TeamPlan, Sequence[TeamTrial]]],
+) -> Iterator[tuple[str, AgentMap, AgentMap]]:
+    """Yield each scene's name and the maps of its first two agents."""
     with progress_bar(0, "maps", "frame") as bar:
         for plan, (trial, *_) in trials:
             agents = plan.load(trial.size).agents[:2]
             _expect(bar, sum(len(agent.frames) for agent in agents))
-            batches = [
-                group_by_voxel(
-                    map_agent(agent, trial.settings, trial.grid, lambda _: _count(bar)).gaussians, trial.grid
-                )
-                for agent in agents
-            ]
-            maps.append((SurfaceSamples.of(batches[0]), SurfaceSamples.of(batches[1])))
-    pairs = judge_pairs(maps, options.frame_pairs, options.seeds[0])
-    _write_table(options, "frame-pairs", pairs_table(pairs), [asdict(pair) for pair in pairs])
-    return 0
+            first, second = (map_agent(agent, trial.settings, trial.grid, lambda _: _count(bar)) for agent in agents)
+            yield plan.name, first, second
+
+
+def _samples(agent: AgentMap, grid: VoxelGrid) -> SurfaceSamples:
+    return SurfaceSamples.of(group_by_voxel(agent.gaussians, grid))
 
 
 def _run_positions(options: argparse.Namespace, plans: Sequence[TeamPlan], size: tuple[int, int]) -> int:

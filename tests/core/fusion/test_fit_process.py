@@ -14,6 +14,7 @@ import pytest
 from gausslite.domain.errors import UnavailableError
 from gausslite.fusion.alignment import SurfaceSamples, fit_frame
 from gausslite.fusion.fit_process import FitProcess
+from gausslite.fusion.unknown_frames import find_frame
 
 _MAIN = """
 import sys
@@ -51,6 +52,8 @@ def test_a_killed_process_starts_again_and_every_fit_has_the_bits_of_the_functio
             assert fit.pid is not None
             os.kill(fit.pid, signal.SIGKILL)
         assert fit(_NOTHING, target) is None
+        searched = fit.find(source, target)
+        assert (searched.fit, searched.reason) == (None, find_frame(source, target).reason)
     finally:
         fit.close()
     assert fit.pid is None

@@ -53,6 +53,31 @@ def test_the_agent_declares_its_frame() -> None:
     assert list(agent.alignment.t_fused_agent.row_major) == T_fused_agent.reshape(-1).tolist()
 
 
+def test_an_unknown_frame_is_in_the_agents_log_in_the_status_and_beside_the_objects(
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = replace(EAGER, frame="unknown", check_interval_s=0.1)
+    with fusion_server() as fusion, uplink(fusion.client.address, options) as link:
+        link.enqueue(make_batch({1: [5]}))
+        assert link.drain(WAIT_S)
+        wait_until(lambda: "uplink: frame unknown: not in the team's map yet; this server compares" in caplog.text)
+        assert fusion.client.status().fused_voxels == 0
+        assert main(["status", fusion.client.address]) == 0
+        assert main(["objects", fusion.client.address]) == 1
+    printed = capsys.readouterr().out
+    assert "frame unlocalised: frame unknown: not in the team's map yet" in printed
+    assert "note: the objects of robot are left out; frame unknown" in printed
+
+
+def test_an_agent_that_joins_again_with_its_frame_is_used(caplog: pytest.LogCaptureFixture) -> None:
+    with fusion_server() as fusion:
+        for frame in ("unknown", "team"):
+            with uplink(fusion.client.address, replace(EAGER, frame=frame)) as link:
+                link.enqueue(make_batch({1: [5], 2: [3]}))
+                assert link.drain(WAIT_S)
+            assert fusion.client.status().fused_voxels == (0 if frame == "unknown" else 2)
+
+
 def test_a_quarantine_is_in_the_agents_log_and_in_the_status(
     caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
