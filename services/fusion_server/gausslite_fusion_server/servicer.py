@@ -270,8 +270,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                 if len(response.rejected) >= _MAX_REPORTED_REJECTIONS:
                     raise
                 response.rejected.add(index=request.keyframe.index, reason=str(error))
-        # they may show where an unknown frame is
-        self._align_in_background()
+        self._align_in_background()  # they may show where an unknown frame is
         return response
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
