@@ -7,6 +7,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+from support.postgres_running import PostgresServer
 
 from gausslite.cli.main import main
 from gausslite_bench.server.server_process import DEFAULT_COMMAND, ServerProcess
@@ -58,3 +59,16 @@ def test_the_stages_of_a_message_are_measured_and_few_bytes_are_written(capsys: 
     assert all(min(result["decode_ms"], result["store_ms"]) > 0 for result in results.values())
     # 1200 Gaussians of 21 bytes, the pages around them, and what moves when segments are emptied
     assert all(result["written_bytes"] < 60_000 for result in results.values())
+
+
+def test_servers_that_share_a_mission_do_no_foreign_work_and_replace_a_killed_one(
+    postgres: PostgresServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("bench", "server", "--held", "20000", "--agents", "4", "--seconds", "2", "--servers", "2")
+    assert main([*arguments, "--store", postgres.new_database(), "--json"]) == 0
+    (result,) = json.loads(capsys.readouterr().out)
+    assert result["received"] == [16, 16]
+    assert sum(result["stored"]) >= 32
+    assert result["missing"] == result["foreign"] == 0
+    assert min(result["server_cpu_ms"], result["failover_s"]) > 0
+    assert main([*arguments, "--store", "sqlite"]) == 2

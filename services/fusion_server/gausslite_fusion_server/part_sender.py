@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -108,10 +108,8 @@ class PartSender:
         end_s, waiting, accepted, stale = loop.time() + WAIT_S, [subset], 0, 0
         while True:
             changed, owners = self._host.changes.subscribe(), self._host.owners
-            parts = [item for part in waiting for item in owners.split(part).items()]
-            results = await asyncio.gather(
-                *(self._store_part(owner, session_id, part) for owner, part in parts), return_exceptions=True
-            )
+            parts = [item for part in waiting for item in owners.split(part)]
+            results = await _all([self._store_part(owner, session_id, part) for owner, part in parts])
             unavailable = None
             waiting = []
             for (_, part), result in zip(parts, results, strict=True):
@@ -135,6 +133,17 @@ class PartSender:
             return await self._regions.store_part(session_id, part)
         self.sent += 1
         return await self._peers.send_part(owner, session_id, part)
+
+
+async def _all(calls: Sequence[Coroutine[Any, Any, tuple[int, int]]]) -> list[tuple[int, int] | BaseException]:
+    """Return the result or the error of each call."""
+    if len(calls) > 1:
+        return await asyncio.gather(*calls, return_exceptions=True)
+    try:
+        # the usual case, without a task
+        return [await calls[0]]
+    except GaussLiteError as error:
+        return [error]
 
 
 def _value(subset: StoredSubset) -> Callable[[asyncio.Future[StoredSubset]], None]:

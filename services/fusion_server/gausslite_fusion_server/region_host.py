@@ -21,7 +21,7 @@ from gausslite.wire.convert import decode_frame
 from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.servicer import FusionServicer
 
-POLL_S = 0.25
+_POLL_S = 0.5
 WAIT_S = 10.0
 """Longest wait for the owner of a slot: a message or a call waits for a server that takes over."""
 _log = logging.getLogger(__name__)
@@ -42,6 +42,7 @@ class RegionHost:
         self._local: FusionServicer | None = None
         # the connection and the slots of the open engine
         self._opened: tuple[int, frozenset[int]] | None = None
+        self._owned = OwnedSlots(slots.server, frozenset())
         self._owners = Owners()
         self._failure = ""
         self.changes = ChangeNotifier()
@@ -61,8 +62,7 @@ class RegionHost:
     def owned(self) -> OwnedSlots:
         """The slots of the open engine. Raises UnavailableError without one."""
         self.local()
-        assert self._opened is not None
-        return OwnedSlots(self.server, self._opened[1])
+        return self._owned
 
     def local(self) -> FusionServicer:
         """Return what serves this server's own part. Raises UnavailableError while it is opened."""
@@ -93,8 +93,13 @@ class RegionHost:
                     await asyncio.wait_for(changed.wait(), remaining_s)
 
     async def run(self) -> None:
-        """Follow the owners until it is cancelled. Raises MismatchError, CodecError for a mission it cannot serve."""
+        """Follow the owners until it is cancelled.
+
+        Raises MismatchError, CodecError for a mission that it cannot serve, StorageError if the first look fails.
+        """
+        await self._follow()
         while True:
+            await asyncio.sleep(_POLL_S)
             try:
                 await self._follow()
                 if self._failure:
@@ -104,7 +109,6 @@ class RegionHost:
                 if not self._failure:
                     _log.error("server %s: %s; trying again", self.server, error)
                 self._failure = str(error)
-            await asyncio.sleep(POLL_S)
 
     async def close(self) -> None:
         """Close the engine and give all slots up."""
@@ -129,6 +133,7 @@ class RegionHost:
         connection, held = self._slots.connection, self._slots.held
         engine = await asyncio.to_thread(self._open_engine)
         self._local, self._opened = self._create_servicer(engine), (connection, held)
+        self._owned = OwnedSlots(self.server, held)
         _log.info("server %s: serves %d of the mission's regions", self.server, len(held))
         self.changes.notify()
 

@@ -186,7 +186,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def publish_changes(self) -> None:
         """Wake the watchers, and look which frames are due. Use it on the event loop."""
         self._map_changes.notify()
-        self._align_in_background()
+        if self._engine.settings.alignment is not None:
+            self._align_in_background()
 
     def _commit_soon(self) -> None:
         """Commit what is queued in the commit thread; one call serves all messages queued before it begins."""

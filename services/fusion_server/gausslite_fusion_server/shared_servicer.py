@@ -159,8 +159,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         if request.exclude_agent_id:
             require_identifier("exclude_agent_id", request.exclude_agent_id)
         layer_from_message(request.layer)
-        async for response in self._watch.follow(request, region):
-            self._gate.require_open()
+        async for response in self._watch.follow(request, region, self._gate.require_open):
             yield response
 
     async def RefineFusedMap(

@@ -6,7 +6,7 @@ import asyncio
 import itertools
 import time
 from collections import OrderedDict
-from collections.abc import AsyncGenerator, AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any
@@ -68,11 +68,11 @@ class SharedWatch:
     grid: VoxelGrid
 
     async def follow(
-        self, request: pb.WatchFusedMapRequest, region: AxisAlignedBox | None
+        self, request: pb.WatchFusedMapRequest, region: AxisAlignedBox | None, require_open: Callable[[], None]
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Yield the map's changes since a revision (0: the map first), without end.
 
-        Raises RevisionGoneError, and UnavailableError if regions move during a snapshot.
+        Raises RevisionGoneError, UnavailableError if regions move during a snapshot, and what `require_open` raises.
         """
         positions = self.revisions.positions(request.since_revision) if request.since_revision else {}
         slots = _slots_in(region, self.grid)
@@ -90,6 +90,7 @@ class SharedWatch:
                         with read_deadline():
                             yield pb.WatchFusedMapResponse(block=latest)
             except UnavailableError:
+                require_open()
                 if time.monotonic() > end_s or (latest.snapshot and not latest.last):
                     raise
                 if not latest.last:

@@ -42,11 +42,12 @@ class Share:
         return [self.servicer.service(), self.regions.service()]
 
     async def run(self) -> None:
-        """Take part until it is cancelled; then end the open streams."""
+        """Take part until it is cancelled; then end the open streams, and leave the regions to the other servers."""
         try:
             await self.host.run()
         finally:
             self.servicer.drain()
+            await self.host.close()
 
     @property
     def storage(self) -> StorageProbe:

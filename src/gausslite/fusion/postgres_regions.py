@@ -7,7 +7,6 @@ that holds the slot's lock, so a server that has lost its connection cannot writ
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from contextlib import ExitStack
 
 import psycopg
 
@@ -44,12 +43,7 @@ class SharedSlots:
         self._holder: Database | None = None
         self._connections = 0
         self._held: frozenset[int] = frozenset()
-        with ExitStack() as opened:
-            self._locks = PostgresConnection(url, self._enter)
-            opened.callback(self._locks.close)
-            self._reader = PostgresConnection(url, lambda _: None)
-            opened.callback(self._reader.close)
-            self._opened = opened.pop_all()
+        self._locks = PostgresConnection(url, self._enter)
 
     @property
     def held(self) -> frozenset[int]:
@@ -63,8 +57,7 @@ class SharedSlots:
 
     def owners(self) -> Owners:
         """Return who owns which slot now; a lost connection is opened again, without locks. Raises StorageError."""
-        self._locks.run(lambda db: db.execute("SELECT 1"))
-        rows = self._reader.run(lambda db: db.execute(_OWNERS, (LOCK, _SLOT_LOCKS)).fetchall())
+        rows = self._locks.run(lambda db: db.execute(_OWNERS, (LOCK, _SLOT_LOCKS)).fetchall())
         return Owners(
             tuple(sorted({address for kind, _, address in rows if kind != _SLOT_LOCKS})),
             {slot: address for kind, slot, address in rows if kind == _SLOT_LOCKS},
@@ -88,8 +81,8 @@ class SharedSlots:
         return PostgresStore(self._url, OwnedSlots(self.server, self._held), _Writer(self._locks, self._holder))
 
     def close(self) -> None:
-        """Close the connections; the locks end."""
-        self._opened.close()
+        """Close the connection; the locks end."""
+        self._locks.close()
 
     def _enter(self, db: Database) -> None:
         """Become one of the servers; the slots of an earlier connection are lost. Raises StorageError."""

@@ -18,7 +18,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.errors import StorageError, UnavailableError
+from gausslite.domain.errors import StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
@@ -91,8 +91,8 @@ class PostgresStore:
     """A FusionStore in the schema `gausslite` of a database: one transaction per call.
 
     Without `owned`, for one server: an advisory lock, which ends with the connection, keeps other servers out. With
-    it, the store has the updates of these slots alone; a message with other voxels raises UnavailableError. Other
-    servers may change the records, sessions and keyframes; only an agent's home deletes them.
+    it, the store has the updates of these slots alone, and takes no others. Other servers may change the records,
+    sessions and keyframes; only an agent's home deletes them.
 
     The totals of all updates are in memory (ScoreIndex). Reads use a second connection and so do not wait for a
     commit. A lost connection is opened again, with the lock, if nobody else has written and no commit is missing. The
@@ -131,7 +131,6 @@ class PostgresStore:
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
         for update in updates:
             require_storable(update)
-            self.require_owned(update.voxels.keys)
         with self._write_lock:
             change = self._log.plan(updates, self._read_rows)
             if change.rows:
@@ -146,11 +145,6 @@ class PostgresStore:
                 with self._index_lock:
                     self._log.apply(change)
         return change.outcomes
-
-    def require_owned(self, keys: Int64[ndarray, " n"]) -> None:
-        """Raise UnavailableError for voxels of slots that this server does not own."""
-        if self._owned is not None and not self._owned.have(keys):
-            raise UnavailableError(f"server {self._owned.server}: some voxels belong to another server now")
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
@@ -55,6 +55,13 @@ class Owners:
 
     servers: tuple[str, ...] = ()
     server_of: Mapping[int, str] = field(default_factory=dict)
+    # the place of each slot's owner among the servers, one more for none
+    _places: Int64[ndarray, " s"] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        places = {server: place for place, server in enumerate(self.servers)}
+        found = [places.get(self.server_of.get(slot, ""), len(places)) for slot in range(SLOTS)]
+        object.__setattr__(self, "_places", np.array(found, np.int64))
 
     def home(self, agent_id: str) -> str | None:
         """Return the owner of the agent's slot; None while it has none."""
@@ -65,18 +72,18 @@ class Owners:
         """Whether every slot has an owner."""
         return len(self.server_of) == SLOTS
 
-    def split(self, subset: StoredSubset) -> dict[str | None, StoredSubset]:
-        """Return the part of a message for each owner, and under None the part for slots without one."""
-        slots = slots_of(subset.voxels.keys)
-        owners = {slot: self.server_of.get(slot) for slot in np.unique(slots).tolist()}
-        names = list(dict.fromkeys(owners.values()))
-        if len(names) <= 1:
-            return dict.fromkeys(names or [self.home(subset.agent_id)], subset)
-        index = np.array([names.index(owners[slot]) for slot in slots.tolist()], np.int64)
-        return {
-            name: replace(subset, voxels=subset.voxels.take(np.flatnonzero(index == number)))
-            for number, name in enumerate(names)
-        }
+    def split(self, subset: StoredSubset) -> list[tuple[str | None, StoredSubset]]:
+        """Return each owner with its part of a message, None with the part for slots without one; at least one."""
+        names = (*self.servers, None)
+        places = self._places[slots_of(subset.voxels.keys)]
+        if len(places) == 0:
+            return [(self.home(subset.agent_id), subset)]
+        if (places == places[0]).all():
+            return [(names[places[0]], subset)]
+        return [
+            (names[place], replace(subset, voxels=subset.voxels.take(np.flatnonzero(places == place))))
+            for place in np.unique(places).tolist()
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +92,10 @@ class OwnedSlots:
 
     server: str
     slots: frozenset[int]
+    _has: Bool[ndarray, " s"] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_has", np.isin(np.arange(SLOTS), sorted(self.slots)))
 
     def is_home(self, agent_id: str) -> bool:
         """Return whether the agent's slot is one of them."""
@@ -92,4 +103,4 @@ class OwnedSlots:
 
     def have(self, keys: Int64[ndarray, " n"]) -> bool:
         """Return whether all of these voxels are in them."""
-        return self.slots.issuperset(np.unique(slots_of(keys)).tolist())
+        return bool(self._has[slots_of(keys)].all())

@@ -14,6 +14,7 @@ from gausslite_bench.server.agent_load import RATE_HZ, LoadResult
 from gausslite_bench.server.bench import P99_LIMIT_MS, ServerBenchSettings, StoredSizeResult, measure
 from gausslite_bench.server.hostile import ATTACKS, AttackResult, measure_attack
 from gausslite_bench.server.server_process import DEFAULT_COMMAND
+from gausslite_bench.server.sharing import SharingResult, measure_sharing
 from gausslite_bench.server.stages import measure_stages
 
 
@@ -28,7 +29,18 @@ def configure_server(parser: argparse.ArgumentParser) -> None:
         help="agents that send updates at 4 Hz, and objects and keyframes as real agents do (default: %(default)s)",
     )
     add("--seconds", type=float, default=10.0, metavar="S", help="duration of each load (default: %(default)s)")
-    add("--store", choices=["sqlite", "memory"], default="sqlite", help="store of the server (default: %(default)s)")
+    add(
+        "--store",
+        default="sqlite",
+        metavar="STORE",
+        help="sqlite, memory, or with --servers postgresql://USER@HOST/DATABASE, beside which databases are made "
+        "(default: %(default)s)",
+    )
+    add(
+        "--servers",
+        metavar="N,N",
+        help="measure so many servers that share a mission, with the first numbers of --held and --agents",
+    )
     add("--watchers", type=int, default=20, metavar="N", help="watchers that stop reading (default: %(default)s)")
     add(
         "--server",
@@ -58,6 +70,14 @@ def run_server(options: argparse.Namespace) -> int:
         return _run_attacks(options)
     if options.stages:
         return _run_stages(max(int(options.seconds * RATE_HZ), 1), options.json)
+    is_database = options.store.startswith("postgresql://")
+    if not is_database and options.store not in ("sqlite", "memory"):
+        raise InvalidInputError(f"--store: expected sqlite, memory or postgresql://..., got {options.store!r}")
+    if options.servers is not None:
+        if not is_database:
+            raise InvalidInputError("--servers: expected a database as --store, postgresql://USER@HOST/DATABASE")
+    elif is_database:
+        raise InvalidInputError("--store postgresql://...: expected --servers too, for example --servers 1,2,4")
     settings = ServerBenchSettings(
         held=_numbers("--held", options.held, 0),
         agents=_numbers("--agents", options.agents, 1),
@@ -66,6 +86,8 @@ def run_server(options: argparse.Namespace) -> int:
         store=options.store,
         watchers=options.watchers,
     )
+    if options.servers is not None:
+        return _run_sharing(settings, _numbers("--servers", options.servers, 1), options.json)
     with progress_bar(len(settings.held), "server", "server") as progress:
         results = []
         if not options.json:
@@ -78,6 +100,31 @@ def run_server(options: argparse.Namespace) -> int:
     if options.json:
         sys.stdout.write(json.dumps([_values(settings, result) for result in results], indent=1) + "\n")
     return 0
+
+
+def _run_sharing(settings: ServerBenchSettings, counts: list[int], is_json: bool) -> int:
+    results = []
+    with progress_bar(len(counts), "servers", "servers") as progress:
+        if not is_json:
+            progress.write(f"{_title(settings.command, settings.store)} that the servers share, so frames are trusted")
+        for count in counts:
+            results.append(measure_sharing(settings, count, progress.set_description))
+            progress.update()
+            if not is_json:
+                progress.write(_sharing_line(results[-1]))
+    if is_json:
+        sys.stdout.write(json.dumps([asdict(result) for result in results], indent=1) + "\n")
+    return 0
+
+
+def _sharing_line(result: SharingResult) -> str:
+    failover = "" if result.failover_s is None else f"; a server killed: {result.failover_s:.1f} s"
+    return (
+        f"{result.servers} servers, {result.agents} agents, {result.held} Gaussians held: CPU per message "
+        f"{result.server_cpu_ms:.2f} ms of servers, {result.database_cpu_ms:.2f} ms of the database; p50 "
+        f"{result.p50_ms:.0f} ms, p99 {result.p99_ms:.0f} ms, {result.missing} missing; received {result.received}, "
+        f"stored parts {result.stored}, foreign {result.foreign}{failover}"
+    )
 
 
 def _run_stages(count: int, is_json: bool) -> int:
@@ -142,7 +189,8 @@ def _numbers(name: str, text: str, least: int) -> list[int]:
 def _title(command: str, store: str) -> str:
     """Return the configuration of the server."""
     options = "default options" if command == DEFAULT_COMMAND else command
-    return f"fusion server, {options}, store in {'memory' if store == 'memory' else 'a file'}"
+    places = {"memory": "memory", "sqlite": "a file"}
+    return f"fusion server, {options}, store in {places.get(store, 'a database')}"
 
 
 def _values(settings: ServerBenchSettings, result: StoredSizeResult) -> dict[str, object]:

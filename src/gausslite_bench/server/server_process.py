@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shlex
 import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 from gausslite.domain.errors import UnavailableError
@@ -20,15 +22,23 @@ _START_LIMIT_S = 300.0
 _POLL_S = 0.02
 
 
+def process_cpu_s(pid: int) -> float:
+    """Return the processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
 class ServerProcess:
     """Owns the process of a server on a store, and appends what it logs to a file.
 
     The server runs with its default options, but for those in the command.
     """
 
-    def __init__(self, command: str, folder: Path, store: str) -> None:
-        self._command, self._store = command, "memory" if store == "memory" else str(folder / "store.sqlite")
+    def __init__(self, command: str, folder: Path, store: str, shares: bool = False) -> None:
+        """store: sqlite, memory, or the address of a database, which the server may share with others."""
+        self._command, self._store = command, str(folder / "store.sqlite") if store == "sqlite" else store
         self.address = f"unix:{folder}/fusion.sock"
+        self._more = ["--set", f"peer-address={self.address}", "--metrics", "127.0.0.1:0"] if shares else []
         self.log = folder / "fusion.log"
         self.start()
 
@@ -69,6 +79,13 @@ class ServerProcess:
                     ticks += sum(map(int, fields[11:13]))
         return ticks / os.sysconf("SC_CLK_TCK")
 
+    def counters(self) -> dict[str, int]:
+        """Return the counters of a server that shares a mission, by name."""
+        url = re.findall(r"metrics on (\S+)", self.log.read_text())[-1]
+        with urllib.request.urlopen(url, timeout=60) as page:  # noqa: S310 - the server's own address
+            found = re.findall(r"^gausslite_fusion_(\w+)_total{.*} (\S+)$", page.read().decode(), re.MULTILINE)
+        return {name: int(float(value)) for name, value in found}
+
     def close(self) -> None:
         """End the process."""
         self._process.send_signal(signal.SIGTERM)
@@ -85,7 +102,7 @@ class ServerProcess:
         """
         begin_s = time.monotonic()
         self._command = command or self._command
-        arguments = [*shlex.split(self._command), "--listen", self.address, "--store", self._store]
+        arguments = [*shlex.split(self._command), "--listen", self.address, "--store", self._store, *self._more]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(arguments, stderr=log)  # noqa: S603 - the user's own command
         socket = Path(self.address.removeprefix("unix:"))

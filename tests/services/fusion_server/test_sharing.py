@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import grpc
 import numpy as np
 import pytest
+from certificates import identity, make_certificates
 from fusion_running import CAMERA, COMMAND, GRID, frame, fusion_server, request
 from sample_gaussians import plain_gaussians
 from sharing_running import SharingServer, sharing_server, sharing_servers, wait_until_settled
@@ -35,6 +37,9 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.regions import ALL_SLOTS, wanted_slots
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1.region_service_pb2 import RemoveAgentRequest
+from gausslite.v1.region_service_pb2_grpc import RegionServiceStub
+from gausslite.wire.channel import open_channel
 from gausslite.wire.clients import Export
 from gausslite.wire.convert import MapUpdate
 
@@ -275,3 +280,25 @@ def test_only_the_slots_of_a_server_that_ends_move() -> None:
     after = {name: wanted_slots(names[1:], name) for name in names[1:]}
     assert all(before[name] <= after[name] for name in names[1:])
     assert frozenset.union(*after.values()) == ALL_SLOTS
+
+
+def test_with_certificates_only_servers_call_each_other(postgres: PostgresServer, folder: Path, tmp_path: Path) -> None:
+    certs = make_certificates(tmp_path, "one:server", "two:server", "ant:robot")
+    url, robot = postgres.new_database(), identity(certs, "ant")
+    with (
+        sharing_server(url, f"unix:{folder}/1.sock", identity(certs, "one"), robot) as one,
+        sharing_server(url, f"unix:{folder}/2.sock", identity(certs, "two"), robot) as two,
+    ):
+        wait_until_settled([one, two])
+        session = one.client.join("ant", GRID).session_id
+        subsets = [scattered("ant", seq, seq) for seq in (1, 2)]
+        list(two.client.contribute([request(session, subset) for subset in subsets], 20.0))
+        assert one.client.export(Export()) == offline({"ant": subsets})
+        assert one.share.counts().stored
+        assert two.share.counts().stored
+        with pytest.raises(NotPermittedError):
+            one.client.join("bee", GRID)
+        with open_channel(one.address, robot) as channel, pytest.raises(grpc.RpcError) as refused:
+            RegionServiceStub(channel).RemoveAgent(RemoveAgentRequest(agent_id="ant"))
+        assert refused.value.code() is grpc.StatusCode.PERMISSION_DENIED
+        assert "the roles server" in refused.value.details()
