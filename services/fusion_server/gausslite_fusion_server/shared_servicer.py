@@ -72,9 +72,9 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         """Join at the agent's home, and tell the other owners."""
         Caller.of(context).require_agent(request.agent_id)
         T_fused_agent = declared_frame_from_message(request)
-        if T_fused_agent is not None and not np.array_equal(T_fused_agent, np.eye(4)):
+        if request.frame_is_unknown or (T_fused_agent is not None and not np.array_equal(T_fused_agent, np.eye(4))):
             raise MismatchError(
-                "t_fused_agent: expected none, because several servers share this mission and use maps as they are "
+                "frame: expected the mission's, because several servers share this mission and use maps as they are "
                 "sent; localise the robot in the mission's frame"
             )
         response: pb.JoinSessionResponse = await self._at_home(request.agent_id, "JoinSession", request, context)

@@ -236,9 +236,9 @@ class FusionEngine:
 
     @property
     def moved_agents(self) -> tuple[str, ...]:
-        """The agents whose frame is not the fused map's, or that are quarantined."""
+        """The agents whose frame is not the fused map's, or whose data are not used."""
         alignments = self._mission.alignments
-        return tuple(sorted(alignments.quarantined | alignments.transforms().keys()))
+        return tuple(sorted(alignments.unused | alignments.transforms().keys()))
 
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""

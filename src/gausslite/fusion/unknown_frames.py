@@ -144,8 +144,8 @@ class _Search:
     ) -> Iterator[Float64[ndarray, "4 4"]]:
         """Yield the motions that matches of point features of these samples propose, refined on all samples."""
         for spacing_m in spacings_m:
-            surfaces = [Surface.sampled(samples.points_m, spacing_m) for samples in (source, target)]
-            proposed = matched_motion(*surfaces, min_inliers=_MIN_INLIERS)
+            own, theirs = (Surface.sampled(samples.points_m, spacing_m) for samples in (source, target))
+            proposed = matched_motion(own, theirs, min_inliers=_MIN_INLIERS)
             if proposed is not None:
                 yield self._registered(self._coarse, proposed)
 
@@ -216,7 +216,8 @@ class _Search:
                 self._places.cloud, cloud, self._places.tree, T, "GICP", reach_m, max_iterations=GICP_ITERATIONS
             )
             T = np.asarray(result.T_target_source, np.float64)
-        return orthonormal(T)
+        registered: Float64[ndarray, "4 4"] = orthonormal(T)
+        return registered
 
 
 def _cloud(points_m: Float64[ndarray, "n 3"]) -> small_gicp.PointCloud:
