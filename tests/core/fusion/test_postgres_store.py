@@ -6,15 +6,18 @@ import time
 from collections.abc import Callable
 from threading import Thread
 
+import numpy as np
 import pytest
 from support.postgres_running import PASSWORD, PostgresServer, postgres_server
 from test_fusion_stores import make_subset
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.errors import InvalidInputError, StorageError
+from gausslite.domain.errors import InvalidInputError, StorageError, UnavailableError
+from gausslite.fusion.regions import slots_of
 
 psycopg = pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
 
+from gausslite.fusion.postgres_regions import SharedSlots  # noqa: E402
 from gausslite.fusion.postgres_store import SCHEMA_VERSION, PostgresStore  # noqa: E402
 
 
@@ -71,6 +74,37 @@ def test_a_store_that_another_server_used_meanwhile_refuses_to_go_on(postgres: P
     again = PostgresStore(url)
     assert again.batch("ant").counts.tolist() == [4]
     again.close()
+
+
+def test_a_database_is_used_by_one_server_alone_or_shared_with_one_owner_of_each_slot(postgres: PostgresServer) -> None:
+    url = postgres.new_database()
+    one, two = SharedSlots(url, "one:1"), SharedSlots(url, "two:1")
+    assert "share it: set peer-address of both" in one_line(lambda: PostgresStore(url))
+    assert "another server has the peer-address two:1" in one_line(lambda: SharedSlots(url, "two:1"))
+    assert one.take({1, 2, 3}) == {1, 2, 3}
+    assert two.take({3, 4}) == {4}
+    assert two.owners().server_of == {1: "one:1", 2: "one:1", 3: "one:1", 4: "two:1"}
+    store = one.open_store()
+    key = next(key for key in range(0, 1 << 40, 1 << 26) if slots_of(np.array([key]))[0] == 1)
+    store.put(make_subset("ant", 1, {key: 2}))
+    one.release({2, 3})
+    assert two.take({2, 3}) == {2, 3}
+    end_connections(url)
+    # the locks are gone, so its rows are not its own any more
+    with pytest.raises(UnavailableError, match="was lost"):
+        store.put(make_subset("ant", 2, {key: 3}))
+    store.close()
+    assert two.owners().servers == ("one:1", "two:1")
+    assert two.take({1, 2, 3, 4}) == {1, 2, 3, 4}
+    other = two.open_store()
+    assert other.batch("ant").counts.tolist() == [2]
+    other.close()
+    one.close()
+    two.close()
+    alone = PostgresStore(url)
+    assert alone.batch("ant").counts.tolist() == [2]
+    assert "in use by another server" in one_line(lambda: SharedSlots(url, "one:1"))
+    alone.close()
 
 
 def test_a_killed_database_loses_nothing_acknowledged(postgres: PostgresServer) -> None:
