@@ -145,8 +145,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._gate = DrainGate()
         find = functools.partial(self._work, session_of, engine)
         self._contributions = Contributions(find, self._store_message, engine.record_traffic, RejectionLog(_log))
-        # one map and one decoded keyframe at a time are in memory
-        self._exports, self._keyframes = asyncio.Semaphore(1), asyncio.Semaphore(1)
+        # one at a time: they hold megabytes, or the interpreter's lock
+        self._exports, self._keyframes, self._queries = (asyncio.Semaphore(1) for _ in range(3))
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
@@ -343,10 +343,12 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def QueryObjects(self, request: pb.QueryObjectsRequest, context: Any) -> pb.QueryObjectsResponse:
         """Return the team's objects that a noun names, or all."""
         self._engine.require_mission(request.mission_id)
-        objects = await self._work(self._engine.query_objects, request.noun)
-        return pb.QueryObjectsResponse(
-            objects=[object_to_message(team_object.landmark, team_object.observers) for team_object in objects]
-        )
+        async with self._queries:
+            return await self._work(self._find_objects, request.noun)
+
+    def _find_objects(self, noun: str) -> pb.QueryObjectsResponse:
+        found = self._engine.query_objects(noun)
+        return pb.QueryObjectsResponse(objects=[object_to_message(one.landmark, one.observers) for one in found])
 
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
         """Render a layer of the map from a camera pose."""
