@@ -40,6 +40,7 @@ from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import CameraView
 from gausslite_agent.background import IdleTraining, KeyframeUpload
+from gausslite_agent.prior import LOCALISING, PriorFrames
 from gausslite_agent.settings import LoadSettings, QueuePolicy
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
 
@@ -128,12 +129,14 @@ class MappingWorker:
         load: LoadSettings | None = None,
         clock: Clock = time.monotonic,
         keyframe_upload: KeyframeUpload | None = None,
+        prior: PriorFrames | None = None,
     ) -> None:
         """Reserve the map's memory.
 
         build_estimator and on_change run on the worker thread, the latter after each mapped frame.
         """
         self._keyframe_upload = keyframe_upload
+        self.prior = prior or PriorFrames(None)
         self._settings, self._grid, self._build_estimator = settings, grid, build_estimator
         self.uplink = uplink
         self._on_change = on_change
@@ -306,6 +309,7 @@ class MappingWorker:
         checkpoint = saved.checkpoint
         task_mapper = self._switch(checkpoint.graph)
         saved.run.restore(task_mapper)
+        self.prior.restore(saved.run.extra, self._settings)
         # not before: the fusion server replaces what it has by each report
         self._report_task(task_mapper)
         self._last_index = checkpoint.last_index
@@ -333,7 +337,7 @@ class MappingWorker:
             return 0.0
         start_s = time.monotonic()
         checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
-        save_run(path, task_mapper, config, checkpoint.last_index, checkpoint.state())
+        save_run(path, task_mapper, config, checkpoint.last_index, {**checkpoint.state(), **self.prior.state()})
         return time.monotonic() - start_s
 
     def _map_next(self) -> None:
@@ -352,7 +356,10 @@ class MappingWorker:
 
     def _map(self, queued: QueuedFrame) -> FrameReport:
         assert self._task_mapper is not None
-        frame = queued.frame
+        graph = self.status().graph
+        frame = self.prior.in_map(queued.frame, self._mapper, "" if graph is None else graph.text)
+        if frame is None:
+            return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
         self._last_index, self._detected = frame.index, outcome.detected or self._detected
         self._update_notes(self._task_mapper.notes)
@@ -375,7 +382,9 @@ class MappingWorker:
         self._status.add_outcome(outcome)
         self._timeline.add(outcome)
         self._recorder.record(self._mapper.poses, self._mapper.gaussians)
-        self._status.update(correction=self._mapper.poses.latest(), corrected_at_s=time.monotonic())
+        self._status.update(
+            correction=self.prior.correction(self._mapper.poses.latest()), corrected_at_s=time.monotonic()
+        )
         self._count(report)
         self._on_change()
         return report

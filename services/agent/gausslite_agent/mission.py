@@ -344,8 +344,21 @@ class AgentMission:
             "stopped_by": ended_by,
             "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
         }
-        write_results(folder, gaussians, report, self._settings.link.uplink.world_frame)
-        self._worker.run(lambda mapper: write_poses(folder, mapper.poses)).result()
+        prior, world_frame = self._worker.prior.run, self._settings.link.uplink.world_frame
+        motion = None if prior is None else prior.motion
+        if prior is not None:
+            objects, keyframes = (
+                self._worker.status().objects,
+                self._worker.run(lambda mapper: mapper.keyframes()).result(),
+            )
+            changes = prior.changes(gaussians, objects, keyframes)
+            for change in changes:
+                _log.info("since the earlier map: %s", change.describe())
+            objects_json = [object_as_json(landmark) for landmark in prior.objects(objects, changes)]
+            report |= {**prior.report(changes), "objects": objects_json}
+            world_frame = world_frame or ("" if motion is None else prior.saved.world_frame)
+        write_results(folder, gaussians, report, world_frame)
+        self._worker.run(lambda mapper: write_poses(folder, mapper.poses, motion)).result()
         self._worker.run(lambda mapper: write_keyframes(folder, mapper.keyframes())).result()
         self._worker.write_history(folder).result()
 

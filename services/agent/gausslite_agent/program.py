@@ -9,13 +9,15 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gausslite.config.values import NONE
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.build import EstimatorFactory
+from gausslite.mission.prior import SavedMap
+from gausslite.mission.prior_run import PriorRun
 from gausslite.mission.results import prepare_file, prepare_folder
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo
@@ -31,6 +33,7 @@ from gausslite.wire.views import ChangeNotifier
 from gausslite_agent.background import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import NO_DETECTOR, AgentMission
+from gausslite_agent.prior import PriorFrames
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_arguments
 from gausslite_agent.state import SavedMission
@@ -155,7 +158,8 @@ async def _serve(settings: AgentSettings) -> int:
     with ExitStack() as stack:
         parser = _open_parser(settings, stack)
         uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
-        estimators = _estimators(settings, stream)
+        prior = PriorFrames(None if saved is not None else _open_prior(settings))
+        estimators = _estimators(settings, stream, prior)
         worker = MappingWorker(
             settings.mission,
             settings.link.grid,
@@ -164,6 +168,7 @@ async def _serve(settings: AgentSettings) -> int:
             on_change=lambda: _notify(loop, changes),
             load=settings.load,
             keyframe_upload=_keyframe_upload(settings.link, uplink),
+            prior=prior,
         )
         stack.callback(worker.close)
         _follow_team_map(settings, worker, stack)
@@ -205,9 +210,14 @@ def _read_saved(settings: AgentSettings) -> SavedMission | None:
     return SavedMission.read(settings.state, *settings.fixed_settings)
 
 
-def _estimators(settings: AgentSettings, stream: FrameStream | None) -> EstimatorFactory:
+def _open_prior(settings: AgentSettings) -> PriorRun | None:
+    """Read the map of the earlier run; None without one. Raises MapFileError."""
+    return None if settings.prior is None else PriorRun(SavedMap.read(settings.prior), settings.mission)
+
+
+def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: PriorFrames) -> EstimatorFactory:
     """Return the estimator factory. Raises InvalidInputError if the task of the command line has no detector."""
-    estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream))
+    estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream, prior))
     if settings.task is not None:
         estimators.require_detector()
     if settings.source is not None and stream is not None and settings.perception.model is None:
@@ -277,9 +287,10 @@ def _keyframe_upload(link: ConnectionSettings, uplink: Uplink | None) -> Keyfram
     return KeyframeUpload(uplink, link.grid, link.keyframes, link.keyframes_during_mission)
 
 
-def _scene(settings: AgentSettings, stream: FrameStream | None) -> SceneInfo:
+def _scene(settings: AgentSettings, stream: FrameStream | None, prior: PriorFrames) -> SceneInfo:
     if stream is not None:
-        return SceneInfo.of(stream.source)
+        scene = SceneInfo.of(stream.source)
+        return replace(scene, regions=prior.regions(scene.regions))
     return SceneInfo() if settings.up_axis is None else SceneInfo(unit_up_axis(settings.up_axis))
 
 

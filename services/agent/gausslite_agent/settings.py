@@ -175,6 +175,11 @@ class AgentSettings:
     state: Path | None = option(
         None, "resume the mission saved in this file, and save it here at the end", metavar="FILE"
     )
+    prior: Path | None = option(
+        None,
+        "continue the map of an earlier run, in its world frame: the folder of its results (default: an empty map)",
+        metavar="RUN",
+    )
     strict: bool = option(False, "end at a frame of the source that cannot be read (default: skip it)")
     save_interval_s: float = option(
         0.0,
@@ -201,7 +206,7 @@ class AgentSettings:
 PROGRAM = Program.of(
     *(AgentSettings, TlsFiles),
     flags="listen agent-id task source frames size detector parser fusion out state policy poses max-gaussians "
-    "iterations rate exit-when-done frame",
+    "iterations rate exit-when-done frame prior",
     defaults={
         "source": None,
         "keyframes": None,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
-from gausslite.cli.map_prior import PriorRun
+from gausslite.cli.map_prior import in_frame_of, localised
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
     RecordingOptions,
@@ -42,6 +42,7 @@ from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.map_diff import Change
+from gausslite.mission.prior_run import PriorRun
 from gausslite.mission.results import (
     PREVIEW,
     locked_folder,
@@ -187,15 +188,16 @@ def _map(options: argparse.Namespace) -> int:
     if saved is None:
         stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
         inputs = inputs.calibrated(replace(stated, force=options.force))
-    prior = None if saved is None else PriorRun.resumed(saved.extra)
+    prior = None if saved is None else PriorRun.resumed(saved.extra, inputs.mission)
     if options.prior is not None:
-        prior = PriorRun.localise(options.prior, inputs)
+        prior = localised(options.prior, inputs)
     recorded = inputs
     if prior is not None:
-        inputs = prior.moved(recorded)
+        inputs = in_frame_of(prior, recorded)
         estimators = estimators.in_scene(lambda: SceneInfo.of(inputs.stream.source))
         roi = _first_roi(options, inputs, resumed_after)
-    mapper = build_task_mapper(inputs.mission, estimators, roi, None if prior is None else prior.gaussians_for(inputs))
+    task = "" if inputs.schedule.first is None else inputs.schedule.first.text
+    mapper = build_task_mapper(inputs.mission, estimators, roi, None if prior is None else prior.gaussians_for(task))
     if saved is not None:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
@@ -272,7 +274,7 @@ class _Run:
         )
         objects: Sequence[ObjectLandmark] = self._mapper.objects
         if self._prior is not None:
-            self._changes = self._prior.changes(self._mapper, self._gaussians, self._inputs)
+            self._changes = self._prior.changes(self._gaussians, objects, self._mapper.keyframes())
             objects = self._prior.objects(objects, self._changes)
         self._report = {
             **self._inputs.report(),
@@ -297,7 +299,7 @@ class _Run:
             self._training_scores = score_training_views(viewer, keyframes)
             self._report["training_views"] = asdict(self._training_scores)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
-        write_poses(options.out, self._mapper.poses)
+        write_poses(options.out, self._mapper.poses, None if self._prior is None else self._prior.motion)
         self._timeline.write(options.out)
         self._recorder.write(options.out)
         write_keyframes(options.out, self._mapper.keyframes())

@@ -72,16 +72,15 @@ class GaussianMapper:
     ) -> None:
         """Allocate memory for `settings.max_gaussians` Gaussians; seed initialises all random choices.
 
-        initial_map: an earlier map to continue; keyframes that contradict it remove its Gaussians, and those that show
-        it set its active flags. Raises QuotaError if it exceeds the cap.
+        initial_map: see `continue_map`.
         """
         self._settings = settings
         self._rasterizer = rasterizer
         self._rng = np.random.default_rng(seed)
         self._table = SplatTable(settings.max_gaussians)
-        self._has_prior = initial_map is not None
+        self._has_prior = False
         if initial_map is not None:
-            self._table.append(initial_map)
+            self.continue_map(initial_map)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
         self._keyframes = KeyframeStore(settings.keyframes, settings.components.follow_task)
         refinement = RefinementSettings(
@@ -94,6 +93,14 @@ class GaussianMapper:
         self._extent_m = 0.0
         self._revision = 0
         self._skipped = 0
+
+    def continue_map(self, earlier: Gaussians) -> None:
+        """Add an earlier map. Keyframes that see through it remove its Gaussians; those that show it set active flags.
+
+        Raises QuotaError if it exceeds the cap.
+        """
+        self._table.append(earlier)
+        self._has_prior = True
 
     @property
     def count(self) -> int:

@@ -27,6 +27,8 @@ _MIN_POINTS = 8
 _MIN_KNOWN, _MIN_EMPTY, _MIN_EMPTY_MOVED = 0.3, 0.4, 0.15
 """Shares: of an object's points that views tell about, and of these that they see through; the last one if the object
 is seen at a place that was empty."""
+_MAX_RATIO = 2.5
+"""Of the longest sides of one object in two runs."""
 _GRID = VoxelGrid(0.1)
 _MIN_CLUSTER_POINTS, _MIN_CLUSTER_VOXELS, _MIN_CLUSTER_SIDE_M = 25, 2, 0.08
 _SIZE_RATIO, _COLOUR_DISTANCE = 1.5, 0.15
@@ -170,8 +172,13 @@ def _joined(objects: Iterable[ObjectLandmark]) -> list[ObjectLandmark]:
 
 
 def _nearest(landmark: ObjectLandmark, candidates: Iterable[ObjectLandmark]) -> ObjectLandmark | None:
-    """Return the nearest candidate of the same noun."""
-    same = (candidate for candidate in candidates if candidate.noun == landmark.noun)
+    """Return the nearest candidate of the same noun and of a similar size."""
+    longest_m = max(landmark.size_m)
+    same = (
+        candidate
+        for candidate in candidates
+        if candidate.noun == landmark.noun and 1 / _MAX_RATIO < max(candidate.size_m) / longest_m < _MAX_RATIO
+    )
     return min(same, key=lambda candidate: _apart_m(landmark, candidate), default=None)
 
 

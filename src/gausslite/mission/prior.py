@@ -107,7 +107,7 @@ class SequenceLocaliser:
         self._motions: list[Float64[ndarray, "4 4"]] = []
         self.tried = 0
         self.T_map_sequence: Float64[ndarray, "4 4"] | None = None
-        """The motion that two frames agree on; None before."""
+        # the motion that two frames agree on
 
     @property
     def is_done(self) -> bool:

@@ -161,13 +161,19 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
     write_json(folder / _REPORT, report)
 
 
-def write_poses(folder: Path, poses: PoseHistory) -> None:
-    """Write map_to_odom.txt and trajectory.txt, in TUM's format, if any frame was mapped. Raises StorageError."""
+def write_poses(folder: Path, poses: PoseHistory, T_map_sequence: Float64[ndarray, "4 4"] | None = None) -> None:
+    """Write map_to_odom.txt and trajectory.txt, in TUM's format, if any frame was mapped. Raises StorageError.
+
+    T_map_sequence: the motion by which the odometry's poses were moved before they were mapped; None without one.
+    """
     corrections = poses.corrections()
     if corrections is None:
         return
+    T_map_odometry = corrections.T_map_odometry
+    if T_map_sequence is not None:
+        T_map_odometry = T_map_odometry @ T_map_sequence
     for name, title, T in (
-        (MAP_TO_ODOM, "T_map_odometry at each mapped frame", corrections.T_map_odometry),
+        (MAP_TO_ODOM, "T_map_odometry at each mapped frame", T_map_odometry),
         (TRAJECTORY, "T_map_camera of each mapped frame", poses.trajectory().T_world_camera),
     ):
         write_atomic(folder / name, format_pose_rows(title, corrections.times_ns, T).encode())

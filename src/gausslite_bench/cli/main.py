@@ -14,6 +14,7 @@ from gausslite_bench.cli.gpu import configure_gpu
 from gausslite_bench.cli.loop import configure_loop
 from gausslite_bench.cli.parser import configure_parser
 from gausslite_bench.cli.perception import configure_perception
+from gausslite_bench.cli.places import configure_places
 from gausslite_bench.cli.quality import configure_ablation, configure_quality
 from gausslite_bench.cli.raster import configure_raster
 from gausslite_bench.cli.registration import configure_registration
@@ -116,6 +117,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str, str]] = {
         "recovery of map quality after a task change",
         "Change the task during a mission. Compare the map with one restarted at the change and with one that had the "
         "new task from the start.",
+    ),
+    "places": (
+        configure_places,
+        "frames of a sequence that are localised in a saved map",
+        "Localise each frame in the map of a run, from any start. Report how many poses are right, wrong and refused, "
+        "and the time. With mirrored images, or in another place, every pose is wrong.",
     ),
     "registration": (
         configure_registration,

@@ -67,9 +67,9 @@ def test_a_signal_while_results_are_written_loses_none_of_them(
     sequence = write_seven_scenes(tmp_path / "kitchen")
     write = map_command.write_poses
 
-    def write_and_raise_signal(folder: Path, poses: PoseHistory) -> None:
+    def write_and_raise_signal(folder: Path, poses: PoseHistory, motion: np.ndarray | None) -> None:
         signal.raise_signal(signal.SIGTERM)
-        write(folder, poses)
+        write(folder, poses, motion)
 
     assert mapped(sequence, tmp_path / "whole") == 0
     monkeypatch.setattr(map_command, "write_poses", write_and_raise_signal)

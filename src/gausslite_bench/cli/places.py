@@ -1,0 +1,110 @@
+"""`gausslite bench places`: how many frames are localised in a saved map, rightly or wrongly, and how fast."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterable
+from dataclasses import MISSING, asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import option
+from gausslite.config.program import Program
+from gausslite.datasets.open import open_source
+from gausslite.datasets.source import frame_size, select_frames
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite.evaluation.views import view_map
+from gausslite.mission.prior import SavedMap
+from gausslite.mission.results import as_text
+from gausslite.mission.settings import SourceSettings
+from gausslite.places.localisation import PlaceMap
+
+_WRONG_M, _WRONG_DEG = 0.25, 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class PlacesOptions:
+    """The options of `bench places` beside those of the source."""
+
+    place: Path = option(MISSING, "folder of the run whose map is the place", metavar="RUN")
+    elsewhere: bool = option(False, "SOURCE shows another place: every localised frame is wrong")
+    mirror: bool = option(False, "mirror the images, which makes a look-alike of the place (implies elsewhere)")
+    threads: int | None = option(None, "the rasterizer's threads (default: one per core)", low=1)
+    json: bool = option(False, "print JSON for scripts")
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceScore:
+    """Frames that were tried, localised rightly (within 25 cm and 10 degrees) and wrongly, and medians of the right."""
+
+    frames: int
+    right: int
+    wrong: int
+    error_m: float
+    error_deg: float
+    seconds: float
+
+    @classmethod
+    def of(cls, places: PlaceMap, frames: Iterable[Frame], elsewhere: bool = False) -> PlaceScore:
+        """Localise the frames, whose own poses are true; elsewhere: no pose is right."""
+        errors, seconds, wrong = [], [], 0
+        for frame in frames:
+            start_s = time.process_time()
+            place = places.localise(frame)
+            seconds.append(time.process_time() - start_s)
+            if place is None:
+                continue
+            error = _error(place.T_world_camera, frame.T_world_camera)
+            if elsewhere or error[0] > _WRONG_M or error[1] > _WRONG_DEG:
+                wrong += 1
+            else:
+                errors.append(error)
+        median_m, median_deg = np.median(errors, axis=0).tolist() if errors else (np.nan, np.nan)
+        return cls(len(seconds), len(errors), wrong, median_m, median_deg, float(np.median(seconds)))
+
+    def line(self) -> str:
+        """Return one line for a person."""
+        return (
+            f"{self.frames} frames: {self.right} right ({1e3 * self.error_m:.0f} mm, {self.error_deg:.1f} deg), "
+            f"{self.wrong} wrong, {self.frames - self.right - self.wrong} refused; {self.seconds:.2f} s CPU time each"
+        )
+
+
+def _error(found: Float64[ndarray, "4 4"], true: Float64[ndarray, "4 4"]) -> tuple[float, float]:
+    return translation_m(found, true), rotation_angle_deg(found, true)
+
+
+def configure_places(parser: CommandParser) -> None:
+    """Add the options of `bench places`."""
+    Program.of(
+        *(PlacesOptions, SourceSettings),
+        flags="frames size elsewhere mirror threads json",
+        positional="place source",
+        omit=("test-every", "camera-correction", "register-depth"),
+    ).add_to(parser)
+    parser.set_defaults(run=run_places)
+
+
+def run_places(options: argparse.Namespace) -> int:
+    """Localise the selected frames and print the result."""
+    saved, source = SavedMap.read(options.place), open_source(options.source, options.up)
+    size, positions = frame_size(options.size, source), select_frames(source, options.frames)
+    frames = (source.frame(position, size) for position in positions)
+    if options.mirror:
+        frames = (mirrored(frame) for frame in frames)
+    places = saved.places(view_map(saved.gaussians, threads=options.threads))
+    score = PlaceScore.of(places, frames, options.elsewhere or options.mirror)
+    print(as_text(asdict(score)) if options.json else score.line())
+    return 0
+
+
+def mirrored(frame: Frame) -> Frame:
+    """Return the frame with its images mirrored."""
+    rgb, depth_m = (np.ascontiguousarray(image[:, ::-1]) for image in (frame.rgb, frame.depth_m))
+    return replace(frame, rgb=rgb, depth_m=depth_m, recorded_rgb=None)
