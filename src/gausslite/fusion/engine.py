@@ -129,11 +129,10 @@ class FusionEngine:
         self._storage = StorageProbe(store)
         self._acknowledgements = Acknowledgements()
         self._merged_objects = MergedObjects()
-        if first_revision is None:
-            first_revision = time.time_ns() // 1000
+        first = time.time_ns() // 1000 if first_revision is None else first_revision
         comparisons = fit, find
         self._mission = MissionData.open(
-            store, settings, self._lock, first_revision, decode_keyframe, comparisons, others
+            store, settings, self._lock, first, decode_keyframe, comparisons=comparisons, others=others
         )
         self._committer = UpdateCommitter(
             store, self._lock, self._decode_update, self._check_update, self._record_updates

@@ -252,7 +252,7 @@ class KeyframeStore:
         self._recent: list[WindowView] = []
         self._long_term: list[WindowView] = []
         self._buffer: list[Keyframe] = []
-        self._mapped_frames = 0
+        self._mapped_frames = self._count = 0
 
     @property
     def window(self) -> tuple[WindowView, ...]:
@@ -273,12 +273,12 @@ class KeyframeStore:
     @property
     def next_anchor(self) -> int:
         """Number of the keyframe that the next frame follows: its own, or that of the newest keyframe."""
-        return self._mapped_frames // self._settings.every
+        return self._count if self.next_is_keyframe else self._count - 1
 
     @property
     def count(self) -> int:
         """Number of keyframes of the mission."""
-        return -(-self._mapped_frames // self._settings.every)
+        return self._count
 
     @property
     def next_is_keyframe(self) -> bool:
@@ -290,6 +290,7 @@ class KeyframeStore:
         self._limit_for(view.keyframe)
         is_keyframe = self.next_is_keyframe
         self._mapped_frames += 1
+        self._count += is_keyframe
         if self._is_long_term(view):
             self._set_long_term([*self._long_term, view])
         if not is_keyframe:
@@ -378,7 +379,7 @@ class KeyframeStore:
             "recent": int_array(*(number[id(view.keyframe)] for view in self._recent)),
             "long_term": int_array(*(number[id(view.keyframe)] for view in self._long_term)),
             "buffer": int_array(*(number[id(keyframe)] for keyframe in self._buffer)),
-            "mapped_frames": int_array(self._mapped_frames),
+            "counts": int_array(self._mapped_frames, self._count),
         }
         for i, keyframe in enumerate(keyframes):
             state |= add_prefix(str(i), keyframe.state())
@@ -403,7 +404,7 @@ class KeyframeStore:
         self._buffer = [keyframes[i] for i in numbers["buffer"]]
         for keyframe in keyframes.values():
             self._limit_for(keyframe)
-        [self._mapped_frames] = get_counts(state, "mapped_frames", 1)
+        self._mapped_frames, self._count = get_counts(state, "counts", 2)
 
     def _limit_for(self, keyframe: Keyframe) -> None:
         """Reduce the limits if this image is the largest so far."""

@@ -79,7 +79,16 @@ def object_report(graph: TaskGraph, noun: str, count: int, time_ns: int) -> Obje
     """Return a report of objects of one noun, side by side on the floor, seen until this time."""
     boxes = [AxisAlignedBox((0.5 * i, 0.0, 0.0), (0.5 * i + 0.2, 0.2, 0.2)) for i in range(count)]
     landmarks = (
-        ObjectLandmark(f"{noun}-{i}", noun, ObjectRole.TARGET, (0.5 * i + 0.1, 0.1, 0.1), box, 0.8, 0, time_ns)
+        ObjectLandmark(
+            f"{noun}-{i}",
+            noun,
+            ObjectRole.TARGET,
+            (0.5 * i + 0.1, 0.1, 0.1),
+            box,
+            confidence=0.8,
+            first_seen_ns=0,
+            last_seen_ns=time_ns,
+        )
         for i, box in enumerate(boxes)
     )
     return ObjectReport(graph, tuple(landmarks))

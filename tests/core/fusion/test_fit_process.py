@@ -10,10 +10,17 @@ import threading
 
 import numpy as np
 import pytest
+from sample_gaussians import plain_gaussians
 
 from gausslite.domain.errors import UnavailableError
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.fusion.alignment import SurfaceSamples, fit_frame
+from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fit_process import FitProcess
+from gausslite.fusion.frames import AlignmentSettings
+from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.store import MissionConfig
 from gausslite.fusion.unknown_frames import find_frame
 
 _MAIN = """
@@ -57,6 +64,24 @@ def test_a_killed_process_starts_again_and_every_fit_has_the_bits_of_the_functio
     finally:
         fit.close()
     assert fit.pid is None
+
+
+@pytest.mark.parametrize("alignment", [None, AlignmentSettings()])
+def test_an_engine_starts_the_process_with_its_first_comparison_and_without_alignment_none(
+    alignment: AlignmentSettings | None,
+) -> None:
+    fit, grid = FitProcess(), VoxelGrid(0.1)
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=grid, alignment=alignment), fit=fit)
+    try:
+        for seed, name in enumerate(("ant", "bee")):
+            assert fit.pid is None
+            session = engine.join(name, MissionConfig("", "", 0.1)).session.session_id
+            voxels = group_by_voxel(plain_gaussians(corner(seed).points_m), grid)
+            engine.contribute(session, RoiSubset(name, "", 1, 1, voxels), grid)
+            engine.align_due()
+        assert (fit.pid is None) == (alignment is None)
+    finally:
+        fit.close()
 
 
 def test_a_comparison_that_raises_is_one_line_and_the_process_goes_on() -> None:

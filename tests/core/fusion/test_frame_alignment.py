@@ -360,17 +360,6 @@ def test_an_agent_that_cannot_be_compared_stays_due_and_the_others_are_compared(
     assert not engine.is_alignment_due
 
 
-def test_without_alignment_nothing_is_compared() -> None:
-    def refuse(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
-        raise AssertionError((source, target))
-
-    engine = FusionEngine(MemoryStore(), replace(SETTINGS, alignment=None), fit=refuse)
-    send(engine, "ant", corner(0))
-    send(engine, "bee", corner(1))
-    assert not engine.is_alignment_due
-    assert not engine.align_due()
-
-
 def test_agents_take_turns_and_a_single_earlier_agent_is_compared_once() -> None:
     pairs = []
 
