@@ -322,6 +322,8 @@ def decode_landmark(state: State, settings: RelevanceTrackerSettings) -> Landmar
     if (counts < 1).any() or (cells[1:] <= cells[:-1]).any() or len(cells) == 0:
         raise MapFileError("state landmark: expected ascending cells with positive counts, got others")
     seen_count, missed_count, missed_in_a_row = get_counts(state, "seen_missed", 3)
+    if not seen_count:
+        raise MapFileError("state seen_missed: expected an object that was seen at least once")
     weak_count, is_given = get_counts(state, "weak_given", 2)
     best_score, farthest_m = get_floats(state, "best_score_farthest_m", 2)
     first_ns, last_ns, number = (int(value) for value in get_array(state, "seen_ns_number", (3,), np.int64))
