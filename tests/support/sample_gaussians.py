@@ -32,6 +32,17 @@ def plain_gaussians(means_m: Any, **columns: Any) -> Gaussians:
     )
 
 
+def textured_corner(seed: int, kappa: int = 5, count: int = 3000) -> Gaussians:
+    """Samples of a textured corner of a room: a floor and two walls of 2 m."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 2, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = 0.0
+    texture = 0.5 + 0.4 * np.sin(6 * points[:, 0] + 4 * points[:, 1] + 5 * points[:, 2])
+    return plain_gaussians(
+        points + rng.normal(0, 0.002, points.shape), rgb=np.repeat(texture[:, None], 3, 1), kappa=kappa
+    )
+
+
 def random_gaussians(n: int, seed: int = 0, max_kappa: int = 100) -> Gaussians:
     """Random Gaussians with means about a metre from the origin."""
     rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ import threading
 
 import numpy as np
 import pytest
-from sample_gaussians import plain_gaussians
+from sample_gaussians import textured_corner
 
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
@@ -38,11 +38,8 @@ _NOTHING = SurfaceSamples(np.zeros((0, 3)), np.zeros(0))
 
 
 def corner(seed: int, shift_m: float = 0.0) -> SurfaceSamples:
-    """Samples of a textured corner of a room."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(0, 2, (2000, 3))
-    points[np.arange(2000), rng.integers(0, 3, 2000)] = 0.0
-    return SurfaceSamples(points + shift_m, 0.5 + 0.4 * np.sin(points @ np.array([6.0, 4.0, 5.0])))
+    gaussians = textured_corner(seed)
+    return SurfaceSamples(gaussians.means_m.astype(np.float64) + shift_m, gaussians.rgb[:, 0].astype(np.float64))
 
 
 def test_a_killed_process_starts_again_and_every_fit_has_the_bits_of_the_function() -> None:
@@ -76,7 +73,7 @@ def test_an_engine_starts_the_process_with_its_first_comparison_and_without_alig
         for seed, name in enumerate(("ant", "bee")):
             assert fit.pid is None
             session = engine.join(name, MissionConfig("", "", 0.1)).session.session_id
-            voxels = group_by_voxel(plain_gaussians(corner(seed).points_m), grid)
+            voxels = group_by_voxel(textured_corner(seed), grid)
             engine.contribute(session, RoiSubset(name, "", 1, 1, voxels), grid)
             engine.align_due()
         assert (fit.pid is None) == (alignment is None)

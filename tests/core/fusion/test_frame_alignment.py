@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
+from sample_gaussians import textured_corner as corner
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import UnavailableError
@@ -35,17 +36,6 @@ from gausslite.fusion.store import FusionStore, MissionConfig
 GRID = VoxelGrid(0.10)
 ANYTHING = MissionConfig("", "", 0.10)
 SETTINGS = FusionSettings(grid=GRID, alignment=AlignmentSettings())
-
-
-def corner(seed: int, kappa: int = 5, count: int = 3000) -> Gaussians:
-    """Samples of a textured corner of a room: a floor and two walls of 2 m."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(0, 2, (count, 3))
-    points[np.arange(count), rng.integers(0, 3, count)] = 0.0
-    texture = 0.5 + 0.4 * np.sin(6 * points[:, 0] + 4 * points[:, 1] + 5 * points[:, 2])
-    return plain_gaussians(
-        points + rng.normal(0, 0.002, points.shape), rgb=np.repeat(texture[:, None], 3, 1), kappa=kappa
-    )
 
 
 def wrong_frame(shift_m: tuple[float, float, float], angle_deg: float = 0.0) -> np.ndarray:

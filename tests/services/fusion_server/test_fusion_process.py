@@ -10,10 +10,9 @@ import sys
 import urllib.request
 from pathlib import Path
 
-import numpy as np
 import pytest
 from fusion_running import COMMAND, GRID, make_subset, request, server_process
-from sample_gaussians import plain_gaussians
+from sample_gaussians import textured_corner
 from waiting import wait_until
 
 from gausslite.codec.ply import gaussians_from_ply
@@ -70,22 +69,13 @@ def children(pid: int) -> list[int]:
     return found
 
 
-def room_corner(agent_id: str, seed: int) -> RoiSubset:
-    """Gaussians on a floor and two walls of 2 m with a texture."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(0, 2, (3000, 3))
-    points[np.arange(3000), rng.integers(0, 3, 3000)] = 0.0
-    texture = 0.5 + 0.4 * np.sin(points @ np.array([6.0, 4.0, 5.0]))
-    gaussians = plain_gaussians(points, rgb=np.repeat(texture[:, None], 3, 1), kappa=5)
-    return RoiSubset(agent_id, "", 1, 1, group_by_voxel(gaussians, GRID))
-
-
 def test_frames_are_compared_in_a_process_that_ends_with_the_server(tmp_path: Path) -> None:
     log = tmp_path / "log"
     with server_process(log=log) as (process, client):
         for seed, name in enumerate(("ant", "bee")):
             session = client.join(name, GRID).session_id
-            list(client.contribute([request(session, room_corner(name, seed))], 20.0))
+            subset = RoiSubset(name, "", 1, 1, group_by_voxel(textured_corner(seed), GRID))
+            list(client.contribute([request(session, subset)], 20.0))
         wait_until(lambda: client.status().agents[1].alignment.state == pb.ALIGNMENT_STATE_ALIGNED)
         [child] = children(process.pid)
         process.send_signal(signal.SIGTERM)

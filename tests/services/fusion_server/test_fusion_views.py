@@ -9,12 +9,15 @@ import grpc
 import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
+from sample_gaussians import textured_corner
+from waiting import wait_until
 
 from gausslite.domain.camera import Camera
-from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError
+from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError, UnavailableError
 from gausslite.domain.pose import transform_of
-from gausslite.domain.voxels import empty_batch
+from gausslite.domain.voxels import RoiSubset, empty_batch, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
@@ -23,6 +26,7 @@ from gausslite.fusion.store import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
+from gausslite_fusion_server import servicer
 
 CELLS = {0: [5, 6], 1: [7], 2: [1, 1]}
 
@@ -144,3 +148,26 @@ def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the
             assert np.array_equal(shown.rgb, alone.rgb)
             assert np.array_equal(shown.depth_m, alone.depth_m)
     assert not shown.rgb.any()
+
+
+def test_frames_that_could_not_be_compared_are_compared_later_without_another_message(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    failures, align_due = [UnavailableError("killed")], FusionEngine.align_due
+
+    def fail_once(engine: FusionEngine, at_most: int | None = None) -> bool:
+        if engine.is_alignment_due and failures:
+            raise failures.pop()
+        return align_due(engine, at_most)
+
+    monkeypatch.setattr(FusionEngine, "align_due", fail_once)
+    monkeypatch.setattr(servicer, "_ALIGN_RETRY_S", 0.0)
+    with fusion_server(settings=FusionSettings(grid=GRID, alignment=AlignmentSettings())) as server:
+        for seed, name in enumerate(("ant", "bee")):
+            session = server.client.join(name, GRID).session_id
+            subset = RoiSubset(name, "", 1, 1, group_by_voxel(textured_corner(seed), GRID))
+            server.contribute_subsets(session, subset)
+        wait_until(lambda: server.client.status().agents[1].alignment.state == pb.ALIGNMENT_STATE_ALIGNED)
+    assert [record.message for record in caplog.records if record.levelname == "ERROR"] == [
+        "frames are not compared, again in 0 s: killed"
+    ]
