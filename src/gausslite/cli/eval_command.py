@@ -145,6 +145,7 @@ class _Conditions:
 
     fit_views: their pose and exposure are fitted first. trajectory: returns the tracked pose at a time in nanoseconds;
     None to start from the given poses. corrections: those published with the map; None if there are none to score.
+    fits_corrected: fits start from the corrected poses, because loops may have moved the map beyond the range of a fit.
     lpips: None if it is not scored.
     """
 
@@ -152,7 +153,15 @@ class _Conditions:
     fit_views: bool
     trajectory: Callable[[int], Float64[ndarray, "4 4"]] | None
     corrections: CorrectionTrack | None
+    fits_corrected: bool
     lpips: Lpips | None
+
+    def start_of_fit(self, frame: Frame) -> Frame:
+        """Return the frame with the pose from which its fit starts."""
+        if self.corrections is None or not self.fits_corrected:
+            return frame
+        T_map_odometry = self.corrections.interpolated(frame.capture_time_ns)
+        return replace(frame, T_world_camera=T_map_odometry @ frame.T_world_camera)
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> _Conditions:
@@ -177,10 +186,12 @@ class _Conditions:
         # views are scored from the poses as they are, or fitted; `map` has compared them with the images
         stated = replace(stated_values(registration, correction, PoseExposurePrior()), checked=True)
         if poses == PoseMode.TRACK:
-            return cls(stated, fit_views, read_trajectory(options.map.parent), None, lpips)
+            return cls(stated, fit_views, read_trajectory(options.map.parent), None, False, lpips)
         corrections = read_corrections(options.map.parent)
         corrections = None if corrections is None or corrections.is_identity else corrections
-        return cls(stated, fit_views, None, corrections, lpips)
+        loops = report.get("loops")
+        was_moved = isinstance(loops, dict) and bool(loops.get("corrections"))
+        return cls(stated, fit_views, None, corrections, was_moved, lpips)
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +261,8 @@ def _score_views(
         view = HeldOutView.of(frame, regions)
         if not view.frame.has_depth:
             continue
-        rendered = render_fitted(viewer, view.frame) if conditions.fit_views else viewer.render_frame(view.frame)
+        start = conditions.start_of_fit(view.frame)
+        rendered = render_fitted(viewer, start) if conditions.fit_views else viewer.render_frame(view.frame)
         scores.append(score_view(rendered, view, conditions.lpips))
         if corrected is not None:
             corrected.add(viewer, view)

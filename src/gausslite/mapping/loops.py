@@ -59,7 +59,7 @@ class LoopCounts:
         if not (self.corrections or self.refused or self.rejected or self.withdrawn):
             return ""
         return (
-            f"loops: the map was corrected {self.corrections} times; not used: {self.refused} contradict the map, "
+            f"loops: corrections of the map {self.corrections}; not used: {self.refused} contradict the map, "
             f"{self.rejected} other loops; taken back: {self.withdrawn}"
         )
 

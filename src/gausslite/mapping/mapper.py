@@ -146,13 +146,14 @@ class GaussianMapper:
             view = self._prepare_view(frame, relevance)
         self._refiner.history.record(frame, view.keyframe.frame.T_world_camera)
         seeded = 0 if scheduler.skips(SkippableStage.SEEDING) else self._seed(view.keyframe, rendered, scheduler)
+        motions = self._close_loop(frame, view.keyframe, scheduler) if self._keyframes.next_is_keyframe else None
+        if motions is not None:
+            view = self._window_view(view.keyframe.moved(motions))
         iterations = self._train(view, scheduler)
-        is_keyframe = self._keyframes.next_is_keyframe
         self._keyframes.add(view)
         if self._has_prior and self._keyframes.buffer[-1] is view.keyframe:
             self._revise(view.keyframe)
         self._revision += 1
-        motions = self._close_loop(frame, view.keyframe, scheduler) if is_keyframe else None
         return MappedFrame(
             frame.index,
             seeded,
@@ -353,8 +354,9 @@ class GaussianMapper:
         """
         if self._loops is None:
             return None
+        search = scheduler.has_time_for(Stage.LOOP_CLOSURE)
         with scheduler.timing(Stage.LOOP_CLOSURE):
-            motions = self._loops.add(keyframe, prior, self._keyframes.kept)
+            motions = self._loops.add(keyframe, prior, self._keyframes.kept if search else ())
             if motions is None:
                 return None
             move_with_anchors(self._table, motions)

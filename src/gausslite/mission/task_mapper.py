@@ -190,9 +190,9 @@ class TaskMapper:
         reevaluation = self._reevaluate_keyframes()
         mapped = self._mapper.map_frame(frame, estimate.relevance, self._scheduler, view, odometry)
         if self._tracker is not None and mapped.T_world_camera is not None:
-            self._tracker.confirm(mapped.T_world_camera, mapped.anchor)
             if mapped.T_corrected_earlier is not None:
                 self._tracker.move(mapped.T_corrected_earlier)
+            self._tracker.confirm(mapped.T_world_camera, mapped.anchor)
         changed_roi = self._publish_changed_roi() if mapped.skipped is None else None
         return FrameOutcome(
             index=frame.index,

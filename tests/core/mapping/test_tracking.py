@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from mapping_scenes import wall_frame
 
 from gausslite.calibration.alignment import align
 from gausslite.calibration.features import detect_features, relative_pose
@@ -17,7 +18,7 @@ from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, rotation_angle_deg, transform_of, translation_m
 from gausslite.evaluation.metrics import trajectory_error
-from gausslite.mapping.tracking import CameraTracker
+from gausslite.mapping.tracking import CameraTracker, KeyframeIndex
 from gausslite.mission.build import build_mapper, build_tracker
 from gausslite.mission.settings import MissionSettings, PoseMode
 from gausslite.mission.task_mapper import TaskMapper
@@ -164,3 +165,11 @@ def test_a_forged_state_is_refused(name: str) -> None:
     restored = CameraTracker(lambda camera, T_world_camera, motion: as_rendering(walk()[2]))
     with pytest.raises(GaussLiteError, match="state"):
         restored.restore(state)
+
+
+def test_tracked_poses_move_with_their_keyframes() -> None:
+    index, frame = KeyframeIndex(), wall_frame()
+    for anchor, x_m in enumerate((0.0, 1.0)):
+        index.add(detect_features(frame), transform_of(np.array([x_m, 0, 0, 0, 0, 0])), anchor)
+    index.move(np.array([np.eye(4), transform_of(np.array([0, 0.5, 0, 0, 0, 0]))]))
+    np.testing.assert_allclose(index.state()["T_world_camera"][:, :3, 3], [[0, 0, 0], [1, 0.5, 0]])
