@@ -206,7 +206,8 @@ class _Search:
         return bool(away_m > _APART_M or rotation_angle_deg(one, other) > _APART_DEG)
 
     def _shared(self, moved: SurfaceSamples) -> Bool[ndarray, " n"]:
-        return self._is_held_out & in_shared_cubes(moved.points_m, self._target.points_m)
+        shared: Bool[ndarray, " n"] = self._is_held_out & in_shared_cubes(moved.points_m, self._target.points_m)
+        return shared
 
     def _registered(
         self, cloud: small_gicp.PointCloud, T: Float64[ndarray, "4 4"], reaches_m: Sequence[float] = _REACH_M
