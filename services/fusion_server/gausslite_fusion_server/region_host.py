@@ -97,11 +97,11 @@ class RegionHost:
 
         Raises MismatchError, CodecError for a mission that it cannot serve, StorageError if the first look fails.
         """
-        await self._follow()
+        await self._look()
         while True:
             await asyncio.sleep(_POLL_S)
             try:
-                await self._follow()
+                await self._look()
                 if self._failure:
                     _log.info("server %s: it shares the store again", self.server)
                 self._failure = ""
@@ -114,6 +114,15 @@ class RegionHost:
         """Close the engine and give all slots up."""
         await self._close_local()
         await asyncio.to_thread(self._slots.close)
+
+    async def _look(self) -> None:
+        """Follow the owners once; a cancellation waits for its end, so that no opened store is left behind."""
+        looking = asyncio.ensure_future(self._follow())
+        try:
+            await asyncio.shield(looking)
+        except asyncio.CancelledError:
+            await asyncio.gather(looking, return_exceptions=True)
+            raise
 
     async def _follow(self) -> None:
         owners = await asyncio.to_thread(self._slots.owners)
