@@ -18,8 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
@@ -39,7 +37,7 @@ from gausslite.perception.pointing import pointed_masks
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import CameraView
-from gausslite_agent.background import IdleTraining, KeyframeUpload
+from gausslite_agent.background import IdleTraining, KeyframeUpload, newest_camera_view
 from gausslite_agent.prior import LOCALISING, PriorFrames
 from gausslite_agent.settings import LoadSettings, QueuePolicy
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
@@ -90,30 +88,10 @@ class FrameQueue:
             return not self._frames
 
 
-_NS_PER_S = 1e9
-
-
-def newest_camera_view(mapper: GaussianMapper, detected: DetectedImage | None) -> CameraView | None:
-    """Return the newest keyframe, the camera's path and the newest detection; None before the first keyframe."""
-    keyframes = mapper.keyframes()
-    if not keyframes:
-        return None
-    newest, trajectory = keyframes[-1], mapper.poses.trajectory()
-    return CameraView(
-        rgb=newest.as_recorded.rgb,
-        roi=newest.relevance.roi,
-        camera=newest.frame.camera,
-        frame_index=newest.frame.index,
-        T_world_camera=newest.frame.T_world_camera,
-        times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
-        path=trajectory.T_world_camera,
-        keyframes=np.stack([keyframe.frame.T_world_camera for keyframe in keyframes]),
-        detected=detected,
-    )
+_Result = TypeVar("_Result")
 
 
 _log = logging.getLogger(__name__)
-_Result = TypeVar("_Result")
 
 
 class MappingWorker:

@@ -16,7 +16,7 @@ from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import TeamObjects
 from gausslite.fusion.store import FusionStore, SharedRows
-from gausslite.fusion.traffic import TrafficLog
+from gausslite.fusion.traffic import AgentContribution, MissionStatus, TrafficLog
 from gausslite.fusion.unknown_frames import Find, UnknownFrames
 from gausslite.fusion.updates import UpdateChecks
 from gausslite.fusion.vote_input import VoteInput
@@ -77,4 +77,34 @@ class MissionData:
             unknown_frames=UnknownFrames(store, alignments, aligner, keyframes, lock, comparisons[1]),
             maps=maps,
             agents=AgentData(store, votes, maps, alignments, aligner, of_agents),
+        )
+
+    def status(self, store: FusionStore) -> MissionStatus:
+        """Return the totals of the mission and of each agent. Call it with the engine's lock."""
+        fused_voxels, fused_gaussians = self.maps.size()
+        return MissionStatus(
+            mission_config=self.members.mission_config,
+            revision=self.maps.revision(),
+            fused_gaussians=fused_gaussians,
+            fused_voxels=fused_voxels,
+            keyframes=len(self.keyframes),
+            refined=self.maps.is_refined,
+            agents=tuple(self._contribution(store, agent_id) for agent_id in sorted(self.members.sources)),
+            banned_agents=self.members.banned,
+        )
+
+    def _contribution(self, store: FusionStore, agent_id: str) -> AgentContribution:
+        totals = store.totals(agent_id)
+        return AgentContribution(
+            agent_id,
+            joined=agent_id in self.members.joined,
+            voxels=totals.occupied_voxels,
+            gaussians=totals.gaussians,
+            kappa_sum=totals.kappa_sum,
+            won_voxels=self.maps.won_voxels(agent_id),
+            last_update_seq=totals.highest_update_seq,
+            keyframes=self.keyframes.count(agent_id),
+            targets=self.objects.targets(agent_id),
+            alignment=self.alignments.get(agent_id),
+            traffic=self.traffic.of(agent_id),
         )
