@@ -36,8 +36,8 @@ class FrameSearchTrial:
     yaw_deg: float
     outcome: str
     reason: str
-    error_m: float
-    error_deg: float
+    error_m: float | None
+    error_deg: float | None
     cpu_s: float
 
 
@@ -49,18 +49,19 @@ def search_frames(
     maps = [(name, _samples_of(team, grid), _samples_of(agent, grid)) for name, team, agent in scenes]
     for i, (name, team, own) in enumerate(maps):
         others = [other for j, (_, _, other) in enumerate(maps) if j != i]
-        for data in (VOXELS, KEYFRAMES, BOTH):
+        for data, whole in own.items():
+            if not len(whole):
+                continue
             for _ in range(count):
-                whole = own[data]
                 places = {SAME: whole, PART: _part_of(whole, rng), MIRRORED: _mirrored(whole)}
                 if others:
                     places[OTHER] = others[int(rng.integers(len(others)))][data]
                 for place, source in places.items():
-                    yield _search(f"{name}", place, data, (source, team[data]), rng)
+                    yield _search(name, place, data, (source, team[data]), rng)
 
 
 def searches_table(trials: Sequence[FrameSearchTrial]) -> str:
-    """Return the outcomes by place and data; errors: median and largest of the aligned ones."""
+    """Return the outcomes by place and data; errors: median and largest, without those that abstained."""
     outcomes = (ALIGNED, ABSTAINED, WRONG)
     lines = [
         f"| the agent has | data | searches | {' | '.join(outcomes)} | error, mm | error, deg | CPU, s |",
@@ -72,11 +73,10 @@ def searches_table(trials: Sequence[FrameSearchTrial]) -> str:
             if not own:
                 continue
             counts = Counter(trial.outcome for trial in own)
-            aligned = [trial for trial in own if trial.outcome == ALIGNED]
             cells = " | ".join(str(counts[outcome]) for outcome in outcomes)
             errors = (
-                _median_and_largest([1e3 * trial.error_m for trial in aligned], 0),
-                _median_and_largest([trial.error_deg for trial in aligned], 2),
+                _median_and_largest([1e3 * trial.error_m for trial in own if trial.error_m is not None], 0),
+                _median_and_largest([trial.error_deg for trial in own if trial.error_deg is not None], 2),
                 _median_and_largest([trial.cpu_s for trial in own], 1),
             )
             lines.append(f"| {place} | {data} | {len(own)} | {cells} | {' | '.join(errors)} |")
@@ -108,12 +108,22 @@ def _search(
     start_s = time.process_time()
     found = find_frame(source.moved(T_agent_scene), target)
     cpu_s = time.process_time() - start_s
-    if found.fit is None:
-        return FrameSearchTrial(scene, place, data, yaw_deg, ABSTAINED, found.reason, np.nan, np.nan, cpu_s)
-    error_m, error_deg = _error(found.fit.motion @ T_agent_scene, source)
-    is_right = place in (SAME, PART) and error_m < _MAX_ERROR_M and error_deg < _MAX_ERROR_DEG
-    outcome = ALIGNED if is_right else WRONG
-    return FrameSearchTrial(scene, place, data, yaw_deg, outcome, "", error_m, error_deg, cpu_s)
+    error_m, error_deg, outcome = None, None, ABSTAINED
+    if found.fit is not None:
+        error_m, error_deg = _error(found.fit.motion @ T_agent_scene, source)
+        is_right = place in (SAME, PART) and error_m < _MAX_ERROR_M and error_deg < _MAX_ERROR_DEG
+        outcome = ALIGNED if is_right else WRONG
+    return FrameSearchTrial(
+        scene=scene,
+        place=place,
+        data=data,
+        yaw_deg=yaw_deg,
+        outcome=outcome,
+        reason=found.reason,
+        error_m=error_m,
+        error_deg=error_deg,
+        cpu_s=cpu_s,
+    )
 
 
 def _error(motion: Float64[ndarray, "4 4"], samples: SurfaceSamples) -> tuple[float, float]:
