@@ -142,7 +142,7 @@ class _Search:
     def matched_motions(
         self, source: SurfaceSamples, target: SurfaceSamples, spacings_m: Sequence[float]
     ) -> Iterator[Float64[ndarray, "4 4"]]:
-        """Yield the motions that matches of point features of these samples propose, refined on all samples."""
+        """Yield the motions that matches of point features of these samples propose, refined on the first half."""
         for spacing_m in spacings_m:
             own, theirs = (Surface.sampled(samples.points_m, spacing_m) for samples in (source, target))
             proposed = matched_motion(own, theirs, min_inliers=_MIN_INLIERS)
