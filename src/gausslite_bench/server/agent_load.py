@@ -84,7 +84,7 @@ class AgentLoad:
         times_s, refused = asyncio.run(self._send(sessions, messages))
         p50, p99, longest = np.percentile(times_s or [np.inf], [50, 99, 100]) * 1000
         total = agents * count
-        return LoadResult(agents, total, float(p50), float(p99), total - len(times_s), float(longest), refused)
+        return LoadResult(agents, total, float(p50), float(p99), total - len(times_s), float(longest), refused=refused)
 
     async def _send_all(self, session_id: str, messages: Sequence[bytes]) -> None:
         async with UpdateStreams(self._addresses[0]) as streams:
