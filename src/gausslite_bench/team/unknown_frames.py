@@ -108,7 +108,6 @@ def _search(
     start_s = time.process_time()
     found = find_frame(source.moved(T_agent_scene), target)
     cpu_s = time.process_time() - start_s
-<<<<<<< ours
     error_m, error_deg, outcome = None, None, ABSTAINED
     if found.fit is not None:
         error_m, error_deg = _error(found.fit.motion @ T_agent_scene, source)
@@ -125,15 +124,6 @@ def _search(
         error_deg=error_deg,
         cpu_s=cpu_s,
     )
-=======
-    if found.fit is None:
-        missing = {"error_m": np.nan, "error_deg": np.nan}
-        return FrameSearchTrial(scene, place, data, yaw_deg, ABSTAINED, found.reason, cpu_s=cpu_s, **missing)
-    error_m, error_deg = _error(found.fit.motion @ T_agent_scene, source)
-    is_right = place in (SAME, PART) and error_m < _MAX_ERROR_M and error_deg < _MAX_ERROR_DEG
-    outcome = ALIGNED if is_right else WRONG
-    return FrameSearchTrial(scene, place, data, yaw_deg, outcome, "", error_m=error_m, error_deg=error_deg, cpu_s=cpu_s)
->>>>>>> theirs
 
 
 def _error(motion: Float64[ndarray, "4 4"], samples: SurfaceSamples) -> tuple[float, float]:
