@@ -18,6 +18,7 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.pose_graph import Loop, PoseGraph, require_graph_solver
@@ -36,7 +37,9 @@ _MAX_DISTANCE = 1.5
 _MIN_SIMILARITY = 0.6
 """Of the descriptors of a candidate by appearance."""
 _SETTLED_M, _SETTLED_DEG = 0.015, 0.5
-"""A loop that the poses contradict by less moves nothing until another one does."""
+_SETTLED_STDS = 2.0 * 2.0**0.5
+"""A loop that the poses contradict by less than these, or by less than this many standard deviations of a pose's error,
+moves nothing until another one does: it is noise of single poses and no drift."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +70,14 @@ class LoopCounts:
 class LoopCloser:
     """Finds loops of the map in `table` and owns the pose graph of its keyframes. Not thread-safe."""
 
-    def __init__(self, table: SplatTable, rasterizer: Rasterizer) -> None:
-        """Raises InvalidInputError if GTSAM is not installed."""
+    def __init__(self, table: SplatTable, rasterizer: Rasterizer, prior: PoseExposurePrior) -> None:
+        """Prior: of the error of single poses. Raises InvalidInputError if GTSAM is not installed."""
         require_graph_solver()
         self._table = table
         self._rasterizer = rasterizer
         self._graph = PoseGraph()
+        self._settled_m = max(_SETTLED_M, _SETTLED_STDS * prior.translation_m)
+        self._settled_deg = max(_SETTLED_DEG, _SETTLED_STDS * prior.rotation_deg)
         self._descriptors: list[PlaceDescriptor] = []
         self._refused = self._withdrawn = self._corrections = 0
 
@@ -184,7 +189,7 @@ class LoopCloser:
     def _is_settled(self, loop: Loop) -> bool:
         """True if the poses agree with a loop, so that it does not move the map."""
         error_m, error_deg = self._graph.residual(loop)
-        return error_m < _SETTLED_M and error_deg < _SETTLED_DEG
+        return error_m < self._settled_m and error_deg < self._settled_deg
 
 
 def _distance(a: Frame, b: Frame) -> float:

@@ -88,7 +88,7 @@ class GaussianMapper:
         )
         self._refiner = ViewRefiner(refinement, self.render)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
-        self._loops = LoopCloser(self._table, rasterizer) if settings.closes_loops else None
+        self._loops = LoopCloser(self._table, rasterizer, settings.pose_prior) if settings.closes_loops else None
         self._T_corrected_odometry: Float64[ndarray, "4 4"] | None = None
         self._extent_m = 0.0
         self._revision = 0
