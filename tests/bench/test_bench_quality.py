@@ -67,8 +67,9 @@ def test_tasks_are_selected_by_name_or_home() -> None:
 def test_components_are_enabled_one_by_one() -> None:
     variants = cumulative_variants()
     label_textures = [variant.label for variant in variants]
-    beyond = ["+long-term-keyframes", "+roi-context", "+depth-edge-mask", "+background-reserve", "+ema", "+lr-decay"]
-    assert label_textures == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *beyond, "+saturation"]
+    views = ["+long-term-keyframes", "+roi-context", "+depth-edge-mask"]
+    others = ["+depth-fill", "+background-reserve", "+ema", "+lr-decay", "+saturation"]
+    assert label_textures == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *views, *others]
     off = [variant.disabled for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))
     assert not off[-1]

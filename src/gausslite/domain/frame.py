@@ -67,6 +67,35 @@ class ClockJumps:
         self._late_ns.clear()
 
 
+def with_filled_depth(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+    """Return a copy where blocks of 4x4 pixels without a measurement have a depth; without such blocks the image.
+
+    It is the largest depth measured in the smallest block of 8x8, 16x16, 32x32, ... pixels around them that has a
+    measurement: what is placed there hides no surface that was measured. All pixels stay 0 if none is measured.
+    Single pixels without a measurement stay 0 too; what is placed at their neighbours covers them.
+    """
+    levels = [_block_maxima(_block_maxima(depth_m))]
+    if levels[0].all():
+        return depth_m
+    while not levels[-1].all() and levels[-1].size > 1:
+        levels.append(_block_maxima(levels[-1]))
+    filled = levels[-1]
+    for finer in reversed(levels[:-1]):
+        filled = np.where(finer > 0, finer, _repeated(filled, 2, finer.shape))
+    return np.maximum(depth_m, _repeated(np.where(levels[0] > 0, np.float32(0.0), filled), 4, depth_m.shape))
+
+
+def _block_maxima(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
+    """Return the maxima of the blocks of 2x2 pixels."""
+    padded = np.pad(image, [(0, side % 2) for side in image.shape])
+    return np.maximum.reduce([padded[row::2, column::2] for row in (0, 1) for column in (0, 1)])
+
+
+def _repeated(blocks: Float32[ndarray, "bh bw"], times: int, shape: tuple[int, ...]) -> Float32[ndarray, "h w"]:
+    """Return an image of this shape where each block's value is repeated along both axes."""
+    return np.repeat(np.repeat(blocks, times, axis=0), times, axis=1)[: shape[0], : shape[1]]
+
+
 MAX_COORDINATE_M = 10_000.0
 """Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
 

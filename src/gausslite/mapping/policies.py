@@ -2,11 +2,11 @@
 
 A baseline follows no task; seeding, scales, loss weights and density control are those of its system's released
 configuration. Everything else is common to all policies: Adam's rates (ONLINE_RATES), the density limit of seeds near
-the cap, clone and split that preserve appearance, pose refinement, and the views to train on. With so few iterations,
-the released rates would lose several decibels. The task policy trains on the 24 most recent keyframes and 24 frames
-that show the ROI; the baselines train on the 24 most recent keyframes and 24 others, spread over the mission. Two
-values were tuned in the baselines' favour (bench/results): the initial scale of MonoGS and the number of SplaTAM's
-seeds.
+the cap, seeds where no depth is measured, clone and split that preserve appearance, pose refinement, and the views to
+train on. With so few iterations, the released rates would lose several decibels. The task policy trains on the 24 most
+recent keyframes and 24 frames that show the ROI; the baselines train on the 24 most recent keyframes and 24 others,
+spread over the mission. Two values were tuned in the baselines' favour (bench/results): the initial scale of MonoGS and
+the number of SplaTAM's seeds.
 """
 
 from __future__ import annotations
@@ -102,6 +102,7 @@ def paper_policy() -> MapperSettings:
             fill_sparse_roi=False,
             min_density_ratio=1.0,
             background_share=0.0,
+            fill_depth=False,
         ),
         keyframes=KeyframeSettings(
             long_term_keyframes=0, roi_context_weight=0.0, pose_updates_per_frame=0, depth_edge_px=0
@@ -161,6 +162,10 @@ def _without_depth_edge_mask(settings: MapperSettings) -> MapperSettings:
     return replace(settings, keyframes=replace(settings.keyframes, depth_edge_px=0))
 
 
+def _without_depth_fill(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, seeding=replace(settings.seeding, fill_depth=False))
+
+
 def _without_background_reserve(settings: MapperSettings) -> MapperSettings:
     return replace(settings, seeding=replace(settings.seeding, background_share=0.0))
 
@@ -181,6 +186,7 @@ EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "long-term-keyframes": _without_long_term_keyframes,
     "roi-context": _without_roi_context,
     "depth-edge-mask": _without_depth_edge_mask,
+    "depth-fill": _without_depth_fill,
     "background-reserve": _without_background_reserve,
     "ema": _without_ema,
     "lr-decay": _without_lr_decay,

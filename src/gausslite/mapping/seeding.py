@@ -10,7 +10,7 @@ there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.camera import Camera, lift, project
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import Frame, with_filled_depth
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import RelevanceMap
@@ -256,10 +256,12 @@ class Seeder:
     def seed(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> Seeds:
         """Return new Gaussians for this frame."""
         pixel_weights = self._pixel_weights(frame)
-        roi_pool, background_pool = self._split_budget(frame, relevance, context)
+        # only measured depth tells what the map lacks
+        surface = replace(frame, depth_m=with_filled_depth(frame.depth_m)) if self._settings.fill_depth else frame
+        roi_pool, background_pool = self._split_budget(frame, surface, relevance, context)
         return Seeds(
-            roi=self._draw(frame, relevance, roi_pool, pixel_weights),
-            background=self._draw(frame, relevance, background_pool, pixel_weights),
+            roi=self._draw(surface, relevance, roi_pool, pixel_weights),
+            background=self._draw(surface, relevance, background_pool, pixel_weights),
         )
 
     def seed_roi(self, frame: Frame, relevance: RelevanceMap, active_means_m: Float32[ndarray, "n 3"]) -> Gaussians:
@@ -275,14 +277,16 @@ class Seeder:
         budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
         return self._draw(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weights(frame))
 
-    def _split_budget(self, frame: Frame, relevance: RelevanceMap, context: SeedingContext) -> tuple[_Pool, _Pool]:
+    def _split_budget(
+        self, frame: Frame, surface: Frame, relevance: RelevanceMap, context: SeedingContext
+    ) -> tuple[_Pool, _Pool]:
         """SB (Sec. III-C.1): split N into floor(ρN) ROI seeds and the background's; without SB all are background.
 
-        Only pixels that the map does not explain yet are candidates.
+        Only pixels that the map does not explain yet are candidates. surface: the frame with the depth of the seeds.
         """
         settings = self._settings
         budget = self._budget(frame, context)
-        seedable = (frame.depth_m > 0) & (frame.depth_m <= settings.max_depth_m)
+        seedable = (surface.depth_m > 0) & (surface.depth_m <= settings.max_depth_m)
         roi_candidates = candidates = seedable
         if context.rendered is not None:
             behind = rendered_behind(frame, context.rendered, settings.depth_error_factor)

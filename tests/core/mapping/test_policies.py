@@ -62,6 +62,7 @@ def test_the_paper_policy_has_the_settings_of_the_paper() -> None:
     assert (seeding.first_frame_seeds, seeding.later_seeds) == (60_000, 10_000)
     assert (seeding.min_alpha, seeding.roi_min_alpha, seeding.depth_error_factor) == (0.6, 0.6, 40.0)
     assert not seeding.fill_sparse_roi
+    assert not seeding.fill_depth
     assert seeding.background_share == 0.0
     assert (keyframes.every, keyframes.window, keyframes.long_term_keyframes) == (5, 24, 0)
     assert (keyframes.roi_context_weight, keyframes.depth_edge_px) == (0.0, 0)

@@ -95,12 +95,21 @@ def test_with_fewer_free_slots_seeds_get_sparser_and_larger() -> None:
     assert np.median(plenty.scales_m) < np.median(scarce.scales_m) < np.median(full.scales_m)
 
 
-def test_pixels_without_depth_or_beyond_the_maximum_are_not_seeded() -> None:
+@pytest.mark.parametrize("fill_depth", [False, True])
+def test_pixels_without_depth_are_seeded_at_the_depth_around_and_those_beyond_the_maximum_are_not(
+    fill_depth: bool,
+) -> None:
     frame = wall_frame()
-    frame.depth_m[:, :32] = 0.0
+    frame.depth_m[:, :16] = 0.0
+    frame.depth_m[:, 16:18] = 3.0
     frame.depth_m[:, 48:] = 11.0
-    background = seeder(sis=True).seed(frame, RelevanceMap.empty(48, 64), EMPTY).background
-    np.testing.assert_allclose(background.means_m[:, 2], 2.0, rtol=1e-6)
+    settings = SeedingSettings(fill_depth=fill_depth)
+    background = seeder(settings, sis=True).seed(frame, RelevanceMap.empty(48, 64), EMPTY).background
+    columns = background.means_m[:, 0] / background.means_m[:, 2] * 64 + 32
+    assert (columns < 16).any() == fill_depth
+    np.testing.assert_allclose(background.means_m[columns < 18, 2], 3.0, rtol=1e-6)
+    np.testing.assert_allclose(background.means_m[columns > 18, 2], 2.0, rtol=1e-6)
+    assert (columns < 48).all()
 
 
 def test_pixels_rendered_behind_the_measured_surface_are_found_but_not_those_in_front() -> None:
