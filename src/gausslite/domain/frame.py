@@ -82,18 +82,23 @@ def with_filled_depth(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w
     filled = levels[-1]
     for finer in reversed(levels[:-1]):
         filled = np.where(finer > 0, finer, _repeated(filled, 2, finer.shape))
-    return np.maximum(depth_m, _repeated(np.where(levels[0] > 0, np.float32(0.0), filled), 4, depth_m.shape))
+    unmeasured = np.where(levels[0] > 0, np.float32(0.0), filled)
+    result: Float32[ndarray, "h w"] = np.maximum(depth_m, _repeated(unmeasured, 4, depth_m.shape))
+    return result
 
 
 def _block_maxima(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
     """Return the maxima of the blocks of 2x2 pixels."""
     padded = np.pad(image, [(0, side % 2) for side in image.shape])
-    return np.maximum.reduce([padded[row::2, column::2] for row in (0, 1) for column in (0, 1)])
+    quarters = [padded[row::2, column::2] for row in (0, 1) for column in (0, 1)]
+    maxima: Float32[ndarray, "bh bw"] = np.maximum.reduce(quarters)
+    return maxima
 
 
 def _repeated(blocks: Float32[ndarray, "bh bw"], times: int, shape: tuple[int, ...]) -> Float32[ndarray, "h w"]:
     """Return an image of this shape where each block's value is repeated along both axes."""
-    return np.repeat(np.repeat(blocks, times, axis=0), times, axis=1)[: shape[0], : shape[1]]
+    image: Float32[ndarray, "h w"] = np.repeat(np.repeat(blocks, times, axis=0), times, axis=1)
+    return image[: shape[0], : shape[1]]
 
 
 MAX_COORDINATE_M = 10_000.0
