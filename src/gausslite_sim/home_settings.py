@@ -14,7 +14,7 @@ TRAJECTORY_COUNT = 3
 _SIDES_PX = (16, 4096)
 _NUMBER = r"-?[0-9]{1,2}(?:\.[0-9]{1,3})?"
 _CHANGES = re.compile(rf"(\w+):(?:gone|({_NUMBER}):({_NUMBER})(?::({_NUMBER}))?)")
-_NUMBERS = ("seed", "trajectory", "frames", "laps")
+_NUMBERS = ("seed", "trajectory", "frames", "laps", "movers")
 _STRENGTHS = {"noise": "noise", "holes": "holes", "flying": "flying_pixels", "exposure": "exposure", "gloss": "gloss"}
 """Fields of HomeSettings by the names in a spec."""
 _TIMES = {"shutter": "readout_ms", "blur": "exposure_ms"}
@@ -30,7 +30,7 @@ class HomeSettings:
     angular speed, which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose poses the frames
     have, in percent of the distance moved and of the angle turned; 0 for exact poses. laps: how often the path is
     walked, every second time backwards. changes: the objects that are not where the home has them, with their shift in
-    metres, or None if they are gone.
+    metres, or None if they are gone. movers: boxes that move.
     """
 
     home: int = 0
@@ -50,6 +50,7 @@ class HomeSettings:
     drift_percent: float = 0.0
     laps: int = 1
     changes: tuple[tuple[str, tuple[float, float, float] | None], ...] = ()
+    movers: int = 0
 
     def __post_init__(self) -> None:
         low, high = _SIDES_PX
@@ -58,6 +59,7 @@ class HomeSettings:
             ("trajectory", self.trajectory, f"0 to {TRAJECTORY_COUNT - 1}", 0 <= self.trajectory < TRAJECTORY_COUNT),
             ("frames", self.frames, "1 to 100000", 1 <= self.frames <= 100_000),
             ("laps", self.laps, "1 to 100", 1 <= self.laps <= 100),
+            ("movers", self.movers, "0 or 1", self.movers in (0, 1)),
             ("size", self.size_px, f"sides of {low} to {high} px", all(low <= side <= high for side in self.size_px)),
             ("shutter", self.readout_ms, "0ms to 100ms", 0.0 <= self.readout_ms <= 100.0),
             ("blur", self.exposure_ms, "0ms to 100ms", 0.0 <= self.exposure_ms <= 100.0),

@@ -26,6 +26,7 @@ from gausslite_sim.home_catalogue import HOME_COUNT, plan_home
 from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.home_settings import HomeSettings
 from gausslite_sim.instance_regions import InstanceImageCache, InstanceRegion
+from gausslite_sim.moving_box import box_centre_m, with_box
 from gausslite_sim.odometry_drift import drifting_poses
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
@@ -209,7 +210,9 @@ class SimulatedHome:
     def _render(self, i: int) -> View:
         settings, scene = self._settings, self._home.scene
         if settings.readout_ms == 0 and settings.exposure_ms == 0:
-            return render_view(scene, RayCamera(self._camera, self._poses[i], settings.lens), settings.gloss)
+            ray_camera = RayCamera(self._camera, self._poses[i], settings.lens)
+            view = render_view(scene, ray_camera, settings.gloss)
+            return with_box(view, ray_camera, box_centre_m(self._poses, i)) if settings.movers else view
         camera = RecordingCamera(self._camera, settings.lens, settings.readout_ms / 1e3, settings.exposure_ms / 1e3)
         path = self._path
 

@@ -350,6 +350,14 @@ class KeyframeStore:
         )
         self._buffer = [keyframe if is_same_frame(old, keyframe) else old for old in self._buffer]
 
+    def exchange(self, old: Keyframe, new: Keyframe, prepare: PrepareView) -> None:
+        """Replace a keyframe by one whose image has other pixels."""
+        self._buffer = [new if is_same_frame(keyframe, old) else keyframe for keyframe in self._buffer]
+        self._recent, self._long_term = (
+            [prepare(new) if is_same_frame(view.keyframe, old) else view for view in views]
+            for views in (self._recent, self._long_term)
+        )
+
     def set_evaluated(self, keyframe: Keyframe, prepare: PrepareView) -> None:
         """Replace a keyframe by its evaluated version; one that shows the ROI joins the window again."""
         self._buffer = [keyframe if is_same_frame(old, keyframe) else old for old in self._buffer]

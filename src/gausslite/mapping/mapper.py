@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
@@ -250,6 +250,30 @@ class GaussianMapper:
     def mark_unavailable(self, keyframe: Keyframe) -> None:
         """Mark a keyframe as evaluated without a result: it shows no ROI and adds no evidence."""
         self._keyframes.set_evaluated(replace(keyframe, evaluated=True), self._window_view)
+
+    def without(self, pixels: Bool[ndarray, "h w"], frame: Frame) -> Frame:
+        """Return the frame without depth in these pixels, and with the map's colours, so that nothing is seeded there.
+
+        The map's own colours give no gradient, so nothing is trained there either.
+        """
+        rendered = self.render(frame.camera, frame.T_world_camera, frame.motion).rgb
+        rgb = np.rint(np.clip(rendered, 0.0, 1.0) * 255.0).astype(np.uint8)
+        return replace(
+            frame,
+            rgb=np.where(pixels[..., None], rgb, frame.rgb),
+            depth_m=np.where(pixels, np.float32(0), frame.depth_m),
+        )
+
+    def hide(self, pixels: Bool[ndarray, "h w"], keyframe: Keyframe) -> None:
+        """Take these pixels of a keyframe out of training."""
+        recorded = None if keyframe.recorded is None else self.without(pixels, keyframe.recorded)
+        hidden = replace(
+            keyframe,
+            frame=self.without(pixels, keyframe.frame),
+            recorded=recorded,
+            relevance=keyframe.relevance.without(pixels),
+        )
+        self._keyframes.exchange(keyframe, hidden, self._window_view)
 
     def render_view(self, frame: Frame) -> RenderedView | None:
         """Return alpha and depth of the map from a frame's pose; None if the map is empty."""

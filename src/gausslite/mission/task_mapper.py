@@ -25,6 +25,7 @@ from gausslite.mapping.tracking import CameraTracker
 from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
+from gausslite.perception.moving import MovingSettings, moving_pixels
 from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
@@ -184,6 +185,7 @@ class TaskMapper:
         if tracked is None:
             return self._lost(frame)
         frame = tracked if self._tracker is not None else self._mapper.corrected(frame)
+        frame = self._without_moving(frame)
         view = self._render(frame)
         estimate = self._estimate_relevance(frame, view)
         lag_frames = self._apply_delayed(estimate.delayed)
@@ -232,6 +234,20 @@ class TaskMapper:
         with self._scheduler.timing(Stage.TRACKING):
             T_world_camera = self._tracker.track(frame)
         return None if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
+
+    def _without_moving(self, frame: Frame) -> Frame:
+        """Return the frame without the things that move; hide in an earlier keyframe what has moved since."""
+        if not frame.has_depth:
+            return frame
+        keyframes = self._mapper.keyframes()[-MovingSettings().references :]
+        frames = [keyframe.frame for keyframe in keyframes]
+        if keyframes:
+            chosen = self._mapper.revision % len(keyframes)
+            moved = moving_pixels(frames[chosen], [*frames[chosen + 1 :], frame])
+            if moved.any():
+                self._mapper.hide(moved, keyframes[chosen])
+        moving = moving_pixels(frame, frames)
+        return self._mapper.without(moving, frame) if moving.any() else frame
 
     def _lost(self, frame: Frame) -> FrameOutcome:
         """Return the outcome of a frame without a pose."""

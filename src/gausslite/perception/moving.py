@@ -1,0 +1,82 @@
+"""Which pixels of a frame show things that move: earlier frames saw through the place where they are now."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+
+from gausslite.domain.camera import lift, project
+from gausslite.domain.frame import Frame
+from gausslite.domain.pose import inverse, transform_points
+
+_NEAR_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class MovingSettings:
+    """When a pixel shows a thing that moves.
+
+    references: the latest keyframes that are compared. min_references: those that must have seen through the place.
+    depth_slack_m, depth_slack_share: how much farther their depth is; the sum counts. columns: how many pixels of a row
+    are compared. min_part: compared pixels from which a part of the image counts. grown: margin in their distances.
+    """
+
+    references: int = 8
+    min_references: int = 2
+    depth_slack_m: float = 0.1
+    depth_slack_share: float = 0.05
+    columns: int = 80
+    min_part: int = 9
+    grown: int = 1
+
+
+def moving_pixels(
+    frame: Frame, earlier: Sequence[Frame], settings: MovingSettings | None = None
+) -> Bool[ndarray, "h w"]:
+    """Return True for the pixels that show a thing that moves. earlier: frames with poses, oldest first.
+
+    A place that earlier frames did not show, or that was behind something, shows no motion.
+    """
+    settings = settings or MovingSettings()
+    height, width = frame.depth_m.shape
+    step = max(1, width // settings.columns)
+    depth_m = frame.depth_m[::step, ::step]
+    rows, columns = np.nonzero(depth_m > 0)
+    points = lift(
+        np.stack([columns, rows], axis=1) * step + 0.5, depth_m[rows, columns].astype(np.float64), frame.camera
+    )
+    p_world = transform_points(frame.T_world_camera, points)
+    count = np.zeros(len(p_world), np.int64)
+    for reference in earlier[-settings.references :]:
+        count += _seen_through(p_world, reference, settings)
+    grid = np.zeros(depth_m.shape, np.uint8)
+    grid[rows, columns] = count >= settings.min_references
+    # single pixels are at depth edges
+    opened = cv2.morphologyEx(grid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    parts, labels, sizes, _ = cv2.connectedComponentsWithStats(opened)
+    large = [label for label in range(1, parts) if sizes[label, cv2.CC_STAT_AREA] >= settings.min_part]
+    shown = cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((2 * settings.grown + 1,) * 2, np.uint8))
+    moving: Bool[ndarray, "h w"] = np.repeat(np.repeat(shown > 0, step, axis=0), step, axis=1)[:height, :width]
+    return moving
+
+
+def _seen_through(p_world: Float64[ndarray, "n 3"], reference: Frame, settings: MovingSettings) -> Bool[ndarray, " n"]:
+    """Return which points are well in front of all that the reference measured around their pixel."""
+    p_camera = transform_points(inverse(reference.T_world_camera), p_world)
+    z_m = p_camera[:, 2]
+    in_front = np.column_stack([p_camera[:, :2], np.maximum(z_m, _NEAR_M)]).astype(np.float32)
+    pixels = np.floor(project(in_front, reference.camera)).astype(np.int64)
+    height, width = reference.depth_m.shape
+    inside = (z_m > _NEAR_M) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+    # a pixel without depth is 0: nothing is seen through there
+    nearest_m = cv2.erode(reference.depth_m, np.ones((3, 3), np.uint8))
+    columns, rows = pixels[inside].T
+    limit_m = z_m[inside] * (1.0 + settings.depth_slack_share) + settings.depth_slack_m
+    seen = np.zeros(len(p_world), np.bool_)
+    seen[inside] = nearest_m[rows, columns] > limit_m
+    return seen
