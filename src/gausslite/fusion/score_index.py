@@ -168,6 +168,8 @@ class _AgentRows:
         """Return the totals in these rows."""
         _, update_seqs, kappa_sums, counts, numbers = self._columns
         is_stored = rows >= 0
+        if is_stored.all():
+            return StoredScores(update_seqs[rows], kappa_sums[rows], counts[rows], numbers[rows])
         return StoredScores(
             np.where(is_stored, update_seqs[rows], -1),
             np.where(is_stored, kappa_sums[rows], np.uint64(0)),
