@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from jaxtyping import UInt64
+from numpy import ndarray
 from numpy.typing import DTypeLike, NDArray
 
 from gausslite.domain.arrays import require_array
@@ -132,3 +134,27 @@ def get_text(state: State, name: str) -> str:
         return get_array(state, name, (None,), np.uint8).tobytes().decode()
     except UnicodeDecodeError:
         raise MapFileError(f"state {name}: expected UTF-8 text, got other bytes") from None
+
+
+_LOW_64_BITS = (1 << 64) - 1
+
+
+def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:
+    """Return a PCG64 generator: state and increment as 64-bit halves, flag and value of a stored 32-bit draw."""
+    state = rng.bit_generator.state
+    numbers = state["state"]["state"], state["state"]["inc"]
+    halves = [half for number in numbers for half in (number >> 64, number & _LOW_64_BITS)]
+    return np.array([*halves, state["has_uint32"], state["uinteger"]], np.uint64)
+
+
+def restore_generator(rng: np.random.Generator, values: UInt64[ndarray, "6"]) -> None:
+    """Set a PCG64 generator to a state of `generator_state`. Raises MapFileError if the values are not valid."""
+    state_high, state_low, inc_high, inc_low, has_uint32, uinteger = (int(value) for value in values)
+    if has_uint32 > 1 or uinteger >> 32 or not inc_low & 1:
+        raise MapFileError("state generator: expected the state of a PCG64 generator, got other values")
+    rng.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": state_high << 64 | state_low, "inc": inc_high << 64 | inc_low},
+        "has_uint32": has_uint32,
+        "uinteger": uinteger,
+    }

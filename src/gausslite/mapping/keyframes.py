@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, UInt64
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -20,8 +20,6 @@ from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import TILE_PX, Rasterizer, Subset, TrainingView
-
-_LOW_64_BITS = (1 << 64) - 1
 
 
 def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
@@ -90,27 +88,6 @@ def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
         raise MapFileError("state pixel_weights: expected values in [0, 1], got others")
     (known_objects,) = get_counts(state, "known_objects", 1)
     return RelevanceMap(pixel_weights, get_array(state, "target", frame.depth_m.shape, np.int16).copy(), known_objects)
-
-
-def generator_state(rng: np.random.Generator) -> UInt64[ndarray, "6"]:
-    """Return a PCG64 generator: state and increment as 64-bit halves, flag and value of a stored 32-bit draw."""
-    state = rng.bit_generator.state
-    numbers = state["state"]["state"], state["state"]["inc"]
-    halves = [half for number in numbers for half in (number >> 64, number & _LOW_64_BITS)]
-    return np.array([*halves, state["has_uint32"], state["uinteger"]], np.uint64)
-
-
-def restore_generator(rng: np.random.Generator, values: UInt64[ndarray, "6"]) -> None:
-    """Set a PCG64 generator to a state of `generator_state`. Raises MapFileError if the values are not valid."""
-    state_high, state_low, inc_high, inc_low, has_uint32, uinteger = (int(value) for value in values)
-    if has_uint32 > 1 or uinteger >> 32 or not inc_low & 1:
-        raise MapFileError("state generator: expected the state of a PCG64 generator, got other values")
-    rng.bit_generator.state = {
-        "bit_generator": "PCG64",
-        "state": {"state": state_high << 64 | state_low, "inc": inc_high << 64 | inc_low},
-        "has_uint32": has_uint32,
-        "uinteger": uinteger,
-    }
 
 
 _SSIM_WINDOW_PX = 11

@@ -15,7 +15,17 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, orthonormal
 from gausslite.domain.relevance import RelevanceMap
-from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
+from gausslite.domain.state import (
+    State,
+    add_prefix,
+    generator_state,
+    get_array,
+    get_counts,
+    get_floats,
+    int_array,
+    restore_generator,
+    select_prefix,
+)
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.free_space import contradicted_rows
@@ -23,8 +33,6 @@ from gausslite.mapping.keyframes import (
     Keyframe,
     KeyframeStore,
     WindowView,
-    generator_state,
-    restore_generator,
     window_view,
 )
 from gausslite.mapping.loops import LoopCloser, LoopCounts

@@ -18,10 +18,9 @@ from gausslite.domain.errors import GaussLiteError, MapFileError, MismatchError
 from gausslite.domain.frame import Frame
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import BallRegion
-from gausslite.domain.state import State, select_prefix
+from gausslite.domain.state import State, generator_state, restore_generator, select_prefix
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
-from gausslite.mapping.keyframes import generator_state, restore_generator
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import DensitySettings, KeyframeSettings, MapperSettings, SeedingSettings
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
