@@ -36,6 +36,7 @@ TEXTS = {
     "parser": "localhost:1",
     "fusion": "localhost:2",
     "health": "localhost:3",
+    "peer-address": "localhost:4",
 }
 """Values of the options with a text form of their own."""
 
