@@ -29,7 +29,7 @@ NEUTRAL_BLUE = round(0.406 * 255)
 def frame(height: int = 60, width: int = 80, blue: int = NEUTRAL_BLUE) -> Frame:
     rgb = np.full((height, width, 3), (9, 9, blue), np.uint8)
     camera = Camera(100, 100, width / 2, height / 2, width, height)
-    return Frame(0, 0, rgb, np.ones((height, width), np.float32), camera, np.eye(4))
+    return Frame(0, 0, rgb, np.full((height, width), 0.4, np.float32), camera, np.eye(4))
 
 
 def detector(tmp_path, answers, limits: GroundingSettings | None = None, **layout) -> GroundingDino:
@@ -80,7 +80,7 @@ def test_duplicate_and_too_large_boxes_are_dropped(tmp_path):
     beside, huge = (0.26, 0.5, 0.25, 0.5), (0.5, 0.5, 0.6, 0.6)
     answers = [(beside, {"mug": 1.0}), (LEFT, {"mug": SURE}), (huge, {"mug": SURE, "table": SURE})]
     grounding = detector(tmp_path, answers)
-    far = replace(frame(), depth_m=np.full((60, 80), 4.0, np.float32))
+    far = replace(frame(), depth_m=np.full((60, 80), 1.0, np.float32))
     (mug,) = grounding.boxes(far, ["mug"])
     assert mug.box_px[0] == 10
     (table,) = grounding.boxes(far, ["table"])

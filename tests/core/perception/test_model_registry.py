@@ -24,9 +24,9 @@ CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
 
 def frame() -> Frame:
     """Return a frame of 128x64 pixels with a red square before a wall."""
-    rgb, depth_m = np.zeros((64, 128, 3), np.uint8), np.full((64, 128), 2.0, np.float32)
+    rgb, depth_m = np.zeros((64, 128, 3), np.uint8), np.full((64, 128), 1.0, np.float32)
     rgb[16:48, 32:64, 0] = 255
-    depth_m[20:44, 36:60] = 1.0
+    depth_m[20:44, 36:60] = 0.5
     return Frame(0, 0, rgb, depth_m, Camera(100, 100, 64, 32, 128, 64), np.eye(4))
 
 
