@@ -1,4 +1,4 @@
-"""Own a share of a mission's slots: follow who lives, take and release slots, and open the engine of those held.
+"""Own a share of a mission's slots: follow which servers run, take and release slots, open the engine of those held.
 
 An engine has a fixed set of slots. When the set changes, it is closed and another one is opened from the rows.
 """

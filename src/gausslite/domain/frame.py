@@ -41,7 +41,7 @@ _LATE_IN_A_ROW = 5
 
 
 class ClockJumps:
-    """Tells a clock that was set back from stamps that arrive out of order.
+    """Distinguishes a clock that was set back from stamps that arrive out of order.
 
     The clock has jumped if a stamp is more than max_late_s before the latest one, or the last of five ascending ones
     before it: a playback began again, a simulator was reset, or a stamp was of the future.

@@ -1,6 +1,6 @@
 """Share a PostgreSQL database among servers: each holds advisory locks on its slots, which end with its connection.
 
-The locks are the whole truth about who owns what: `owners` reads them. All rows of a slot are written by the connection
+The locks alone state which server owns what: `owners` reads them. All rows of a slot are written by the connection
 that holds the slot's lock, so a server that has lost its connection cannot write what another server owns by now.
 """
 
@@ -23,7 +23,7 @@ WHERE locks.locktype = 'advisory' AND locks.granted
     AND locks.database = (SELECT oid FROM pg_database WHERE datname = current_database())
     AND (locks.classid = 0 AND locks.objid = %s AND locks.objsubid = 1 OR locks.classid = %s AND locks.objsubid = 2)
 """
-_FORGET_ENDED = """
+_DELETE_ENDED = """
 DELETE FROM gausslite.servers
 WHERE pid = pg_backend_pid() OR pid NOT IN (SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted)
 """
@@ -95,7 +95,7 @@ class SharedSlots:
                 # one after the other
                 db.execute("SELECT pg_advisory_xact_lock(%s, -1)", (_SLOT_LOCKS,))
                 create_or_check(db, self._name)
-                db.execute(_FORGET_ENDED)
+                db.execute(_DELETE_ENDED)
                 if any(address == self.server for *_, address in db.execute(_OWNERS, (LOCK, _SLOT_LOCKS))):
                     raise StorageError(f"store {self._name}: another server has the peer-address {self.server}")
                 db.execute(_REGISTER, (self.server,))

@@ -50,7 +50,7 @@ _MIN_BLOCKS = 30
 _MIN_MATCHED, _MIN_TEXTURE = 0.9, 0.35
 """Of 123 pairs of parts of homes and of the kitchen, wrong motions with 90 % matched have a texture of at most 0.28,
 right ones of at least 0.39."""
-_RIVAL_MATCHED, _RIVAL_TEXTURE, _RIVAL_BLOCKS = 0.9, 0.7, 15
+_OTHER_MATCHED, _OTHER_TEXTURE, _OTHER_BLOCKS = 0.9, 0.7, 15
 """Shares of the best motion's figures, and blocks, with which another motion is as good."""
 _APART_M, _APART_DEG = 0.25, 8.0
 _MIN_BLOCK_SAMPLES = 4
@@ -83,10 +83,10 @@ class _Agreement:
     matched: float = 0.0
     texture: float = 0.0
 
-    def rivals(self, best: _Agreement) -> bool:
+    def is_about_as_good(self, best: _Agreement) -> bool:
         """Return whether this motion is about as good as the best one."""
-        is_matched = self.matched >= _RIVAL_MATCHED * best.matched
-        return is_matched and self.texture >= _RIVAL_TEXTURE * best.texture and self.blocks >= _RIVAL_BLOCKS
+        is_matched = self.matched >= _OTHER_MATCHED * best.matched
+        return is_matched and self.texture >= _OTHER_TEXTURE * best.texture and self.blocks >= _OTHER_BLOCKS
 
     @property
     def reason(self) -> str:
@@ -117,7 +117,7 @@ def find_frame(source: SurfaceSamples, target: SurfaceSamples) -> FrameSearch:
     if agreement.reason:
         return FrameSearch(None, agreement.reason)
     others = (other for other in search.alternatives(motion, motions) if search.is_apart(other, motion))
-    if any(search.agreement(other).rivals(agreement) for other in others):
+    if any(search.agreement(other).is_about_as_good(agreement) for other in others):
         return FrameSearch(None, f"overlap {100 * agreement.overlap:.0f} %, but it fits in several places")
     return FrameSearch(search.fit(motion))
 

@@ -36,8 +36,8 @@ _MAX_DISTANCE = 1.5
 """Of a candidate by position: metres plus radians."""
 _MIN_SIMILARITY = 0.6
 """Of the descriptors of a candidate by appearance."""
-_SETTLED_M, _SETTLED_DEG = 0.015, 0.5
-_SETTLED_STDS = 2.0 * 2.0**0.5
+_NOISE_M, _NOISE_DEG = 0.015, 0.5
+_NOISE_STDS = 2.0 * 2.0**0.5
 """A loop that the poses contradict by less than these, or by less than this many standard deviations of a pose's error,
 moves nothing until another one does: it is noise of single poses and no drift."""
 
@@ -76,8 +76,8 @@ class LoopCloser:
         self._table = table
         self._rasterizer = rasterizer
         self._graph = PoseGraph()
-        self._settled_m = max(_SETTLED_M, _SETTLED_STDS * prior.translation_m)
-        self._settled_deg = max(_SETTLED_DEG, _SETTLED_STDS * prior.rotation_deg)
+        self._noise_m = max(_NOISE_M, _NOISE_STDS * prior.translation_m)
+        self._noise_deg = max(_NOISE_DEG, _NOISE_STDS * prior.rotation_deg)
         self._descriptors: list[PlaceDescriptor] = []
         self._refused = self._withdrawn = self._corrections = 0
 
@@ -104,9 +104,9 @@ class LoopCloser:
         loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - _MIN_GAP])
         if loop is None:
             return None
-        settled = self._is_settled(loop)
+        is_noise = self._is_noise(loop)
         self._graph.add_loop(loop)
-        return None if settled else self._solve(loop)
+        return None if is_noise else self._solve(loop)
 
     def state(self) -> State:
         """Return the pose graph and the counts."""
@@ -170,7 +170,7 @@ class LoopCloser:
             return None
         T_world_camera = old.frame.T_world_camera @ registration.T_target_source
         loop = Loop(old.anchor, keyframe.anchor, inverse(self._graph.poses[old.anchor]) @ T_world_camera)
-        if self._is_settled(loop) or self._is_verified(keyframe, T_world_camera):
+        if self._is_noise(loop) or self._is_verified(keyframe, T_world_camera):
             return loop
         self._refused += 1
         return None
@@ -186,10 +186,10 @@ class LoopCloser:
 
         return verify(render, keyframe.frame, T_world_camera).is_accepted
 
-    def _is_settled(self, loop: Loop) -> bool:
+    def _is_noise(self, loop: Loop) -> bool:
         """True if the poses agree with a loop, so that it does not move the map."""
         error_m, error_deg = self._graph.residual(loop)
-        return error_m < self._settled_m and error_deg < self._settled_deg
+        return error_m < self._noise_m and error_deg < self._noise_deg
 
 
 def _distance(a: Frame, b: Frame) -> float:

@@ -89,7 +89,7 @@ Global___AgentState: _TypeAlias = AgentState  # noqa: Y015
 
 @_typing.final
 class AssignTaskRequest(_message.Message):
-    """With points alone, the current task stays and gets these objects, or is left by them."""
+    """With points alone, the current task stays; the objects are added to it or removed from it."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
