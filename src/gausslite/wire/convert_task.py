@@ -33,6 +33,7 @@ from gausslite.v1 import agent_service_pb2, fusion_service_pb2, geometry_pb2, ob
 from gausslite.wire.convert import box_from_message, box_to_message
 
 _MAX_POINTED: Final = 64
+"""Points and boxes of a task in all; a region grows around each of them, on the thread that maps frames."""
 _PREDICATE_NUMBERS = {predicate: task_pb2.Predicate.Value(f"PREDICATE_{predicate.name}") for predicate in Predicate}
 _PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
 _ROLE_NUMBERS = {role: task_pb2.TargetRole.Value(f"TARGET_ROLE_{role.name}") for role in TargetRole}
@@ -120,8 +121,11 @@ class AssignedTask:
     def __post_init__(self) -> None:
         if self.graph is None and not (self.pointed or self.excluded_m):
             raise InvalidInputError("task: expected a text, a graph or points, got none")
-        if max(len(self.pointed), len(self.excluded_m)) > _MAX_POINTED:
-            raise InvalidInputError(f"task: expected at most {_MAX_POINTED} objects pointed at or excluded, got more")
+        marks = sum(max(len(shown.points_px) + len(shown.boxes_px), 1) for shown in self.pointed)
+        if max(marks, len(self.excluded_m)) > _MAX_POINTED:
+            raise InvalidInputError(
+                f"task: expected at most {_MAX_POINTED} points and boxes or excluded ones, got more"
+            )
 
 
 def assigned_to_message(
