@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import back_project
-from gausslite.domain.errors import UnavailableError
+from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
 from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.pose import orthonormal, rotation_angle_deg, transform_of, transform_points
 from gausslite.domain.voxels import VoxelGrid
@@ -57,6 +57,10 @@ _MIN_BLOCK_SAMPLES = 4
 _MAX_KEYFRAMES = 24
 _SAMPLE_GRID = VoxelGrid(0.05)
 _NEAREST_M, _FARTHEST_M, _STEP_PX, _DEPTH_EDGE_PX = 0.1, 5.0, 2, 2
+_MAX_KEYFRAME_SAMPLES = 20_000
+"""A view of rooms has a few thousand; a forged image could have one for each pixel."""
+_ATTEMPTS = 2
+"""Searches that fail, before an agent waits for more data as after any other search."""
 _GROWTH = 1.25
 _KEYFRAME_VOXELS = 100
 """What a keyframe adds to the size of a map, in voxels."""
@@ -248,7 +252,8 @@ def keyframe_samples(frame: Frame) -> SurfaceSamples:
     used = (points[:, 2] > _NEAREST_M) & (points[:, 2] < _FARTHEST_M)
     luminance = (frame.rgb[::_STEP_PX, ::_STEP_PX].reshape(-1, 3)[used] / 255.0) @ LUMINANCE
     world = transform_points(frame.T_world_camera, points[used].astype(np.float64))
-    return _one_of_each_cube(SurfaceSamples(world, luminance))
+    samples = _one_of_each_cube(SurfaceSamples(world, luminance))
+    return samples.take(np.arange(0, len(samples), max(1, -(-len(samples) // _MAX_KEYFRAME_SAMPLES))))
 
 
 def _one_of_each_cube(samples: SurfaceSamples) -> SurfaceSamples:
@@ -277,12 +282,16 @@ class UnknownFrames:
         self._keyframes, self._lock, self._find = keyframes, lock, find
         # the team at the latest search, the agent's size and the team's
         self._searched: dict[str, tuple[tuple[str, ...], tuple[int, int]]] = {}
+        self._failed: dict[str, int] = {}
         self._samples_of_keyframe: dict[str, dict[int, SurfaceSamples]] = {}
 
     def run(self) -> None:
         """Search the frames of the agents with enough new data; the aligner moves the maps. Raises StorageError."""
         with self._lock:
             names = [name for name in self._alignments.names() if self._size(name)]
+            for known in (self._searched, self._failed, self._samples_of_keyframe):
+                for name in known.keys() - set(names):
+                    del known[name]
             waiting = [name for name in names if not self._alignments.get(name).is_localised]
             team = [name for name in names if self._alignments.get(name).is_used]
             if waiting and not team:
@@ -304,9 +313,13 @@ class UnknownFrames:
             self._searched[agent_id] = tuple(team), sizes
         try:
             found = self._find(self._samples(agent_id), SurfaceSamples.concatenate([*map(self._samples, team)]))
-        except UnavailableError as error:
+            self._failed.pop(agent_id, None)
+        except (UnavailableError, CodecError, InvalidInputError) as error:
+            # one agent's data must not end the comparisons of the others, nor be searched for ever
             found = FrameSearch(None, f"the search failed: {error}")
-            del self._searched[agent_id]
+            self._failed[agent_id] = self._failed.get(agent_id, 0) + 1
+            if self._failed[agent_id] < _ATTEMPTS:
+                del self._searched[agent_id]
         with self._lock:
             if any(self._alignments.get(name) is not alignment for name, alignment in before.items()):
                 return

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from place_scenes import CAMERA, room
 
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
@@ -19,12 +21,12 @@ from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelGrid, group_
 from gausslite.fusion.alignment import FrameFit, Misfit, SurfaceSamples
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentSettings, AlignmentState, FrameAlignment
-from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore, MissionConfig
-from gausslite.fusion.unknown_frames import find_frame
+from gausslite.fusion.unknown_frames import FrameSearch, find_frame, keyframe_samples
 
 pytest.importorskip("kiss_matcher")
 
@@ -193,3 +195,48 @@ def test_an_agent_that_knows_its_frame_now_is_used_as_sent() -> None:
     assert won(engine, "ant") == 0
     engine.declare_frame("ant", np.eye(4))
     assert won(engine, "ant") == len(group_by_voxel(scan(0), GRID))
+
+
+def test_a_search_that_fails_is_made_twice_and_then_with_more_data_or_after_the_agent_has_left() -> None:
+    sizes: list[int] = []
+
+    def find(source: SurfaceSamples, target: SurfaceSamples) -> FrameSearch:
+        sizes.append(len(source))
+        raise UnavailableError("the process of the comparisons ended 2 times, with code -9")
+
+    engine = FusionEngine(MemoryStore(), SETTINGS, find=find)
+    send(engine, "ant", scan(0))
+    send(engine, "bee", scan(1).take(np.arange(400)), unknown=True)
+    for _ in range(5):
+        engine.align_due()
+    assert len(sizes) == 2
+    assert "the search failed: the process" in alignment_of(engine, "bee").message
+    send(engine, "bee", scan(1), seq=2)
+    for _ in range(5):
+        engine.align_due()
+    assert len(sizes) == 3
+    assert sizes[2] > sizes[1]
+    engine.evict("bee", ban=False)
+    engine.align_due()
+    send(engine, "bee", scan(1).take(np.arange(400)), unknown=True)
+    engine.align_due()
+    assert sizes[3:] == sizes[:1]
+
+
+def test_a_keyframe_that_no_decoder_reads_ends_no_comparison_of_others() -> None:
+    engine = FusionEngine(MemoryStore(), SETTINGS)  # without a decoder
+    send(engine, "ant", scan(0))
+    send(engine, "bee", scan(1), unknown=True)
+    engine.add_keyframe(EncodedKeyframe("bee", 0, 1, 1, b"of another version"))
+    send(engine, "cat", scan(2))
+    engine.align_due()
+    assert alignment_of(engine, "cat").fit is not None
+    assert "the search failed: stored keyframe" in alignment_of(engine, "bee").message
+
+
+def test_an_image_that_no_room_gives_has_not_more_samples_than_a_view() -> None:
+    camera = Camera.centred(900.0, 960, 720)
+    rows, columns = np.mgrid[: camera.height_px, : camera.width_px]
+    depth_m = (2.7 + 2.2 * np.sin(rows / 60) * np.sin(columns / 60)).astype(np.float32)
+    waves = Frame(0, 0, np.zeros((*depth_m.shape, 3), np.uint8), depth_m, camera, np.eye(4))
+    assert 10_000 <= len(keyframe_samples(waves)) <= 20_000
