@@ -160,10 +160,12 @@ class NewestTask:
             # without effect on one that has begun
             self._newest.cancel()
         self._newest = future
-        await asyncio.wait([asyncio.wrap_future(future)])
+        assigned = asyncio.wrap_future(future)
+        await asyncio.wait([assigned])
         if future.cancelled():
             raise MismatchError("task: superseded by a newer AssignTask before it was assigned")
-        return future.result()
+        # else asyncio logs the error of a refused task as one that nobody has looked at
+        return assigned.result()
 
 
 class AgentServicer(pb_grpc.AgentServiceServicer):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import grpc
@@ -38,6 +41,7 @@ from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.servicer import NewestTask
 
 
 def test_a_task_is_text_or_a_graph() -> None:
@@ -120,6 +124,22 @@ def test_pointing_at_nothing_is_refused_and_changes_nothing(pointed: PointedObje
         with pytest.raises(InvalidInputError, match=match):
             a.client.assign_task(pointed=[pointed])
         assert convert_task.graph_from_message(a.client.status().graph) == RuleParser().parse(TASK)
+
+
+def test_a_refused_task_is_not_logged_as_an_error_that_nobody_has_looked_at() -> None:
+    unseen: list[object] = []
+
+    def refuse() -> TaskGraph:
+        raise InvalidInputError("task: expected another one")
+
+    async def assign() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: unseen.append(context))
+        with suppress(InvalidInputError):
+            await NewestTask().assign(refuse)
+        gc.collect()
+
+    asyncio.run(assign())
+    assert unseen == []
 
 
 def test_an_invalid_task_is_refused() -> None:
