@@ -85,7 +85,8 @@ class PartSender:
                     assert isinstance(update.message, bytes)
                     subset = decode_own(update.message, update.agent_id, self._grid)
                     loop.call_soon_threadsafe(self._end, update, _value(subset))
-                except GaussLiteError as error:
+                except Exception as error:
+                    # reaches the call; this thread decodes the messages of all agents
                     loop.call_soon_threadsafe(self._end, update, _error(error))
                 finally:
                     self._queue.put_back(update, is_done=True)
@@ -150,7 +151,7 @@ def _value(subset: StoredSubset) -> Callable[[asyncio.Future[StoredSubset]], Non
     return lambda decoded: decoded.set_result(subset)
 
 
-def _error(error: GaussLiteError) -> Callable[[asyncio.Future[StoredSubset]], None]:
+def _error(error: Exception) -> Callable[[asyncio.Future[StoredSubset]], None]:
     return lambda decoded: decoded.set_exception(error)
 
 

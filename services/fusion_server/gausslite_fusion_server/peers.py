@@ -188,11 +188,13 @@ class _PartStream:
             # the call is cancelled by `close`, not this task
             if not self._is_closing:
                 raise
-        self.has_ended = self._is_closing = True
-        self._woken.set()
-        for waiting in self._outcomes.values():
-            if not waiting.done():
-                waiting.set_exception(error)
+        finally:
+            # whatever ended it: else the parts, and those of later streams, would wait for ever
+            self.has_ended = self._is_closing = True
+            self._woken.set()
+            for waiting in self._outcomes.values():
+                if not waiting.done():
+                    waiting.set_exception(error)
 
     def _end(self, outcome: region_pb.PartOutcome) -> None:
         waiting = self._outcomes.get(outcome.number)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from typing import Any
 
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.codec.subset_codec import SubsetCoding, encode_subset, split_batch
-from gausslite.domain.errors import GaussLiteError, UnavailableError
-from gausslite.domain.voxels import RoiSubset
+from gausslite.domain.checks import quote_name
+from gausslite.domain.errors import CodecError, GaussLiteError, UnavailableError
+from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
@@ -26,6 +28,7 @@ from gausslite_fusion_server.servicer import FusionServicer
 SLOTS_KEY = "gausslite-slots"
 """The initial metadata of an answer: the slots for which it holds, as bits of a hexadecimal number."""
 _SENDER = "fusion-server"
+_log = logging.getLogger(__name__)
 
 
 class RegionServicer(region_pb_grpc.RegionServiceServicer):
@@ -86,10 +89,15 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         outcome = region_pb.PartOutcome(number=part.number)
         try:
             voxels = StoredVoxels.from_row(part.voxels)
+            _require_codes_of(self._host.settings.grid, voxels)
             subset = StoredSubset(part.agent_id, part.message_seq, part.update_seq, voxels)
             outcome.accepted_voxels, outcome.stale_voxels = await self.store_part(part.session_id, subset)
         except GaussLiteError as error:
             outcome.reason, outcome.message = code_and_reason(error)[1], str(error)
+        except Exception as error:
+            # without an outcome the sender, and its agent, would wait for ever
+            _log.exception("a part of a message of agent %s is not stored", quote_name(part.agent_id))
+            outcome.reason, outcome.message = code_and_reason(GaussLiteError())[1], f"{type(error).__name__}: {error}"
         done.put_nowait(outcome)
 
     async def BeginAgent(self, request: region_pb.BeginAgentRequest, context: Any) -> region_pb.BeginAgentResponse:
@@ -194,3 +202,10 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
     async def _state_slots(self, context: Any) -> None:
         slots = sum(1 << slot for slot in self._host.owned.slots)
         await context.send_initial_metadata(((SLOTS_KEY, f"{slots:x}"),))
+
+
+def _require_codes_of(grid: VoxelGrid, voxels: StoredVoxels) -> None:
+    """Raise CodecError for a row that no server of this mission sends: once stored, it could not be read."""
+    keys = voxels.keys
+    if voxels.size_m not in (0.0, grid.size_m) or (keys[:1] < 0).any() or (keys[1:] <= keys[:-1]).any():
+        raise CodecError(f"part: expected ascending voxels of {grid.size_m:g} m, got others")

@@ -408,8 +408,9 @@ class FusionEngine:
 
     def _check_update(self, update: PendingUpdate) -> None:
         """Raise GaussLiteError for a message that may not be stored; only its first part is checked."""
-        self._mission.members.session(update.session_id)
+        session = self._mission.members.session(update.session_id)
         if not update.outcomes:
+            require_own(session.agent_id, update.agent_id, self.grid, self.grid)
             self._mission.checks.require_plausible(update.subset)
             require_storable(update.subset)
             require_within_quotas(update.subset, self._store, self._settings.quotas)

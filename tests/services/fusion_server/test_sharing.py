@@ -39,7 +39,7 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.regions import ALL_SLOTS, wanted_slots
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
-from gausslite.v1.region_service_pb2 import RemoveAgentRequest
+from gausslite.v1.region_service_pb2 import RemoveAgentRequest, StorePartsRequest, SubsetPart
 from gausslite.v1.region_service_pb2_grpc import RegionServiceStub
 from gausslite.wire.channel import open_channel
 from gausslite.wire.clients import Export
@@ -329,3 +329,36 @@ def test_with_certificates_only_servers_call_each_other(postgres: PostgresServer
             RegionServiceStub(channel).RemoveAgent(RemoveAgentRequest(agent_id="ant"))
         assert refused.value.code() is grpc.StatusCode.PERMISSION_DENIED
         assert "the roles server" in refused.value.details()
+
+
+def test_a_part_that_cannot_be_stored_has_an_outcome_and_no_effect(
+    postgres: PostgresServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with sharing_servers(postgres.new_database(), folder, 1) as [server]:
+        sessions = {name: server.client.join(name, GRID).session_id for name in AGENTS[:2]}
+        first, second = scattered("ant", 1, 1), scattered("ant", 2, 2)
+        list(server.client.contribute([request(sessions["ant"], first)], 20.0))
+        voxels = decode_stored(encode_subset(second, GRID))[0].voxels
+        good, reversed_keys = voxels.to_row(), voxels.take(np.arange(len(voxels))[::-1]).to_row()
+        parts = [
+            SubsetPart(number=number, session_id=sessions[name], agent_id="ant", update_seq=seq, voxels=row)
+            for number, (name, seq, row) in enumerate(
+                [
+                    ("ant", 2, good[:-1]),
+                    ("ant", 2, np.float64(np.nan).tobytes() + good[8:]),
+                    ("ant", 2, np.float64(0.5).tobytes() + good[8:]),
+                    ("ant", 2, reversed_keys),
+                    ("bee", 2, good),
+                    ("ant", 2**64 - 1, good),
+                ]
+            )
+        ]
+        with open_channel(server.address, None) as channel:
+            answers = RegionServiceStub(channel).StoreParts(iter([StorePartsRequest(parts=parts)]), timeout=20.0)
+            reasons = {outcome.number: outcome.reason for answer in answers for outcome in answer.outcomes}
+            wrong_numbers = {0: "STORAGE", 1: "CODEC", 2: "CODEC", 3: "CODEC", 4: "NOT_PERMITTED", 5: "INVALID_INPUT"}
+            assert reasons == wrong_numbers
+            assert server.client.export(Export()) == offline({"ant": [first]})
+            monkeypatch.setattr(server.share.regions, "store_part", None)  # an error that nobody expects
+            answers = RegionServiceStub(channel).StoreParts(iter([StorePartsRequest(parts=parts[4:5])]), timeout=20.0)
+            assert [outcome.reason for answer in answers for outcome in answer.outcomes] == ["INTERNAL"]
