@@ -299,6 +299,9 @@ class RobotSession:
                     self._map_problem = ""
                 except InvalidInputError as error:
                     self._map_problem = str(error)
+                except Exception as error:
+                    # the diagnostics say so; a later map may be published
+                    self._map_problem = f"map: not published, {type(error).__name__}: {error}"
 
         self._map_thread = threading.Thread(target=run, name="map", daemon=True)
         self._map_thread.start()

@@ -136,6 +136,22 @@ def test_a_replayed_bag_is_mapped_as_the_bag_source_gives_it(tmp_path: Path, del
         assert running.client.status().frames_mapped == len(source)
 
 
+def test_a_map_that_cannot_be_published_is_reported_and_the_next_one_is_published() -> None:
+    calls: list[list[Outgoing]] = []
+
+    def publish(messages: list[Outgoing]) -> None:
+        calls.append(messages)
+        if len(calls) == 1:
+            raise MemoryError("no room for the grid")
+
+    with agent() as running, opened(running, PARAMETERS) as (session, _):
+        session.follow_map(publish, lambda: NOW_NS)
+        wait_until(lambda: "no room for the grid" in str(session.status(NOW_NS)[0].fields))
+        wait_until(lambda: len(calls) > 1)
+        wait_until(lambda: "no room for the grid" not in str(session.status(NOW_NS)[0].fields))
+        session.close()
+
+
 def test_a_task_topic_assigns_the_task() -> None:
     with agent() as running, opened(running, PARAMETERS) as (session, link):
         [assign] = [each.callback for each in session.subscriptions() if each.topic == TASK_TOPIC]
