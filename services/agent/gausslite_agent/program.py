@@ -17,7 +17,7 @@ from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.prior import SavedMap
-from gausslite.mission.prior_run import PriorRun
+from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import prepare_file, prepare_folder
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo
@@ -198,6 +198,7 @@ def _require_usable(settings: AgentSettings) -> None:
     if settings.up_axis is not None:
         unit_up_axis(settings.up_axis)
     if settings.out is not None:
+        require_other_folder(settings.prior, settings.out)
         prepare_folder(settings.out)
     if settings.state is not None:
         prepare_file(settings.state)

@@ -42,7 +42,7 @@ from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import SavedRun, save_run
 from gausslite.mission.map_diff import Change
-from gausslite.mission.prior_run import PriorRun
+from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import (
     PREVIEW,
     locked_folder,
@@ -162,6 +162,7 @@ def run(options: argparse.Namespace) -> int:
         import_extra("viser", "view", "--view")
     if options.prior is not None and options.resume is not None:
         raise InvalidInputError("--prior: expected it without resume; a saved run knows the map that it continues")
+    require_other_folder(options.prior, options.out)
     if options.resume is None and not options.overwrite:
         require_no_map(options.out)
     with locked_folder(options.out):

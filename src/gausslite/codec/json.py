@@ -170,5 +170,5 @@ def object_from_json(value: Mapping[str, Any]) -> ObjectLandmark:
             first_seen_ns=int(value["first_seen_ns"]),
             last_seen_ns=int(value["last_seen_ns"]),
         )
-    except (KeyError, TypeError, ValueError, IndexError, GaussLiteError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, GaussLiteError) as error:
         raise CodecError(f"object: expected the JSON of a landmark, got other values ({error})") from error

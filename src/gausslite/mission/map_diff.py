@@ -177,7 +177,7 @@ def _nearest(landmark: ObjectLandmark, candidates: Iterable[ObjectLandmark]) -> 
     same = (
         candidate
         for candidate in candidates
-        if candidate.noun == landmark.noun and 1 / _MAX_RATIO < max(candidate.size_m) / longest_m < _MAX_RATIO
+        if candidate.noun == landmark.noun and longest_m / _MAX_RATIO < max(candidate.size_m) < _MAX_RATIO * longest_m
     )
     return min(same, key=lambda candidate: _apart_m(landmark, candidate), default=None)
 

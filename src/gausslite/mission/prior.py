@@ -14,7 +14,7 @@ from numpy import ndarray
 from gausslite.codec.json import object_from_json
 from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.codec.run_files import KeyframeView, read_keyframe_views
-from gausslite.domain.errors import MapFileError, MismatchError
+from gausslite.domain.errors import CodecError, MapFileError, MismatchError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.objects import ObjectLandmark
@@ -46,19 +46,28 @@ class SavedMap:
 
     @classmethod
     def read(cls, folder: Path) -> SavedMap:
-        """Read the folder of a run of `gausslite map` or of an agent. Raises MapFileError, CodecError."""
+        """Read the folder of a run of `gausslite map` or of an agent. Raises MapFileError."""
         gaussians, keyframes = read_ply(folder / MAP), read_keyframe_views(folder)
         if not keyframes or len(gaussians) == 0:
             raise MapFileError(
                 f"{folder}: expected a run with {MAP} and keyframes.json, got no keyframe or no Gaussian"
             )
         report = read_report(folder)
-        objects, task = report.get("objects"), report.get("task")
+        if not report and (folder / "report.json").exists():
+            raise MapFileError(f"{folder}: expected a run's report.json, got a damaged one")
+        found = report.get("objects", [])
+        if not isinstance(found, list):
+            raise MapFileError(f"{folder}: expected a report.json with a list of objects, got another value")
+        try:
+            objects = tuple(map(object_from_json, found))
+        except CodecError as error:
+            raise MapFileError(f"{folder}: expected a report.json with the run's objects: {error}") from error
+        task = report.get("task")
         return cls(
             folder,
             gaussians,
             keyframes,
-            tuple(object_from_json(value) for value in objects) if isinstance(objects, list) else (),
+            objects,
             str(task.get("text", "")) if isinstance(task, dict) else str(task or ""),
             read_world_frame(folder / MAP),
         )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark
@@ -21,6 +22,12 @@ from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.map_diff import Change, Visit, compare_visits, with_earlier_objects
 from gausslite.mission.prior import SavedMap, SequenceLocaliser
 from gausslite.mission.settings import MissionSettings
+
+
+def require_other_folder(prior: Path | None, out: Path) -> None:
+    """Raise InvalidInputError for a saved map in the folder of the new run, which would replace it."""
+    if prior is not None and prior.resolve() == out.resolve():
+        raise InvalidInputError(f"--prior {prior}: expected another folder than --out, whose map is replaced")
 
 
 class PriorRun:

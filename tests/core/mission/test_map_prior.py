@@ -87,13 +87,26 @@ def test_a_folder_without_a_run_and_both_options_are_refused(
     for arguments, expected in (
         ([*common, missing], "missing/map.ply"),
         ([*common, str(run), "--set", "resume=x.state"], "--prior: expected it without resume"),
+        (["map", HOME, "--out", str(run), "--overwrite", "--prior", f"{run}/../run"], "another folder than --out"),
+        ([*common, str(run / "map.ply")], "map.ply"),
         (["diff", missing, str(run)], "missing/map.ply"),
     ):
         assert main(arguments) == 2
+        message = capsys.readouterr().err
+        assert expected in message
+        assert message.splitlines()[-1].startswith("gausslite: ")
+        assert "Traceback" not in message
+    report = json.loads((run / "report.json").read_text())
+    endless = [{**found, "first_seen_ns": float("inf")} for found in report["objects"]]
+    for name, content, expected in (
+        ("report.json", json.dumps({**report, "objects": endless}), "expected a report.json with the run's objects"),
+        ("report.json", json.dumps({**report, "objects": 5}), "expected a report.json with a list of objects"),
+        ("report.json", '{"objects": [', "expected a run's report.json, got a damaged one"),
+        ("keyframes.json", '{"keyframes": []}', "expected a run with map.ply and keyframes.json"),
+    ):
+        (run / name).write_text(content)
+        assert main(["diff", str(run), str(run)]) == 2
         assert expected in capsys.readouterr().err
-    (run / "keyframes.json").unlink()
-    assert main(["diff", str(run), str(run)]) == 2
-    assert "expected a run with map.ply and keyframes.json" in capsys.readouterr().err
 
 
 class _Places(PlaceMap):
