@@ -131,19 +131,32 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
             return pb.ContributeKeyframesResponse()
         session = await self._session(first.session_id, Caller.of(context))
 
+        failures: list[GaussLiteError] = []
+
         async def of_session() -> AsyncIterator[pb.ContributeKeyframesRequest]:
             yield first
-            async for request in requests:
-                if request.session_id != first.session_id:
-                    raise InvalidInputError("session_id: expected the one of the stream's first keyframe, got another")
-                yield request
+            try:
+                async for request in requests:
+                    if request.session_id != first.session_id:
+                        raise InvalidInputError("session_id: expected that of the stream's first keyframe, got another")
+                    yield request
+            except GaussLiteError as error:
+                failures.append(error)
+                raise
 
         server = self._home(session.agent_id)
         if server == self._host.server:
             return await self._regions.ContributeKeyframes(of_session(), context)
-        with peer_errors(server):
-            stored: pb.ContributeKeyframesResponse = await self._peers.stub(server).ContributeKeyframes(of_session())
-            return stored
+        try:
+            with peer_errors(server):
+                call = self._peers.stub(server).ContributeKeyframes(of_session())
+                stored: pb.ContributeKeyframesResponse = await call
+                return stored
+        except asyncio.CancelledError:
+            # gRPC cancels a call whose requests raise, and loses the error
+            if failures:
+                raise failures[0] from None
+            raise
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
         """Return a stored keyframe of an agent, for a person."""

@@ -39,11 +39,12 @@ from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.regions import ALL_SLOTS, wanted_slots
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
 from gausslite.v1.region_service_pb2 import RemoveAgentRequest, StorePartsRequest, SubsetPart
 from gausslite.v1.region_service_pb2_grpc import RegionServiceStub
 from gausslite.wire.channel import open_channel
 from gausslite.wire.clients import Export
-from gausslite.wire.convert import MapUpdate
+from gausslite.wire.convert import MapUpdate, frame_to_message
 
 pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
 
@@ -79,6 +80,10 @@ def latest_of(subsets: list[RoiSubset]) -> VoxelBatch:
         stored = decode_stored(encode_subset(subset, GRID))[0]
         store.put_all([replace(stored, voxels=stored.voxels.with_computed_sums())])
     return store.batch(subsets[0].agent_id)
+
+
+def keyframe_request(session_id: str, index: int) -> pb.ContributeKeyframesRequest:
+    return pb.ContributeKeyframesRequest(session_id=session_id, keyframe=frame_to_message(frame(index)))
 
 
 def offline(subsets: dict[str, list[RoiSubset]]) -> bytes:
@@ -191,6 +196,10 @@ def test_what_is_known_of_an_agent_is_the_same_at_every_server(servers: list[Sha
     assert three.contribute_keyframes(session, [frame(3), frame(4)]) == 2
     stored = [client.keyframe("ant") for client in (one, two, three)]
     assert [keyframe is not None and keyframe.index for keyframe in stored] == [4, 4, 4]
+    mixed = [keyframe_request(name, 4) for name in (session, "another")]
+    for server in servers:
+        with open_channel(server.address, None) as channel, pytest.raises(grpc.RpcError, match="got another"):
+            FusionServiceStub(channel).ContributeKeyframes(iter(mixed), timeout=20.0)
     assert [(agent.keyframes, list(agent.targets)) for agent in one.status().agents] == [(2, ["mug"])]
     with pytest.raises(MismatchError, match="several share this mission"):
         next(one.refine())
