@@ -170,6 +170,8 @@ class BrowserDetail:
         return statistics.median(times_s)
 
     def _wait_for_answer(self) -> None:
+        if self._is_closed:
+            raise ConnectionError("the page has closed")
         try:
             self._client.local_storage.get_item(_STORAGE_KEY, _ANSWER_LIMIT_S)
         except RuntimeError as error:

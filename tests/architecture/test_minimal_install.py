@@ -17,9 +17,10 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
+_SHARING = ("part_sender", "peers", "region_", "shared_", "sharing")
 NEED_AN_EXTRA = {
     "torch": ("gausslite.render.reference", "gausslite.render.cuda"),
-    "psycopg": ("gausslite.fusion.postgres_",),
+    "psycopg": ("gausslite.fusion.postgres_", *(f"gausslite_fusion_server.{name}" for name in _SHARING)),
     "rclpy": ("gausslite_ros.node",),
     "rospy": ("gausslite_ros.node_ros1",),
     "viser": ("gausslite_view", "gausslite_bench.view_rates"),

@@ -201,9 +201,13 @@ class _ChaosRun:
 
     def _resend(self) -> None:
         """Send messages of the past again: duplicates, in another order."""
-        agent_id = self._random.choice(list(self.team.acknowledged))
-        acknowledged = self.team.acknowledged[agent_id]
-        acknowledged.read()
+        chosen = self._random.choice(list(self.team.acknowledged))
+        # another one stands in for an agent that has sent nothing yet
+        for agent_id in (chosen, *self.team.acknowledged):
+            acknowledged = self.team.acknowledged[agent_id]
+            acknowledged.read()
+            if acknowledged.sent:
+                break
         # drawn also before the agent's first message, so that the seed alone decides the order of faults
         shares = [self._random.random() for _ in range(_RESENT_MESSAGES)]
         sent = list(acknowledged.sent)
