@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.export.free_space import narrower, seen_through
+from gausslite.export.free_space import narrower, points_before_surface
 from gausslite.export.occupancy import OccupancySettings, occupied_voxels, planar_grid
 from gausslite.wire.map_follower import FollowedMap
 
@@ -83,7 +83,7 @@ class LiveMap:
         camera = narrower(frame.camera, _WIDTH_PX)
         size = camera.width_px, camera.height_px
         depth_m = np.minimum(cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST), np.float32(_RANGE_M))
-        rays = seen_through(camera, depth_m, T_map_camera, self._settings.voxel_m)
+        rays = points_before_surface(camera, depth_m, T_map_camera, self._settings.voxel_m)
         found = [np.unique(self._grid.keys(points_m.astype(np.float32))) for points_m in rays]
         # the oldest keys have no place of their own: a mission that large needs larger cells
         self._free = np.unique(np.concatenate([self._free, *found]))[:_MAX_FREE]

@@ -159,7 +159,7 @@ class MappingWorker:
     ) -> Future[TaskGraph]:
         """Switch to this task with the next frame; the map is kept and earlier keyframes are re-evaluated.
 
-        A task that is equivalent to the current one changes nothing; without one, the current task goes on with what a
+        A task that is equivalent to the current one changes nothing; without one, the current task stays, with what a
         person points at. The future returns the graph; it raises InvalidInputError, ModelFileError and the like.
         """
         return self._submit(lambda: self._assign(graph, pointed, excluded_m))
@@ -260,7 +260,7 @@ class MappingWorker:
         return extended
 
     def _switch(self, graph: TaskGraph, is_extended: bool = False) -> TaskMapper:
-        """Make this the task of the next frame; return its mapper. is_extended: the task goes on with more targets."""
+        """Make this the task of the next frame; return its mapper. is_extended: the same task with more targets."""
         current = self.status().graph
         if self._task_mapper is None:
             self._task_mapper = TaskMapper(

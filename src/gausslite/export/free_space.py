@@ -55,7 +55,7 @@ def _carve(
     """Mark the voxels before the surface of one view."""
     camera = narrower(view.camera, _WIDTH_PX)
     depth_m = render(camera, view.T_world_camera).expected_depth_m()
-    for points_m in seen_through(camera, depth_m, view.T_world_camera, voxel_m):
+    for points_m in points_before_surface(camera, depth_m, view.T_world_camera, voxel_m):
         cells = np.floor(points_m / voxel_m).astype(np.int64) - first
         cells = cells[((cells >= 0) & (cells < free.shape)).all(axis=1)]
         free[tuple(cells.T)] = True
@@ -67,7 +67,7 @@ def narrower(camera: Camera, width_px: int) -> Camera:
     return camera.resized(width_px, max(1, round(camera.height_px * width_px / camera.width_px)))
 
 
-def seen_through(
+def points_before_surface(
     camera: Camera, depth_m: Float32[ndarray, "h w"], T_world_camera: Float64[ndarray, "4 4"], voxel_m: float
 ) -> Iterator[Float64[ndarray, "c 3"]]:
     """Yield the points of all rays at the same distance, in steps of half a voxel, up to the measured surface.
