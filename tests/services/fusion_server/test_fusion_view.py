@@ -211,8 +211,18 @@ def test_a_refinement_is_started_in_a_browser_which_then_shows_its_map():
 
 
 def choose(tab: Any, control: str, option: str) -> None:
-    tab.get_by_label(control).first.click()
-    tab.get_by_role("option", name=option, exact=True).click()
+    from playwright.sync_api import TimeoutError as NotVisibleError
+
+    item = tab.get_by_role("option", name=option, exact=True)
+    for attempt in range(5):
+        tab.get_by_label(control).first.click()
+        try:
+            item.click(timeout=WAIT_S * 200)
+            return
+        except NotVisibleError:
+            # a list that closed because the panel was drawn anew is opened again, as a person does
+            if attempt == 4:
+                raise
 
 
 def wall() -> VoxelBatch:
