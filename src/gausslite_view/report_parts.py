@@ -188,10 +188,6 @@ def as_decibels(value: float) -> str:
     return f"{value:.2f} dB"
 
 
-def _plain(value: float) -> str:
-    return f"{value:.3g}"
-
-
 def _similarity(value: float) -> str:
     return f"{value:.3f}"
 

@@ -103,12 +103,6 @@ class Camera:
         """Return the slopes of the rays through these image coordinates: the inverse of `pixels`."""
         return (columns - self.cx_px) / self.fx_px, (rows - self.cy_px) / self.fy_px
 
-    def corner_rays(self) -> Float64[ndarray, "4 3"]:
-        """Return the rays through the corners of the image, at a depth of 1, clockwise from the top left."""
-        width, height = self.width_px, self.height_px
-        x, y = self.slopes(np.array((0, width, width, 0)), np.array((0, 0, height, height)))
-        return np.column_stack([x, y, np.ones(4)])
-
     def pixels_per_s(self, x: ndarray, y: ndarray, rate: Float64[ndarray, "*n 3"]) -> tuple[ndarray, ndarray]:
         """Return the image velocity of points at slopes x and y; rate: their velocity divided by their depth."""
         return self.fx_px * (rate[..., 0] - x * rate[..., 2]), self.fy_px * (rate[..., 1] - y * rate[..., 2])

@@ -311,21 +311,6 @@ class TeamObject:
     observers: tuple[ObjectObserver, ...]
 
 
-def object_of_gaussian(
-    objects: Iterable[TeamObject], agent_id: str, target: int, mean_m: Iterable[float]
-) -> TeamObject | None:
-    """Return the object that a fused Gaussian shows: the nearest with this target of the agent that sent the Gaussian.
-
-    agent_id: the agent that won the Gaussian's voxel; target: the Gaussian's target index. None without such an object.
-    """
-    if target == NO_TARGET_INDEX:
-        return None
-    point = tuple(mean_m)
-    seen_as = (agent_id, target)
-    matching = [found for found in objects if seen_as in ((seen.agent_id, seen.target) for seen in found.observers)]
-    return min(matching, key=lambda found: found.landmark.distance_m(point), default=None)
-
-
 def found_text(
     objects: Sequence[ObjectLandmark], targets: Sequence[str], region_means_m: Float32[ndarray, "n 3"]
 ) -> str:

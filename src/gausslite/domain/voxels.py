@@ -307,10 +307,3 @@ def select_keys(batch: VoxelBatch, keys: Int64[ndarray, " k"]) -> VoxelBatch:
     counts, starts = batch.counts[rows], batch.offsets[rows]
     gaussians = batch.gaussians.take(gather_rows(starts, counts))
     return VoxelBatch(batch.keys[rows], batch.kappa_sums[rows], counts, gaussians)
-
-
-def slice_voxels(batch: VoxelBatch, start: int, stop: int) -> VoxelBatch:
-    """Return the voxels with the indices start to stop - 1, or fewer at the end of the batch."""
-    stop = min(stop, len(batch))
-    gaussians = batch.gaussians.take(np.arange(batch.offsets[start], batch.offsets[stop]))
-    return VoxelBatch(batch.keys[start:stop], batch.kappa_sums[start:stop], batch.counts[start:stop], gaussians)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from gausslite.codec.json import decode_object_report, encode_object_report
 from gausslite.domain.errors import CodecError, InvalidInputError
-from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole, object_of_gaussian
+from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.engine import FusionEngine
@@ -179,18 +179,6 @@ def test_a_landmark_that_moves_out_of_range_is_left_out_and_others_are_found() -
     T[0, 3] = 9000.0
     [table] = merge_objects(reports, {"ant": T})
     assert table.landmark.centroid_m == (9000.0, 0.0, 0.0)
-
-
-def test_a_gaussian_leads_to_the_object_of_its_target() -> None:
-    reports = {
-        "ant": report(landmark("mug", (0, 0, 0), 1), landmark("mug", (1, 0, 0), 2), landmark("table", (1, 0, 0)))
-    }
-    objects = merge_objects(reports)
-    found = object_of_gaussian(objects, "ant", 0, (0.9, 0, 0))
-    assert found is not None
-    assert found.landmark.object_id == "ant/mug-2"
-    assert object_of_gaussian(objects, "ant", -1, (0.9, 0, 0)) is None
-    assert object_of_gaussian(objects, "bee", 0, (0.9, 0, 0)) is None
 
 
 def test_reports_survive_in_the_store_and_end_with_the_agent(tmp_path: Path) -> None:
