@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from gausslite.domain.nouns import is_thing
@@ -16,6 +16,8 @@ from gausslite.task.tokens import Bounds
 _DRINK_WORDS = word_set(
     "wine beer water champagne drinking cocktail juice whisky whiskey shot pint milk measuring dirty empty"
 )
+_DEFINITE = word_set("the this that these those my your his her its our their")
+_PLACES_OF_A_THING = word_set("center centre middle edge")
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +26,8 @@ class NounPhrase:
 
     words: tuple[str, ...]
     has_determiner: bool
+    is_definite: bool = True
+    is_plural: bool = False
 
     @property
     def head(self) -> str:
@@ -50,6 +54,8 @@ def noun_phrase(words: Sequence[str], has_determiner: bool) -> NounPhrase:
     """Return the phrase of these words of a sentence."""
     kept = list(words)
     last = kept[-1]
+    if len(kept) > 1 and kept[-2] in lexicon.COMMON_ANCHORS and last in _PLACES_OF_A_THING:
+        return noun_phrase(kept[:-1], has_determiner)  # "the table center"
     kept[-1] = "glass" if last == "glasses" and _DRINK_WORDS.intersection(kept) else singular(last)
     return NounPhrase(tuple(kept), has_determiner)
 
@@ -157,9 +163,19 @@ class ChunkBuffer:
             )
         )
 
+    def _ends_with_state(self) -> bool:
+        """Return True for an unknown word after a noun, in "are the plants on the balcony dead"."""
+        *before, last = self.words
+        known = last in lexicon.NOUNS or is_thing(singular(last))
+        return bool(before) and not known and is_thing(before[-1]) and not self.tag(1)
+
     def close(self) -> None:
         """End the current noun phrase."""
         if self.words:
+            if self.tagged[0][1] is Tag.AUXILIARY and self.has_determiner and self._ends_with_state():
+                self.words.pop()
             noun = noun_phrase(self.words, self.has_determiner)
+            is_definite = self.has_determiner and self.tagged[self.determiner_at][0] in _DEFINITE
+            noun = replace(noun, is_definite=is_definite, is_plural=noun.head != self.words[-1])
             self.chunks.append(Chunk(ChunkKind.NOUN, self.words[-1], noun))
         self.words, self.has_determiner = [], False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from gausslite.domain import verbs
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind, adjectives_only
 from gausslite.task.clause_types import (
@@ -15,19 +16,12 @@ from gausslite.task.clause_types import (
     clause_types,
     is_command,
     is_modal,
+    is_question_subject,
 )
 from gausslite.task.lexicon import ORDINALS, is_attribute, word_set
 from gausslite.task.negation import HAVE_FORMS, NOUN_PHRASE_TAGS, OBJECT_START_TAGS, chunk_negation
 from gausslite.task.tags import Tag, tag_words
 from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
-from gausslite.task.verbs import (
-    ASPECT_VERBS,
-    BELONGING_VERBS,
-    GO_VERBS,
-    HOLDING_VERBS,
-    is_particle,
-    verb_base,
-)
 
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
@@ -52,17 +46,25 @@ class VerbChunker:
         """Handle "is", "has" and the like; "has" with an object means near."""
         buffer = self._buffer
         self._end_relative_subject(finite=True)
-        if word in HAVE_FORMS and buffer.last_kind() is ChunkKind.NOUN and buffer.tag(1) in OBJECT_START_TAGS:
-            buffer.emit_preposition("near")
+        continues = buffer.tag(-1) is Tag.RELATIVE and buffer.last_kind() is ChunkKind.CONJUNCTION  # "and which has"
+        if (
+            word in HAVE_FORMS
+            and (continues or buffer.last_kind() is ChunkKind.NOUN)
+            and buffer.tag(1) in OBJECT_START_TAGS
+        ):
+            buffer.emit_preposition("near", current_place=True)
         self._after_modal = is_modal(buffer.tagged, buffer.index) and buffer.last_kind() is ChunkKind.NOUN
 
     def verb(self, word: str) -> None:
         """Emit an instruction; a verb of a subordinate clause relates its object to its subject."""
         buffer = self._buffer
         self._end_relative_subject(finite=True)
-        base = verb_base(word) or word
+        base = verbs.verb_base(word) or word
         if buffer.negates_next:
             self._negated_verb(base)
+            return
+        if buffer.word(-3) == "what" or (buffer.index == 1 and buffer.word(-1) == "who"):
+            buffer.close()  # "what did you see on the shelf", "who put the ladder there"
             return
         subject, tagged, index = buffer.tag(-1), buffer.tagged, buffer.index
         is_required = self._after_modal
@@ -71,11 +73,11 @@ class VerbChunker:
         if subject is Tag.INFINITIVE and buffer.tag(-2) is Tag.INDEFINITE and buffer.tag(1) not in OBJECT_START_TAGS:
             buffer.close()  # "something to write with"
         elif is_required and self._subject_is_object():
-            if base in BELONGING_VERBS:
+            if base in verbs.BELONGING_VERBS:
                 buffer.emit(ChunkKind.SUBJECT_VERB, base)
         elif subject not in SUBJECT_TAGS or is_wish or is_command(tagged, index):
             buffer.emit(ChunkKind.VERB, base)
-        elif base in BELONGING_VERBS and subject is not Tag.PRONOUN:
+        elif base in verbs.BELONGING_VERBS and word.startswith(base) and subject not in (Tag.PRONOUN, Tag.RELATIVE):
             buffer.emit(ChunkKind.SUBJECT_VERB, base)
         elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.INDEFINITE) and buffer.tag(1) in OBJECT_START_TAGS | {Tag.PRONOUN}:
             self._subordinate_verb(base)
@@ -87,11 +89,13 @@ class VerbChunker:
         buffer = self._buffer
         before, after = buffer.tag(-1), buffer.tag(1)
         if buffer.negates_next:
-            self._negated_verb(verb_base(word) or word)
+            self._negated_verb(verbs.verb_base(word) or word)
             return
         can_start = buffer.has_determiner or before not in _BEFORE_GERUND_TAGS
         can_start = can_start or (
-            before is Tag.VERB and buffer.last_kind() is ChunkKind.VERB and buffer.chunks[-1].word not in ASPECT_VERBS
+            before is Tag.VERB
+            and buffer.last_kind() is ChunkKind.VERB
+            and buffer.chunks[-1].word not in verbs.ASPECT_VERBS
         )
         if can_start and after in NOUN_PHRASE_TAGS and lexicon.ADJECTIVES.issuperset(buffer.words):
             buffer.words.append(word)  # "the leaking pipe"
@@ -102,7 +106,7 @@ class VerbChunker:
         elif buffer.words or before in (Tag.NOUN, Tag.INDEFINITE, Tag.AUXILIARY, Tag.RELATIVE):
             self._gerund_after_noun(after)
         else:
-            buffer.emit(ChunkKind.VERB, verb_base(word) or word, gerund=True)
+            buffer.emit(ChunkKind.VERB, verbs.verb_base(word) or word, gerund=True)
 
     def participle(self, word: str) -> None:
         """Handle a participle: an adjective, a required state, or a modifier of the noun before it."""
@@ -113,7 +117,9 @@ class VerbChunker:
             return
         self._end_relative_subject(finite=after is Tag.PRONOUN)
         if self._after_modal and self._subject_is_object():
-            buffer.emit(ChunkKind.SUBJECT_VERB, verb_base(word) or word)
+            buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
+        elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
+            pass  # "the coffee went cold"
         elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN:
             buffer.chunks.pop()  # "the toy my son dropped": the son is irrelevant
         self._after_modal = False
@@ -121,8 +127,8 @@ class VerbChunker:
     def _negated_verb(self, base: str) -> None:
         """Skip the verb of "that is not standing on"; "who does not wear a helmet" means not near it."""
         self._buffer.close()
-        if base in HOLDING_VERBS:
-            self._buffer.emit_preposition("near")
+        if base in verbs.HOLDING_VERBS:
+            self._buffer.emit_preposition("near", current_place=True)
 
     def _end_relative_subject(self, finite: bool) -> None:
         """Remove the subject of a relative clause: the wife in "the mug (that) my wife uses"."""
@@ -138,10 +144,13 @@ class VerbChunker:
     def _subordinate_verb(self, base: str) -> None:
         """Handle the verb of a subordinate clause: "holds" in "the shelf that holds the cans" means near."""
         buffer = self._buffer
-        if base in HOLDING_VERBS:
-            buffer.emit_preposition("near")
-        elif buffer.tag(-1) is Tag.INDEFINITE and buffer.last_kind() is ChunkKind.NOUN:
-            buffer.chunks.pop()
+        buffer.close()
+        if base in verbs.HOLDING_VERBS:
+            buffer.emit_preposition("near", current_place=True)
+        elif buffer.last_kind() is ChunkKind.NOUN and (
+            buffer.tag(-1) is Tag.INDEFINITE or is_question_subject(buffer.tagged, buffer.index - 1)
+        ):
+            buffer.chunks.pop()  # "did the courier leave the envelope"
         else:
             buffer.emit_preposition("purpose")
 
@@ -152,7 +161,7 @@ class VerbChunker:
     def _gerund_after_noun(self, after: Tag | None) -> None:
         """Relate the object of the gerund: "the person holding a cup" is near the cup."""
         if after in OBJECT_START_TAGS:
-            self._buffer.emit_preposition("near")
+            self._buffer.emit_preposition("near", current_place=True)
         else:
             self._buffer.close()
 
@@ -259,11 +268,13 @@ class _Chunker:
         before = (buffer.tag(-1), buffer.tag(-2))
         follows_noun = Tag.INDEFINITE in before or Tag.RELATIVE in (buffer.tag(-2), buffer.tag(-3))
         is_it = self._is_statement and before == (Tag.AUXILIARY, Tag.ANAPHOR)  # "it is black"
-        follows_noun = follows_noun or (self._is_statement and before == (Tag.AUXILIARY, Tag.NOUN))
+        is_description = not any(other in (Tag.VERB, Tag.INDEFINITE) for _, other in buffer.tagged)
+        follows_noun = follows_noun or ((self._is_statement or is_description) and before == (Tag.AUXILIARY, Tag.NOUN))
         if is_attribute(word) and (
             is_it or (follows_noun and buffer.last_kind() in (ChunkKind.NOUN, ChunkKind.CONJUNCTION))
         ):
-            buffer.chunks.append(Chunk(ChunkKind.ATTRIBUTE, word, negated=buffer.negates_next))
+            plural = "are" if "are" in (buffer.word(-1), buffer.word(-2)) else ""
+            buffer.chunks.append(Chunk(ChunkKind.ATTRIBUTE, word, negated=buffer.negates_next, text=plural))
         buffer.negates_next = False
 
     def _determiner(self, word: str) -> None:
@@ -278,8 +289,11 @@ class _Chunker:
     def _indefinite(self, word: str) -> None:
         buffer = self._buffer
         buffer.close()
+        asked = [buffer.tag(offset) for offset in (2, 3, 4)]
+        if word == "what" and asked == [Tag.PRONOUN, Tag.VERB, Tag.PREPOSITION]:
+            buffer.emit(ChunkKind.VERB, "find")  # "what did I put in the drawer"
         # "what does the sign say", "what is that thing"
-        if word == "what" and (
+        elif word == "what" and (
             buffer.word(1) in _DO_FORMS or (buffer.tag(2) in OBJECT_START_TAGS and buffer.tag(1) is Tag.AUXILIARY)
         ):
             return
@@ -333,13 +347,22 @@ class _Chunker:
         if word == "of" and before is Tag.DETERMINER and not buffer.words:
             return
         directly = not buffer.words and buffer.last_kind() is ChunkKind.VERB and before is Tag.VERB
-        if directly and bounds is None and is_particle(buffer.chunks[-1].word, word):
-            if relation in _ROUTE_RELATIONS and buffer.chunks[-1].word in GO_VERBS:
+        elided = word == "in" and [chunk.kind for chunk in buffer.chunks[-3:-1]] == [
+            ChunkKind.NOUN,
+            ChunkKind.CONJUNCTION,
+        ]
+        elided = elided and buffer.chunks[-1].word in verbs.PLACE_VERBS  # "rinse the plate and put in the rack"
+        if directly and bounds is None and not elided and verbs.is_particle(buffer.chunks[-1].word, word):
+            if relation in _ROUTE_RELATIONS and buffer.chunks[-1].word in verbs.GO_VERBS:
                 buffer.emit_preposition("via", word)
             return
         in_modifier = before is Tag.GERUND or buffer.tag(-2) is Tag.RELATIVE
-        if relation == "to" and in_modifier and buffer.last_kind() is ChunkKind.NOUN:
-            relation = "purpose"  # "the door that leads to the hall"
+        buffer.close()
+        if relation == "to" and buffer.last_kind() is ChunkKind.NOUN:
+            if in_modifier:
+                relation = "purpose"  # "the door that leads to the hall"
+            elif before is Tag.PARTICIPLE and buffer.last_verb() not in WISHES:
+                relation = "near"  # "the chair pushed into the desk"
         if after is Tag.PREPOSITION or (after is Tag.GERUND and word in ("for", "by", "before", "after")):
             buffer.close()
             return

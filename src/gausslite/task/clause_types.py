@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Final
 
+from gausslite.domain.verbs import BELONGING_VERBS, verb_base
 from gausslite.task.lexicon import word_set
 from gausslite.task.tags import Tag
-from gausslite.task.verbs import BELONGING_VERBS, verb_base
 
 TaggedWords = Sequence[tuple[str, Tag]]
 
@@ -65,12 +65,12 @@ def is_command(tagged: TaggedWords, index: int) -> bool:
         return False
     if subject not in SUBJECT_TAGS or subject_at < index - 1:
         return True
-    if subject is Tag.RELATIVE or verb_base(word) != word or _is_question_subject(tagged, subject_at):
+    if subject is Tag.RELATIVE or verb_base(word) != word or is_question_subject(tagged, subject_at):
         return False
     return subject is not Tag.NOUN or not (before.endswith("s") or verb_base(word) in BELONGING_VERBS)
 
 
-def _is_question_subject(tagged: TaggedWords, subject_at: int) -> bool:
+def is_question_subject(tagged: TaggedWords, subject_at: int) -> bool:
     """Return True if an auxiliary precedes the subject: "does the shelf hold"."""
     while subject_at > 0 and tagged[subject_at][1] in _SUBJECT_PHRASE_TAGS:
         subject_at -= 1
@@ -119,6 +119,8 @@ def _clause_type(tagged: TaggedWords, start: int, end: int, before: ClauseType) 
         return ClauseType.REASON
     if clause and opener[0] in _TIMES and clause[0][0] in _OTHER_PEOPLE | {"we"}:
         return ClauseType.STATEMENT  # "while I hold the door"
+    if clause and opener[0] == "before" and clause[0][1] is Tag.ANAPHOR:
+        return ClauseType.STATEMENT  # "before it reaches the rug"
     if not clause or (opener[1] is Tag.CLAUSE_BREAK and opener[0] in _CONDITIONS):
         return ClauseType.REQUEST
     is_statement = clause[0][0] in _UNKNOWN_PEOPLE and len(clause) > 1 and clause[1][1] in _PREDICATES
@@ -127,7 +129,9 @@ def _clause_type(tagged: TaggedWords, start: int, end: int, before: ClauseType) 
         return ClauseType.REQUEST
     # "bring the hammer. And the nails."
     elliptic = not any(tag in (Tag.AUXILIARY, Tag.VERB, Tag.PRONOUN) for _, tag in clause)
-    return before if elliptic and before is ClauseType.REQUEST else ClauseType.STATEMENT
+    # "there are two sinks. The one near the door."
+    names = clause[0][1] in (Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE) and opener[1] is Tag.CLAUSE_BREAK
+    return ClauseType.REQUEST if elliptic and (before is ClauseType.REQUEST or names) else ClauseType.STATEMENT
 
 
 def is_modal(tagged: TaggedWords, index: int) -> bool:
@@ -148,7 +152,17 @@ def _is_request(tagged: TaggedWords, index: int) -> bool:
         return True
     if is_modal(tagged, index) and before in SUBJECT_TAGS and before is not Tag.PRONOUN:
         return True
-    if tag is not Tag.VERB:
+    if tag is not Tag.VERB or (before is Tag.INFINITIVE and _is_wish_of_another(tagged, index - 2)):
         return False
     base = verb_base(word)
-    return is_command(tagged, index) or base in BELONGING_VERBS or base in WISHES
+    return (
+        is_command(tagged, index)
+        or base in BELONGING_VERBS
+        or (base in WISHES and not _is_wish_of_another(tagged, index))
+    )
+
+
+def _is_wish_of_another(tagged: TaggedWords, index: int) -> bool:
+    """Return True for "the dog wants to"."""
+    tags = [tag for _, tag in tagged[max(index - 1, 0) : index + 2]]
+    return tags == [Tag.NOUN, Tag.VERB, Tag.INFINITIVE] and verb_base(tagged[index][0]) in WISHES

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gausslite.domain.task import TargetRole
+from gausslite.domain.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS, PLACE_VERBS, SPEAKING_VERBS
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
 from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
 from gausslite.task.roles import RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
-from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is
@@ -48,6 +48,7 @@ class GraphBuilder:
         self._partitive: tuple[NounPhrase, str | None] | None = None  # "the largest" of "the largest of the boxes"
         self._described: str | None = None  # the latest object, which an attribute may describe
         self._adjectives: list[NounPhrase] = []
+        self._plurals: set[str] = set()
         self._following: Sequence[Chunk] = ()
 
     def add(self, before: Chunk | None, chunk: Chunk, following: Sequence[Chunk]) -> None:
@@ -59,6 +60,7 @@ class GraphBuilder:
             self._clause.verb = "put" if chunk.word in BELONGING_VERBS else chunk.word
             self._clause.last_relation, self._negated = None, False
         elif chunk.kind is ChunkKind.NOUN and chunk.noun is not None:
+            self._plurals |= {chunk.noun.text} if chunk.noun.is_plural else set()
             self._noun(before, chunk.noun, after)
         elif chunk.kind is ChunkKind.PREPOSITION:
             # "all but the lighter, to the tent": the exception ends here
@@ -79,8 +81,12 @@ class GraphBuilder:
         elif chunk.kind is ChunkKind.NOT_UNDERSTOOD:
             self._draft.warnings.append(f"{chunk.word!r} is not understood: it is dropped")
         elif chunk.kind is ChunkKind.ATTRIBUTE:
-            if before is not None and before.kind is ChunkKind.CONJUNCTION:  # "near the door and is not blue"
-                self._described = next(reversed(self._clause.objects), self._described)
+            described = next(reversed(self._clause.objects), self._described)
+            # "near the door and is not blue", "the umbrellas in the stand that are black"
+            if (before is not None and before.kind is ChunkKind.CONJUNCTION) or (
+                chunk.text and described in self._plurals and self._described not in self._plurals
+            ):
+                self._described = described
             self._describe(chunk.word, chunk.negated)
 
     def finish(self) -> GraphDraft:
@@ -92,6 +98,9 @@ class GraphBuilder:
     def _preposition(self, before: Chunk | None, chunk: Chunk) -> None:
         clause = self._clause
         clause.adds_place = before is not None and before.kind is ChunkKind.CONJUNCTION
+        if chunk.word == "of" and clause.skip_of_phrase:  # "around the edge of the table"
+            self._pending = "of"
+            return
         self._pending, clause.preposition, clause.current_place = chunk.word, chunk.text, chunk.current_place
         clause.terms = RelationTerms(chunk.word, chunk.negated, chunk.bounds or UNBOUNDED)
 
@@ -117,6 +126,7 @@ class GraphBuilder:
         self._avoids = word.startswith("avoid ")
 
     def _negate(self) -> None:
+        self._assigner.reach_places()  # "wait by the door but don't open it"
         self._pending, self._negated, self._avoids, self._negated_objects = None, True, False, []
         self._clause.nouns_since_negation = 0
         self._clause.verb_since_negation = False
@@ -130,7 +140,8 @@ class GraphBuilder:
         return named and (not rest or rest[0] in (ChunkKind.CLAUSE_BREAK, ChunkKind.VERB))
 
     def _verb(self, before: Chunk | None, chunk: Chunk) -> None:
-        is_leave = chunk.word == "leave" and not self._clause.statement
+        is_kept = chunk.word == "keep" and before is not None and before.word == "but"
+        is_leave = (chunk.word == "leave" or is_kept) and not self._clause.statement
         if is_leave and self._draft.targets and self._leave_excludes(before):
             self._negate()
             return
@@ -164,7 +175,17 @@ class GraphBuilder:
     def _resolve_back_reference(self, word: str, before: Chunk | None) -> None:
         """Resolve "it" or "them": the clause's objects, or after a preposition the objects named before these."""
         clause = self._clause
-        if not clause.referents and not clause.objects and before is not None and before.kind is ChunkKind.VERB:
+        is_object = before is not None and before.kind is ChunkKind.VERB
+        if (
+            not clause.referents
+            and not clause.objects
+            and is_object
+            and not self._negated
+            and (self._negated_objects[:1] == self._draft.excluded[:1] != [])
+        ):
+            clause.referents = [self._draft.excluded.pop(0)]  # "don't put the knife in the dishwasher, wash it"
+            self._draft.add_target(clause.referents[0])
+        if not clause.referents and not clause.objects and is_object:
             self._handle_demonstrative(word, before, None)
             return
         pending, self._pending = self._pending, None
@@ -179,6 +200,7 @@ class GraphBuilder:
             return
         if pending is None:
             clause.objects = clause.objects or list(clause.referents)
+            self._described = next(reversed(clause.objects), self._described)
             if not clause.statement:
                 clause.by_pronoun = bool(clause.verb and clause.objects)
                 self._draft.confirm_targets(clause.objects)
@@ -210,6 +232,7 @@ class GraphBuilder:
         if noun.words in _ADDRESSED_ROBOTS and not (noun.has_determiner or self._clause.verb or self._pending):
             return
         conjoined = before is not None and before.kind is ChunkKind.CONJUNCTION
+        self._clause.is_alternative = conjoined and before is not None and before.word == "or"
         if conjoined and self._corrects and self._clause.nouns_since_negation:
             self._negated = False  # "not the wooden spoon, the metal one"
         if noun.head in ("one", "ones"):
@@ -218,7 +241,8 @@ class GraphBuilder:
                 return
             noun = self._resolve_one(noun)
         pending, self._pending = self._pending, None
-        if pending == "of" and self._described and self._described.split()[-1] in lexicon.PICTURES:
+        is_picture = bool(self._described) and (self._described or "").split()[-1] in lexicon.PICTURES
+        if pending == "of" and not self._clause.skip_of_phrase and is_picture:
             self._draft.warnings.append(f"what {self._described!r} shows is not understood: {noun.text!r} is dropped")
             return
         if self._partitive is not None and pending in (None, "of"):
@@ -231,12 +255,16 @@ class GraphBuilder:
         if not _names_object(noun, pending, self._following, self._clause.verb):
             self._skip_noun(noun, pending, conjoined, after)
             return
-        if pending is not None and lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS:
-            pending = "inside"
+        in_space = lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS
+        self._assign_listed(noun, "inside" if in_space and pending not in (None, "via") else pending, conjoined)
+
+    def _assign_listed(self, noun: NounPhrase, pending: str | None, conjoined: bool) -> None:
+        """Assign or exclude the noun, and the adjectives before it that share it."""
         nouns = [*(_with_shared_head(adjective, noun) for adjective in self._adjectives), noun]
         self._adjectives = []
         for listed in nouns:
-            if self._negated and pending == "to" and not self._clause.verb_since_negation:
+            goes = pending == "to" or (self._clause.verb in PLACE_VERBS and not self._clause.current_place)
+            if self._negated and pending and goes and not self._clause.verb_since_negation and self._negated_objects:
                 self._negated = False  # "bring everything except the knife to the sink"
             if self._negated:
                 self._exclude(listed, pending)
@@ -270,20 +298,22 @@ class GraphBuilder:
         if len(one.words) == 1:
             return phrase_from_text(named[-1])
         described = NounPhrase((*one.words[:-1], *same.words), one.has_determiner)
-        if self._draft.is_from_statement(named[-1]):  # "there are two mugs on the table, take the red one"
+        if (
+            self._pending in (None, "purpose") and not self._negated and self._draft.is_from_statement(named[-1])
+        ):  # "there are two mugs on the table, take the red one"
             self._assigner.rename(named[-1], described.text)
         return described
 
     def _skip_noun(self, noun: NounPhrase, pending: str | None, conjoined: bool, after: Chunk | None) -> None:
         """Skip a noun that names no object; in "on the edge of the table" the table inherits the "on"."""
-        if pending is not None and self._clause.terms.negated:
+        of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
+        if pending is not None and self._clause.terms.negated and not of_follows:
             words = f"not {self._clause.preposition} {noun.text}"
             self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
         if noun.head in lexicon.ROUTES:
             self._clause.route = True
         elif noun.head in lexicon.PLACES and pending is None:
             self._draft.whole_place = noun.text
-        of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
         self._clause.inherited_preposition = pending if of_follows else None
         self._clause.skip_of_phrase, self._clause.inherited_conjoined = of_follows, conjoined
 
@@ -299,37 +329,47 @@ class GraphBuilder:
         clause.nouns_since_negation += 1
         if not direct:
             self._place_negated(noun, pending or "near")
-        elif self._avoids or (clause.verb_since_negation and clause.verb in CONTACT_VERBS | GO_VERBS):
+        elif self._avoids or (clause.verb_since_negation and self._may_harm(pending)):
             self._draft.add_target(noun.text, TargetRole.OBSTACLE)
             self._negated_objects.append(noun.text)
         else:
             self._draft.exclude(noun.text)
             self._negated_objects.append(noun.text)
 
+    def _may_harm(self, pending: str | None) -> bool:
+        """Return True for "don't touch", and for "don't go near" or "over", unlike "don't go to"."""
+        verb = self._clause.verb
+        return verb in CONTACT_VERBS or (verb in GO_VERBS and pending in ("near", "on", "above", "past", "via"))
+
     def _place_negated(self, noun: NounPhrase, relation: str) -> None:
         """Relate an obstacle to its place; "the mugs except the one on the shelf" negates the relation."""
         terms = self._clause.terms
-        objects = self._negated_objects
+        objects = self._negated_objects or (self._clause.referents if self._clause.verb is None else [])
+        relation = "near" if relation == "with" else relation
         if objects and all(self._draft.roles.get(phrase) is TargetRole.OBSTACLE for phrase in objects):
             self._draft.add_relation(RelationTerms(relation, terms.negated, terms.bounds), objects, noun.text)
         elif objects and all(phrase in self._draft.targets for phrase in objects) and not lexicon.is_space(noun.words):
             self._draft.excluded = [phrase for phrase in self._draft.excluded if phrase not in objects]
             self._draft.add_relation(RelationTerms(relation, not terms.negated, terms.bounds), objects, noun.text)
         else:
+            if self._clause.verb in PLACE_VERBS and self._clause.verb_since_negation:
+                self._draft.exclude(noun.text)
+                return
             self._draft.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")
 
 
 def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chunk], verb: str | None) -> bool:
     """Return False for names of the robot, and for places, routes and amounts that stand for another noun."""
-    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES:
+    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES and not (noun.has_determiner and pending == "to"):
         return False
     if noun.head in lexicon.TASK_NOUNS and pending is None:
         return False
     of_follows = bool(following) and following[0].kind is ChunkKind.PREPOSITION and following[0].word == "of"
     content = following[1].noun if of_follows and len(following) > 1 else None
-    if content is not None and not content.has_determiner and noun.head not in lexicon.CONTAINERS:
+    is_picture = noun.head in lexicon.PICTURES and verb not in _PICTURING_VERBS
+    if content is not None and not (content.has_determiner or is_picture or noun.head in lexicon.CONTAINERS):
         return False  # "a bar of soap"
-    if of_follows and noun.head in lexicon.PICTURES and verb not in _PICTURING_VERBS:
+    if of_follows and is_picture:
         return True
     compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
     if compound and noun.head in lexicon.PLACES and not of_follows:
@@ -337,7 +377,8 @@ def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chu
     if noun.head in lexicon.PHYSICAL_MEASURES and verb in HANDLING_VERBS and pending is None and not of_follows:
         return True
     unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
-    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in (None, "from", "of", "to", "on"):
+    likely = (None, "from", "of", "to", "on", "with" if noun.has_determiner else None)
+    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in likely:
         return False
     if noun.head in lexicon.BUILDINGS:
         return pending != "inside" or bool(noun.words[1:])
@@ -345,7 +386,16 @@ def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chu
         if pending == "to" and lexicon.is_space(noun.words):
             return True  # "to the cold room"
         return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
-    if noun.head in lexicon.ROUTES and not compound:
+    if (
+        verb in SPEAKING_VERBS | {"report"}
+        and pending is None
+        and (verb == "say" or of_follows)
+        and noun.head not in lexicon.PEOPLE
+    ):
+        return False  # "say your name", "tell me the name of the person"
+    if noun.words == ("light",) and of_follows and pending is not None:
+        return False  # "by the light of the lamp"
+    if noun.head in lexicon.ROUTES and not compound and noun.words[0] not in lexicon.COLOURS:
         return pending not in (None, "of", "for", "to")
     if noun.head in lexicon.MEASURES and pending not in (None, "of"):
         return not of_follows

@@ -160,9 +160,10 @@ class Clause:
     """The objects a verb acts on, the candidates for "it" (referents), and places still without an object.
 
     places: the destinations or tools named last, which further places describe. terms: of the latest preposition.
-    superlative: "nearest" or "farthest" before the latest object. conjoined: the latest object followed
-    a conjunction. by_pronoun: the objects come from "it" or "them". adds_place: the preposition follows a conjunction.
-    route: the clause mentions a path. skip_of_phrase: the next "of" continues a noun that names no object.
+    superlative: "nearest" or "farthest" before the latest object. conjoined, is_alternative: a conjunction, or "or",
+    precedes the latest noun. describes: an indefinite noun after "with" does. by_pronoun: the objects come from "it".
+    adds_place: the preposition follows a conjunction. route: the clause mentions a path. skip_of_phrase: the next "of"
+    continues a noun that names no object.
     """
 
     def __init__(self, verb: str | None = None, referents: list[str] | None = None) -> None:
@@ -176,6 +177,8 @@ class Clause:
         self.superlative: str | None = None
         self.statement = False
         self.conjoined = False
+        self.describes = False
+        self.is_alternative = False
         self.is_part = False
         self.between = False
         self.in_space = False

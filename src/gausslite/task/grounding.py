@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 from gausslite.domain.errors import TaskError
+from gausslite.domain.nouns import are_one_kind
+from gausslite.domain.objects import same_kind
 from gausslite.domain.task import (
     EXAMPLE,
     LIMITS,
@@ -108,15 +110,8 @@ _ANY_OBJECT = (
     | {word for word, noun in lexicon.INDEFINITE_PRONOUNS.items() if noun == "object"}
     | word_set("this that these those it them one ones whatever everywhere")
 )
-_SYNONYMS = tuple(
-    word_set(line)
-    for line in (
-        "sofa couch", "fridge refrigerator", "tv television", "bike bicycle", "phone cellphone telephone smartphone",
-        "trash garbage rubbish litter waste", "tap faucet", "cupboard cabinet", "rug carpet", "elevator lift",
-        "mug cup",
-        "laptop notebook computer", "bin can", "photo picture", "shelf bookshelf", "purse handbag", "plane airplane",
-    )
-)  # fmt: skip
+# beside the nouns of one kind in the vocabulary
+_SYNONYMS = tuple(map(word_set, ("trash garbage rubbish litter waste", "cupboard cabinet", "elevator lift", "bin can")))
 _ARTICLES = word_set("a an the this that these those my your his her its our their some any all every each")
 
 
@@ -306,4 +301,6 @@ def _is_mentioned(phrase: str, mentioned: frozenset[str]) -> bool:
         return bool(mentioned & _ANY_OBJECT) or any(lexicon.is_space((word,)) for word in mentioned)
     if head == "person":
         return bool(mentioned & lexicon.PEOPLE)
-    return any(head in group and mentioned & group for group in _SYNONYMS)
+    if any(head in group and mentioned & group for group in _SYNONYMS):
+        return True
+    return any(are_one_kind(head, word) or same_kind(head, word) for word in mentioned)

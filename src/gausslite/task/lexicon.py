@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from gausslite.domain.nouns import is_thing
 from gausslite.domain.task import Superlative
-
-
-def word_set(text: str) -> frozenset[str]:
-    """Return the set of the words of a text."""
-    return frozenset(text.split())
-
+from gausslite.domain.verbs import word_set as word_set
 
 COLOURS: Final = word_set(
     "red green blue yellow orange black white grey gray brown pink purple beige silver golden gold turquoise violet "
@@ -55,15 +51,6 @@ COMPARATIVES: Final = frozenset(
     if word.endswith("er") and superlative not in (Superlative.NEAREST, Superlative.FARTHEST)
 ) | word_set("heavier lighter older newer thicker thinner")
 DISTANCE_SUPERLATIVES: Final = frozenset({Superlative.NEAREST, Superlative.FARTHEST})
-# superlatives of properties that geometry does not show
-UNSEEN_SUPERLATIVES: Final = word_set(
-    "oldest newest heaviest lightest cheapest cleanest dirtiest hottest coldest warmest coolest best worst fastest "
-    "slowest freshest strongest weakest hardest softest brightest darkest safest loudest quietest ripest sharpest "
-    "youngest latest earliest nicest prettiest fullest emptiest driest wettest finest poorest richest heavier older "
-    "newer cheaper dirtier hotter colder warmer younger fresher sturdiest busiest simplest easiest fanciest "
-    "darker "
-    "brighter softer harder stronger weaker fuller emptier dirtiest drier wetter safer"
-)
 ORDINALS: Final = word_set("first second third fourth fifth sixth seventh eighth ninth tenth last")
 _JOINED: Final = "-and-"
 
@@ -80,7 +67,19 @@ class DescribedNoun:
 
 def is_attribute(word: str) -> bool:
     """Return True for words that never stand in a name."""
-    return word in SUPERLATIVES or word in UNSEEN_SUPERLATIVES or word in ORDINALS or _is_colour(word)
+    return word in SUPERLATIVES or is_unseen(word) or word in ORDINALS or _is_colour(word)
+
+
+def is_unseen(word: str) -> bool:
+    """Return True for the superlative or comparative of a property that geometry does not show: "oldest", "heavier"."""
+    ending = next((ending for ending in ("est", "er") if word.endswith(ending)), None)
+    if ending is None or word in ADJECTIVES or (ending == "er" and is_thing(word)):
+        return word in ("best", "worst")
+    stem = word.removesuffix(ending)
+    return any(
+        adjective in ADJECTIVES
+        for adjective in (stem, stem + "e", stem[:-1] + "y") + (stem[:-1],) * (stem[-2:-1] == stem[-1:])
+    )
 
 
 def split_attributes(phrase: str) -> DescribedNoun:
@@ -94,7 +93,7 @@ def split_attributes(phrase: str) -> DescribedNoun:
         following = words[at + 1] if at + 1 < len(words) else head
         if word in SUPERLATIVES:
             superlative = SUPERLATIVES[word]
-        elif word in UNSEEN_SUPERLATIVES or (word in ORDINALS and (word, following) != ("first", "aid")):
+        elif is_unseen(word) or (word in ORDINALS and (word, following) != ("first", "aid")):
             unseen.append(word)
         elif (_is_colour(word) and (word, following) not in _COLOUR_COMPOUNDS) or (
             word in _SHADES and _is_colour(following) and at + 1 < len(words)
@@ -169,21 +168,11 @@ INDEFINITE_PRONOUNS: Final = {
 COMPOUND_OPENERS: Final = frozenset({("first", "aid"), ("second", "hand")})
 # irrelevant to the graph; most other adverbs end in -ly
 ADVERBS: Final = word_set(
-    "please so kindly yo pls plz thx ta cheers hey ok okay hello hi yes no-one thanks thank quickly slowly just now "
-    "also too again very really so-so here there else sure still already yet always currently almost instead fast "
-    "soon later today tonight tomorrow yesterday sometime sometimes whenever maybe perhaps probably certainly exactly "
-    "directly straight precisely about approximately roughly nearly nearby anywhere somewhere together alone "
-    "afterwards finally firstly even ever quite rather pretty otherwise therefore however anyway indeed twice "
-    "possible necessary ago overhead only able um uh er erm hmm oh"
-)
-# gerunds that begin a compound noun: the charging station, a washing machine
-COMPOUND_GERUNDS: Final = word_set(
-    "charging washing loading parking dining living drying cutting swimming sleeping ironing changing sewing vending "
-    "reading shopping rocking recycling cooking baking frying mixing serving waiting meeting fishing watering "
-    "measuring packing gardening climbing welding milking landing docking lighting heating cooling smoking dressing "
-    "soldering chopping rolling mailing filing weighing boarding bowling boxing camping cleaning operating sorting "
-    "training knitting polling printing pruning racing riding running sailing seating shaving skipping spinning "
-    "steering swinging wedding wrapping writing"
+    "please so yo pls plz thx ta cheers hey ok okay hello hi yes no-one thanks thank just now also too again very "
+    "so-so here there else sure still already yet always almost instead fast soon later today tonight tomorrow "
+    "yesterday sometime sometimes whenever maybe perhaps straight about nearly nearby anywhere somewhere together "
+    "alone afterwards even ever quite rather pretty otherwise therefore however anyway indeed twice possible necessary "
+    "ago overhead halfway only able um uh er erm hmm oh"
 )
 # names and forms of address for the robot
 ADDRESSEES: Final = word_set(
@@ -268,19 +257,17 @@ HELD_TOOLS: Final = word_set(
 )
 GENERIC: Final = word_set("object thing item stuff obstacle obstruction clutter hazard debris target")
 
-ADJECTIVES: Final = word_set(
-    "red green blue yellow orange black white grey gray brown pink purple beige silver golden dark light bright big "
-    "small large little tiny huge tall short long wide narrow thick thin round square flat heavy old new broken clean "
-    "dirty dusty wet dry empty full open closed wooden metal metallic plastic glass ceramic leather soft hard damaged "
-    "fragile hot cold warm clear transparent striped loose left right upper lower top bottom front back rear "
-    "suspicious unknown dangerous moving static movable fallen spilled unused used nearest closest relevant important "
-    "leftmost rightmost highest lowest biggest largest smallest tallest free main far deep shallow strong weak loud "
-    "quiet fresh stale ripe raw sharp blunt smooth rough sticky greasy muddy rusty shiny plain spare extra quarter "
-    "double missing electric electronic wireless portable safe unsafe sick ill tired busy young elderly friendly oily "
-    "curly woolly silly early local nice good bad fine great pretty cute cheap expensive high low foreign modern "
-    "ancient antique tidy messy woollen rubber steel iron brass copper cotton concrete turquoise violet maroon navy "
-    "crimson scarlet ivory cream tan bronze teal lilac magenta cyan vertical horizontal upright final initial "
-    "original correct proper exact current previous"
+ADJECTIVES: Final = COLOURS.union(SUPERLATIVES) | word_set(
+    "dark light bright big small large little tiny huge tall short long wide narrow thick thin round square flat heavy "
+    "old new broken clean dirty dusty wet dry empty full open closed wooden metal metallic plastic glass ceramic "
+    "leather soft hard damaged fragile hot cold warm clear transparent striped loose left right upper lower top bottom "
+    "front back rear suspicious unknown dangerous moving static movable fallen spilled unused used relevant important "
+    "free main far deep shallow strong weak loud quiet fresh stale ripe raw sharp blunt smooth rough sticky greasy "
+    "muddy rusty shiny plain spare extra quarter double missing electric electronic wireless portable safe unsafe sick "
+    "ill tired busy young elderly friendly oily curly woolly silly early local nice good bad fine great pretty cute "
+    "cheap expensive high low foreign modern ancient antique tidy messy woollen rubber steel iron brass copper cotton "
+    "concrete vertical horizontal upright final initial original correct proper exact current previous fast slow "
+    "sturdy cool rich easy fancy simple poor late"
 )
 
 # words that always exclude the following noun or verb
@@ -293,17 +280,17 @@ _EXCLUDING: Final = (
 NEGATIONS: Final = frozenset(tuple(negation.split()) for negation in _EXCLUDING.split("|"))
 
 
-_IRREGULAR: Final = {
-    "people": "person", "men": "man", "women": "woman", "children": "child", "feet": "foot", "teeth": "tooth",
-    "mice": "mouse", "geese": "goose", "shelves": "shelf", "bookshelves": "bookshelf", "knives": "knife",
-    "leaves": "leaf", "loaves": "loaf", "scarves": "scarf", "halves": "half", "wolves": "wolf", "lives": "life",
-    "buses": "bus", "lenses": "lens", "viruses": "virus", "cacti": "cactus", "dice": "dice", "dies": "die",
-    "tvs": "tv", "cds": "cd", "dvds": "dvd", "pcs": "pc",
-    "ties": "tie", "pies": "pie", "cookies": "cookie", "brownies": "brownie", "movies": "movie", "hoodies": "hoodie",
-    "selfies": "selfie", "potatoes": "potato", "tomatoes": "tomato", "mangoes": "mango", "heroes": "hero",
-    "caches": "cache", "aches": "ache", "axes": "axe", "persons": "person", "gases": "gas", "calves": "calf",
-    "humans": "human", "rubbish": "rubbish", "quizzes": "quiz", "policemen": "policeman", "workmen": "workman",
-}  # fmt: skip
+_IRREGULAR: Final = dict(
+    pair.split(":")
+    for pair in word_set(
+        "people:person men:man women:woman children:child feet:foot teeth:tooth mice:mouse geese:goose shelves:shelf "
+        "bookshelves:bookshelf knives:knife leaves:leaf loaves:loaf scarves:scarf halves:half wolves:wolf lives:life "
+        "buses:bus lenses:lens viruses:virus cacti:cactus dice:dice dies:die tvs:tv cds:cd dvds:dvd pcs:pc ties:tie "
+        "pies:pie cookies:cookie brownies:brownie movies:movie hoodies:hoodie selfies:selfie potatoes:potato "
+        "tomatoes:tomato mangoes:mango heroes:hero caches:cache aches:ache axes:axe persons:person gases:gas "
+        "calves:calf humans:human rubbish:rubbish quizzes:quiz policemen:policeman workmen:workman"
+    )
+)
 # words that singular() returns unchanged: plural in form only, or singular with a final s
 UNCHANGED: Final = word_set(
     "scissors glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from gausslite.domain.verbs import HOLDING_VERBS, POSTURE_VERBS, TOOL_VERBS, verb_base
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind
 from gausslite.task.clause_types import INABILITIES, WISHES
 from gausslite.task.lexicon import is_attribute, singular, word_set
 from gausslite.task.tags import Tag
-from gausslite.task.verbs import HOLDING_VERBS, POSTURE_VERBS, TOOL_VERBS, verb_base
 
 HAVE_FORMS: Final = word_set("has have had")
 NOUN_PHRASE_TAGS: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE})
@@ -102,8 +102,10 @@ def _negates_place(buffer: ChunkBuffer) -> bool:
     base, after = verb_base(buffer.word(1)), buffer.tag(2)
     if buffer.tag(-1) is Tag.AUXILIARY and buffer.word(1) in HAVE_FORMS and after in OBJECT_START_TAGS:
         return True
+    if buffer.tag(-1) is Tag.NOUN and buffer.tag(1) is Tag.PARTICIPLE:
+        return after is Tag.PREPOSITION  # "the chair not tucked under the table"
     in_clause = buffer.tag(-1) in (Tag.AUXILIARY, Tag.RELATIVE) and buffer.tag(1) in _VERB_FORMS
-    is_place = base in POSTURE_VERBS and after is Tag.PREPOSITION
+    is_place = (base in POSTURE_VERBS or buffer.tag(1) is Tag.PARTICIPLE) and after is Tag.PREPOSITION
     return in_clause and (is_place or (base in HOLDING_VERBS and after in OBJECT_START_TAGS))
 
 

@@ -3,33 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
+from gausslite.domain import verbs
 from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, phrase_from_text
 from gausslite.task.graph_draft import Clause, GraphDraft, RelationAssigner, RelationTerms
 from gausslite.task.lexicon import word_set
-from gausslite.task.verbs import (
-    ATTACHING_VERBS,
-    AVOIDING_VERBS,
-    COVERING_VERBS,
-    DELIVERY_VERBS,
-    FETCHING_VERBS,
-    FILLING_VERBS,
-    GIVING_VERBS,
-    GO_VERBS,
-    INSPECTION_VERBS,
-    LEAVING_VERBS,
-    LOOKING_VERBS,
-    MOVING_VERBS,
-    PLACE_VERBS,
-    PUSHING_VERBS,
-    REACHING_VERBS,
-    SEARCH_VERBS,
-    STOPPING_VERBS,
-    TOOL_VERBS,
-)
 
 _ORIGIN_RELATIONS: Final = {f"from_{place}": place for place in ("on", "under", "inside", "behind", "near")}
 # after "on the table" these state the destination; other prepositions locate the table
@@ -42,7 +24,9 @@ _PAIRING_VERBS: Final = word_set("compare swap exchange")
 _PUSHED_TO: Final = word_set("near under behind in_front_of between left_of right_of")
 _ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
 # with a room: where the robot goes through
-_CROSSING_VERBS: Final = LEAVING_VERBS | (GO_VERBS - REACHING_VERBS - COVERING_VERBS)
+_CROSSING_VERBS: Final = verbs.LEAVING_VERBS | (verbs.GO_VERBS - verbs.REACHING_VERBS - verbs.COVERING_VERBS)
+_PASSING_VERBS: Final = verbs.GO_VERBS - verbs.STOPPING_VERBS - word_set("park dock land")
+_PASSAGES: Final = word_set("door doorway entrance gate archway")
 _PASSING_RELATIONS: Final = word_set("past beyond")
 
 
@@ -77,8 +61,10 @@ class RoleAssigner:
 
     def _searches_for_referent(self) -> bool:
         clause = self.clause
-        places_only = clause.verb in SEARCH_VERBS and bool(clause.pending_places) and not clause.objects
-        return places_only and clause.follows_statement and bool(clause.referents)
+        places_only = clause.verb in verbs.SEARCH_VERBS and bool(clause.pending_places) and not clause.objects
+        # "there is a cabinet. placed under the table"
+        describes = clause.verb is None and bool(clause.pending_places) and not clause.objects and clause.statement
+        return (places_only or describes) and clause.follows_statement and bool(clause.referents)
 
     def _search_places_for_referents(self, clause: Clause) -> None:
         """Search the places for the referents, as in "I lost my wallet, look under the bed"."""
@@ -88,11 +74,17 @@ class RoleAssigner:
         for terms, noun in pending_places:
             self._relations.relate_by(terms, noun)
 
-    def _make_places_targets(self) -> None:
+    def reach_places(self) -> None:
+        """Make the places of "wait by the door" destinations."""
+        if self.clause.verb in verbs.TRAVEL_VERBS:
+            self._make_places_targets()
+
+    def _make_places_targets(self, passes: bool = False) -> None:
         pending_places, self.clause.pending_places = self.clause.pending_places, []
-        going = self.clause.verb in GO_VERBS | STOPPING_VERBS
-        for _, noun in pending_places:
-            self.target(noun, TargetRole.DESTINATION if going else TargetRole.OBJECT, conjoined=True)
+        going = self.clause.verb in verbs.TRAVEL_VERBS
+        for terms, noun in pending_places:
+            passed = (passes and terms.relation in ("between", "past", "under")) or terms.relation == "with"
+            self.target(noun, TargetRole.DESTINATION if going and not passed else TargetRole.OBJECT, conjoined=True)
 
     def assign(self, noun: NounPhrase, pending: str | None, conjoined: bool, following: Sequence[Chunk]) -> None:
         """Assign one noun, given its preposition, whether a conjunction precedes it, and the following chunks."""
@@ -108,9 +100,10 @@ class RoleAssigner:
             elif self._is_recipient(following):
                 self._add_destination(noun)
             else:
-                self.target(noun, self._role_of_object(), conjoined and clause.last_relation is None)
+                self.target(noun, self._role_of_object(noun.head), conjoined and clause.last_relation is None)
             return
         self.assign_by_preposition(pending, noun, following)
+        clause.describes = clause.preposition in ("with", "near", "without") and not noun.is_definite
 
     def assign_by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Chunk] = ()) -> None:
         """Assign the noun's role relative to the clause's objects, by the preposition before it."""
@@ -118,9 +111,11 @@ class RoleAssigner:
         if self._relations.is_extreme(pending):
             self._relations.relate_extreme(noun)
             return
+        if clause.verb in verbs.PLACE_VERBS and not (clause.objects or clause.pending_places) and clause.referents:
+            clause.objects, clause.by_pronoun = list(clause.referents), True  # "rinse the cup and place on the rack"
         if pending == "closer":
-            moves = clause.verb in DELIVERY_VERBS - FETCHING_VERBS | GO_VERBS and not clause.current_place
-            pending = "to" if moves else "closest_to"
+            moving = verbs.DELIVERY_VERBS - verbs.FETCHING_VERBS | verbs.GO_VERBS
+            pending = "to" if clause.verb in moving and not clause.current_place else "closest_to"
         handlers = {
             "to": self._destination,
             "for": self._assign_searched_object,
@@ -133,44 +128,87 @@ class RoleAssigner:
             return
         elif pending == "purpose":
             self._assign_path_end(noun)
+        elif noun.head in lexicon.BODY_PARTS and pending in ("near", "inside", "on") and self._acts_on_people():
+            return  # "raising their arm"
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
             self._relations.relate("near", noun)
-        elif pending in _PASSING_RELATIONS and clause.verb in DELIVERY_VERBS - PLACE_VERBS:
-            self._draft.add_target(noun.text)
-        elif clause.preposition in _ROUTE_PREPOSITIONS and clause.verb in DELIVERY_VERBS and not clause.objects:
-            self.target(noun, TargetRole.OBJECT)  # "lead me around the puddle"
-        elif self._is_route_point(pending) or (pending == "with" and clause.verb in _PAIRING_VERBS):
-            self._assign_waypoint(noun, conjoined=True)
+        elif self._assign_on_route(pending, noun):
+            return
         elif pending == "with" and clause.terms.negated and clause.places:
             self._draft.exclude(noun.text)  # "with the sponge, not with the towel"
-        elif pending == "with" and clause.verb in FILLING_VERBS and clause.objects:
-            self._assign_loaded(noun)
         elif pending == "with":
-            if (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
-                self._assign_after_with(noun)
+            self._assign_with(noun)
         elif pending == "from" or pending in _ORIGIN_RELATIONS:
             self._assign_origin(pending, noun)
         else:
             self._assign_place(pending, noun, following)
 
+    def _assign_on_route(self, pending: str, noun: NounPhrase) -> bool:
+        """Make a noun that the way passes a target; return False for other nouns."""
+        clause = self.clause
+        by_route, aimless = clause.preposition in _ROUTE_PREPOSITIONS, not (clause.objects or clause.pending_places)
+        moves_by = (by_route or clause.preposition == "by") and clause.verb in _PASSING_VERBS
+        if (pending in _PASSING_RELATIONS and clause.verb in verbs.DELIVERY_VERBS - verbs.PLACE_VERBS) or (
+            by_route and clause.verb in verbs.LEADING_VERBS and clause.objects
+        ):
+            self._draft.add_target(noun.text)
+        elif by_route and clause.verb in verbs.DELIVERY_VERBS and not clause.objects:
+            self.target(noun, TargetRole.OBJECT)  # "lead me around the puddle"
+        elif (
+            (moves_by and (clause.adds_place or aimless))  # "walk by the bathroom, by the bedroom"
+            or (pending == "past" and clause.verb in verbs.TRAVEL_VERBS)
+            or (pending == "with" and clause.verb in _PAIRING_VERBS)
+        ):
+            self._assign_waypoint(noun, conjoined=True)
+        else:
+            return False
+        return True
+
+    def _assign_with(self, noun: NounPhrase) -> None:
+        """Assign a noun after "with": contents, a tool, or what describes an object or a place."""
+        clause = self.clause
+        if clause.verb in verbs.FILLING_VERBS and clause.objects:
+            self._assign_loaded(noun)
+            return
+        self.reach_places()  # "stop at the shelf with the boxes"
+        if not clause.objects and clause.verb is None and not clause.terms.negated:
+            clause.pending_places.append((clause.terms, noun))  # "with a sponge, wipe the table"
+        elif (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
+            self._assign_after_with(noun)
+
     def _assign_place(self, pending: str, noun: NounPhrase, following: Sequence[Chunk]) -> None:
         """Assign a noun after a preposition of place: a destination, or where an object or a destination is."""
         clause = self.clause
-        if clause.last_relation == "to" and clause.terms.negated and clause.adds_place:
+        if clause.terms.negated and clause.adds_place and self._has_destination(pending):
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
+        elif pending == "far_from" and clause.verb in verbs.GO_VERBS and not (clause.objects or clause.pending_places):
+            self._assign_waypoint(noun)  # "back away from the desk"
         elif clause.last_relation in ("to", "with") and clause.places:
             self._relations.relate_places(RelationTerms(pending, clause.terms.negated, clause.terms.bounds), noun)
         elif self._is_destination(pending, following):
             self._add_destination(noun)
             clause.between = pending == "between"
-        elif pending == "far_from" and clause.verb in PUSHING_VERBS | DELIVERY_VERBS and not clause.current_place:
+        elif (
+            pending == "far_from"
+            and clause.verb in verbs.PUSHING_VERBS | verbs.DELIVERY_VERBS
+            and not clause.current_place
+        ):
             self._relations.relate("near", noun)  # "pull the chair away from the wall": it is there now
         else:
-            if clause.pending_places and clause.verb in GO_VERBS | STOPPING_VERBS:
+            if clause.pending_places and clause.verb in verbs.TRAVEL_VERBS:
                 self._make_places_targets()  # "stop behind the car near the tree"
             self._relations.relate(pending, noun)
 
+    def _has_destination(self, pending: str) -> bool:
+        """Return True if the clause has a destination, and the same preposition as another that it denies."""
+        places = self.clause.pending_places
+        reached = any(self._draft.roles.get(phrase) is TargetRole.DESTINATION for phrase in self.clause.objects)
+        goes_there = places[-1][0].relation == pending if places else reached and self.clause.preposition == "at"
+        return self.clause.last_relation == "to" or (self.clause.verb in verbs.TRAVEL_VERBS and goes_there)
+
     def _assign_waypoint(self, noun: NounPhrase, conjoined: bool = False) -> None:
+        if self.clause.verb in verbs.GO_VERBS:
+            self._make_places_targets(passes=True)  # "to the right of the bed and through the curtain"
         if lexicon.is_space(noun.words):
             self._draft.add_context(noun.text)
         else:
@@ -179,30 +217,28 @@ class RoleAssigner:
 
     def _assign_path_end(self, noun: NounPhrase) -> None:
         """Make the end of a path a target; where a door leads or what a key opens is no target."""
-        if self.clause.route:
+        passage = self._draft.mentions[-1:] and self._draft.mentions[-1].split()[-1] in _PASSAGES
+        if self.clause.route and not passage:
             self.target(noun, TargetRole.DESTINATION)
         else:
             self.clause.last_relation = "with"
 
     def _acts_on_people(self) -> bool:
-        return any(subject.split()[-1] in lexicon.PEOPLE for subject in self.clause.objects)
+        return self._are_people((*self.clause.objects, *self._draft.mentions[-1:]))
 
     def _is_destination(self, pending: str, following: Sequence[Chunk]) -> bool:
         """Return True if the preposition states where to put the objects: "put the mug on the desk"."""
         clause = self.clause
-        if clause.by_pronoun and clause.verb in DELIVERY_VERBS and pending in _DESTINATION_RELATIONS:
+        if clause.by_pronoun and clause.verb in verbs.DELIVERY_VERBS and pending in _DESTINATION_RELATIONS:
             return True
-        if clause.verb in PUSHING_VERBS and clause.objects and clause.preposition.startswith(("to the ", "on to")):
+        pushes = clause.verb in verbs.PUSHING_VERBS and bool(clause.objects)
+        if pushes and clause.preposition.startswith(("to the ", "on to")):
             return True  # "move the mug to the left of the plate"
-        pushed = any(self._draft.roles.get(phrase) is TargetRole.OBJECT for phrase in clause.objects)
-        if pushed and clause.verb in PUSHING_VERBS - {"pull"} and pending in _PUSHED_TO and not clause.current_place:
-            return self._is_final_place(pending, following)  # "push the ball between the cones"
-        if clause.verb in ATTACHING_VERBS and not clause.current_place:
-            return self._is_final_place(pending, following)
-        return clause.verb in PLACE_VERBS and not clause.current_place and self._is_final_place(pending, following)
-
-    def _is_route_point(self, pending: str) -> bool:
-        return pending == "past" and self.clause.verb in GO_VERBS | STOPPING_VERBS
+        are_objects = any(self._draft.roles.get(phrase) is TargetRole.OBJECT for phrase in clause.objects)
+        # "push the ball between the cones", unlike "push the button next to the door"
+        moves = pushes and are_objects and not clause.is_part and clause.verb != "pull" and pending in _PUSHED_TO
+        places = moves or clause.verb in verbs.ATTACHING_VERBS | verbs.PLACE_VERBS
+        return places and not clause.current_place and self._is_final_place(pending, following)
 
     def _add_anchor(self, relation: str, noun: NounPhrase) -> None:
         if relation == "to":
@@ -249,17 +285,19 @@ class RoleAssigner:
 
     def _describes_with(self, noun: NounPhrase) -> bool:
         verb = self.clause.verb
-        if verb is None or verb in LOOKING_VERBS:
+        if verb is None or verb in verbs.LOOKING_VERBS | verbs.STOPPING_VERBS:
             return True
-        return verb in FETCHING_VERBS | GIVING_VERBS | DELIVERY_VERBS and noun.head not in lexicon.HELD_TOOLS
+        handles = verb in verbs.FETCHING_VERBS | verbs.GIVING_VERBS | verbs.DELIVERY_VERBS
+        return handles and noun.head not in lexicon.HELD_TOOLS
 
     def _may_be_tool(self, noun: NounPhrase) -> bool:
-        return self.clause.verb in TOOL_VERBS or noun.head in lexicon.HELD_TOOLS
+        return self.clause.verb in verbs.TOOL_VERBS or noun.head in lexicon.HELD_TOOLS
 
     def _assign_loaded(self, noun: NounPhrase) -> None:
         """Make the noun the object and the objects so far destinations: "load the van with boxes"."""
         places, self.clause.objects = self.clause.objects, []
         self._draft.roles.update(dict.fromkeys(places, TargetRole.DESTINATION))
+        self.clause.verb = "find"  # a place that follows is where the contents are
         self.target(noun, TargetRole.OBJECT)
 
     def _is_recipient(self, following: Sequence[Chunk]) -> bool:
@@ -268,7 +306,7 @@ class RoleAssigner:
         while len(following) > 1 and following[0].kind is ChunkKind.PREPOSITION and following[1].kind is ChunkKind.NOUN:
             following = following[2:]  # "bring the man in the wheelchair a drink"
         follows = bool(following) and following[0].kind is ChunkKind.NOUN
-        return follows and clause.verb in GIVING_VERBS and not clause.objects
+        return follows and clause.verb in verbs.GIVING_VERBS and not clause.objects
 
     def _is_final_place(self, pending: str, following: Sequence[Chunk]) -> bool:
         """Return True if no later place is the destination; "on the table into the sink" goes to the sink."""
@@ -279,49 +317,64 @@ class RoleAssigner:
 
     def _is_second_anchor(self, noun: NounPhrase, after: Chunk | None) -> bool:
         """Return True for the stove in "near the sink and the stove", not for a target of its own."""
+        if self.clause.last_relation == "between" or self.clause.between or self.clause.is_alternative:
+            return True
+        # "a couch with a throw and two cushions", unlike "the mug with a lid and the plate"
+        if self.clause.describes and not noun.is_definite:
+            return self.clause.verb is None or self.clause.verb in verbs.LOOKING_VERBS | verbs.STOPPING_VERBS
         if after is not None and after.kind is ChunkKind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
             return False
-        if self.clause.last_relation == "between" or self.clause.between:
-            return True
         if lexicon.is_space(noun.words) and self.clause.in_space:
             return True
         return noun.head in lexicon.COMMON_ANCHORS and self.clause.last_relation not in ("on", "inside", "with")
 
-    def _role_of_object(self) -> TargetRole:
+    def _role_of_object(self, head: str) -> TargetRole:
         """Return the role of a verb's direct object."""
-        if self.clause.verb in AVOIDING_VERBS:
+        if self.clause.verb in verbs.AVOIDING_VERBS:
             return TargetRole.OBSTACLE
-        if self.clause.verb in REACHING_VERBS | STOPPING_VERBS:
+        if self.clause.verb in verbs.REACHING_VERBS | verbs.STOPPING_VERBS or (
+            self.clause.verb in verbs.SPEAKING_VERBS and head in lexicon.PEOPLE
+        ):
             return TargetRole.DESTINATION
         return TargetRole.TOOL if self.clause.verb == "use" else TargetRole.OBJECT
 
     def target(self, noun: NounPhrase, role: TargetRole, conjoined: bool = False) -> None:
         """Make the noun a target and the clause's object; a conjoined noun is added to the objects."""
         clause, phrase = self.clause, noun.text
-        if lexicon.is_space(noun.words) and role is TargetRole.OBJECT and clause.verb in COVERING_VERBS:
+        if lexicon.is_space(noun.words) and role is TargetRole.OBJECT and clause.verb in verbs.COVERING_VERBS:
             self._draft.add_context(phrase)  # "clean the kitchen": every object in it
             phrase = "object"
         self._draft.add_target(phrase, role, from_statement=clause.statement)
         clause.objects = [*clause.objects, phrase] if conjoined else [phrase]
         clause.conjoined, clause.by_pronoun = conjoined, False
-        clause.last_relation, clause.places = None, []
+        clause.last_relation, clause.places, clause.describes = None, [], False
         clause.superlative = noun.distance_superlative or (clause.superlative if conjoined else None)
         clause.is_part = noun.head in lexicon.PARTS
         pending_places, clause.pending_places = clause.pending_places, []
         for terms, anchor in pending_places:
-            self._relations.relate_by(terms, anchor)
+            if terms.relation == "with" and clause.verb is not None:
+                self._add_tool(anchor)
+            else:
+                self._relations.relate_by(replace(terms, relation=terms.relation.replace("with", "near")), anchor)
 
     def _are_people(self, phrases: Sequence[str]) -> bool:
         return any(phrase.split()[-1] in lexicon.PEOPLE for phrase in phrases)
 
     def _destination(self, noun: NounPhrase) -> None:
         clause = self.clause
-        if clause.verb in GO_VERBS | STOPPING_VERBS:
-            self._make_places_targets()  # "between the shelves to the exit"
-        if clause.route or not clause.objects or clause.verb in GO_VERBS - MOVING_VERBS:
-            going = clause.route or clause.verb is None or clause.verb in GO_VERBS | STOPPING_VERBS | DELIVERY_VERBS
+        latest = self._draft.mentions[-1] if self._draft.mentions else ""
+        is_passage = latest.split()[-1:] and latest.split()[-1] in _PASSAGES
+        if (clause.verb in verbs.STOPPING_VERBS and clause.pending_places) or (
+            is_passage and self._draft.roles.get(latest) is TargetRole.DESTINATION
+        ):
+            return  # "stop by the doorway to the bedroom"
+        if clause.verb in verbs.TRAVEL_VERBS:
+            self._make_places_targets(passes=True)  # "between the shelves to the exit"
+        if clause.route or not clause.objects or clause.verb in verbs.GO_VERBS - verbs.MOVING_VERBS:
+            moving = {"turn"} | verbs.TRAVEL_VERBS | verbs.DELIVERY_VERBS | verbs.SPEAKING_VERBS
+            going = clause.route or clause.verb is None or clause.verb in moving
             role = TargetRole.DESTINATION if going else TargetRole.OBJECT
-            if clause.verb in REACHING_VERBS:  # "climb the ladder to the attic"
+            if clause.verb in verbs.REACHING_VERBS:  # "climb the ladder to the attic"
                 self._draft.roles.update(dict.fromkeys(clause.objects, TargetRole.OBJECT))
             self.target(noun, role, conjoined=bool(clause.objects))
             clause.route = False
@@ -331,9 +384,9 @@ class RoleAssigner:
     def _assign_searched_object(self, noun: NounPhrase) -> None:
         """Make the noun the target, near the searched places; a defect to inspect for is no object."""
         clause = self.clause
-        if clause.objects and clause.verb in INSPECTION_VERBS and noun.head in lexicon.DEFECTS:
+        if clause.objects and clause.verb in verbs.INSPECTION_VERBS and noun.head in lexicon.DEFECTS:
             return
-        if clause.objects and clause.verb in SEARCH_VERBS:
+        if clause.objects and clause.verb in verbs.SEARCH_VERBS:
             places, clause.objects = clause.objects, []
             self._draft.remove_targets(places)
             self.target(noun, TargetRole.OBJECT)
@@ -348,7 +401,7 @@ class RoleAssigner:
     def _assign_after_of(self, noun: NounPhrase) -> None:
         clause = self.clause
         if not clause.objects and not clause.pending_places:
-            self.target(noun, self._role_of_object())
+            self.target(noun, self._role_of_object(noun.head))
         elif lexicon.is_space(noun.words):
             self._draft.add_context(noun.text)
         elif clause.last_relation in ("to", "with") and clause.places:
@@ -357,13 +410,22 @@ class RoleAssigner:
             self._relations.relate("near", noun)
 
     def _assign_origin(self, pending: str, noun: NounPhrase) -> None:
-        going = self.clause.verb in GO_VERBS - MOVING_VERBS - SEARCH_VERBS
-        if going or self.clause.last_relation == "with":
+        clause = self.clause
+        encloses = noun.head in lexicon.CONTAINERS or lexicon.is_space(noun.words)
+        going = clause.verb in verbs.GO_VERBS - verbs.MOVING_VERBS - verbs.SEARCH_VERBS and not (
+            clause.objects and clause.verb in verbs.LEADING_VERBS
+        )
+        if lexicon.is_space(noun.words) and not clause.objects and clause.verb is None:
+            self._draft.add_context(noun.text)  # "once you are out of the bathroom"
             return
-        if pending in _ORIGIN_RELATIONS:
-            self._relations.relate(_ORIGIN_RELATIONS[pending], noun)
-        elif noun.head in lexicon.PEOPLE:
-            self._relations.relate("near", noun)
-        else:
-            encloses = noun.head in lexicon.CONTAINERS or lexicon.is_space(noun.words)
-            self._relations.relate("inside" if encloses else "on", noun)
+        if going:
+            if pending == "from_inside" and not encloses and noun.head not in lexicon.ROOMS:
+                self._assign_waypoint(noun, conjoined=True)  # "out of the back door"
+            return
+        relation = _ORIGIN_RELATIONS.get(pending, "inside" if encloses else "on")
+        if clause.last_relation == "with":
+            self._relations.relate_places(RelationTerms(relation), noun)
+            return
+        of_people = clause.verb in verbs.LEADING_VERBS or (self._are_people(clause.objects) and not encloses)
+        near = pending == "from" and (noun.head in lexicon.PEOPLE or of_people)
+        self._relations.relate("near" if near else relation, noun)

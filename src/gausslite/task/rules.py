@@ -155,9 +155,12 @@ def _require_structure(text: str, chunks: list[Chunk]) -> None:
     nouns = [chunk.noun for chunk in chunks if chunk.noun is not None]
     words = [word for word in tokenize(normalise_text(text)) if word[0].isalpha()]
     unknown = [word for word in words if not is_english(word)]
-    if _CODE.search(text) or (len(words) > 2 and 2 * len(unknown) > len(words)):
+    prepositions = any(chunk.kind is ChunkKind.PREPOSITION for chunk in chunks)
+    plain = not prepositions and not any(noun.has_determiner for noun in nouns)
+    is_foreign = len(words) > 2 and (2 * len(unknown) > len(words) or (plain and len(unknown) > 1))
+    if _CODE.search(text) or is_foreign:
         raise TaskError(_no_object_message(text, ()))
-    has_structure = any(chunk.kind in (ChunkKind.VERB, ChunkKind.PREPOSITION) for chunk in chunks)
+    has_structure = prepositions or any(chunk.kind is ChunkKind.VERB for chunk in chunks)
     if not has_structure and not any(noun.is_known or noun.has_determiner for noun in nouns):
         raise TaskError(_no_object_message(text, ()))
 

@@ -6,21 +6,11 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Final
 
+from gausslite.domain import verbs
 from gausslite.domain.nouns import is_thing
 from gausslite.task import lexicon
 from gausslite.task.lexicon import UNCHANGED, is_attribute, singular, word_set
 from gausslite.task.tokens import PREPOSITIONS, split_bounds
-from gausslite.task.verbs import (
-    GO_VERBS,
-    SEARCH_VERBS,
-    STOPPING_VERBS,
-    TOOL_VERBS,
-    VERBS,
-    base_of_ed,
-    base_of_ing,
-    base_of_s,
-    verb_base,
-)
 
 
 class Tag(Enum):
@@ -116,73 +106,68 @@ def _cost(pair: tuple[int, Tag | None]) -> int:
 Options = dict[Tag, int]
 
 # one line for words with the same possible tags; the digits after a tag are its cost
-_CLOSED_LINES: Final = (
-    ("d0", "a an the my your his our their its every whose"),
-    ("q0", "no"),
-    ("d0 o3", "her"),
-    ("d0 k2", "this these those"),
-    ("d0 k4 w0 s13", "that"),
-    ("d0 w0", "which"),
-    ("d0 n3", "one"),
-    ("d0 t15", "all both each more most"),
-    ("d0 s3", "first second third last next"),
-    ("d5 a0 n9", "half"),
-    ("k0", "it them"),
-    ("o0", "i me you he him she we us they myself yourself itself themselves himself herself mine yours"),
-    (
-        "x0",
-        "is are was were be been being am could would should will shall may might must does did has had having ought",
-    ),
-    ("x4 n0", "can"),
-    ("a0 p2", "closest nearest"),
-    ("x0 v15", "do have"),
-    ("v0", "let lets"),
-    ("i3 w0", "who"),
-    ("w0", "whom where how why"),
-    ("s0 w5", "when"),
-    ("s0", ". ; : ! ? then while if whether because unless although though once as than"),
-    ("s0 p2", "before after until since"),
-    ("c0", "and or , / & plus but + ( )"),
-    ("p0 u0", "to"),
-    ("t0", "away out apart ahead forward forwards backward backwards upstairs downstairs aside"),
-    ("t0 n8 a5 v15", "back"),
-    ("t0 p20", "up down"),
-    ("t0 p3", "off"),
-    ("t3 p2", "around"),
-    ("t0 p2", "outside"),
-    ("p0 t5", "over inside"),
-    ("p0 t10", "in on under below above behind along through past across by near"),
-    ("p0 g0", "touching facing surrounding"),
-    ("p3 v0", "like"),
-    ("a0 e3 n14 t20", "left"),
-    ("a0 n14 t8", "right"),
-    ("n0", "ones everywhere"),
-    ("i0 d8", "what whatever"),
-)
+_CLOSED_LINES: Final = """
+d0: a an the my your his our their its every whose
+q0: no
+d0 o3: her
+d0 k2: this these those
+d0 k4 w0 s13: that
+d0 w0: which
+d0 n3: one
+d0 t15: all both each more most
+d0 s3: first second third last next
+d5 a0 n9: half
+k0: it them
+o0: i me you he him she we us they myself yourself itself themselves himself herself mine yours
+x0: is are was were be been being am could would should will shall may might must does did has had having ought
+x4 n0: can
+a0 p2: closest nearest
+x0 v15: do have
+v0: let lets
+i3 w0: who
+w0: whom where how why
+s0 w5: when
+s0: . ; : ! ? then while if whether because unless although though once as than
+s0 p2: before after until since
+c0: and or , / & plus but + ( )
+p0 u0: to
+t0: away out apart ahead forward forwards backward backwards upstairs downstairs aside
+t0 n8 a5 v15: back
+t0 p20: up down
+t0 p3: off
+t3 p2: around
+t0 p2: outside
+p0 t5: over inside
+p0 t10: in on under below above behind along through past across by near
+p0 g0: touching facing surrounding
+p3 v0: like
+a0 e3 n14 t20: left
+a0 n14 t8: right
+n0: ones everywhere
+i0 d8: what whatever
+"""
 # "go stand", "help clean": the second verb is the instruction
 _LEADING_VERBS: Final = word_set("go come help")
 _NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
 _MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
-_USUALLY_VERBS: Final = GO_VERBS | TOOL_VERBS | SEARCH_VERBS | word_set("stop hand")
-_NEVER_NOUNS: Final = GO_VERBS | word_set(
+_USUALLY_VERBS: Final = verbs.GO_VERBS | verbs.TOOL_VERBS | verbs.SEARCH_VERBS | word_set("stop hand")
+_NEVER_NOUNS: Final = verbs.GO_VERBS | word_set(
     "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
     "know think eat sit seem contain include become lose forget boil"
 )
 # at the start of a clause no things: "stand in front of", "swing left", "stock the shelf"
-_MOTIONS: Final = GO_VERBS | STOPPING_VERBS | word_set("turn pass")
+_MOTIONS: Final = verbs.GO_VERBS | verbs.STOPPING_VERBS | word_set("turn pass")
 _ARTICLES: Final = frozenset({"a", "an", "the", "my", "your", "every"})
+_SUBJECTS: Final = word_set("it they he she i we")
+_BE: Final = word_set("is are was were")
+_OBJECTS_OF_VERBS: Final = word_set("the a an my it them up")
+_BEFORE_NAMES: Final = _ARTICLES | word_set("to at in near from")
+_FINITE: Final = word_set("is are was were has have can will")
+_THE: Final = _ARTICLES | word_set("this these those his her its our their")
 _OPENERS: Final = frozenset({"", ",", ".", ";", "and", "then"})
 _TURNS: Final = word_set("left right around back up down forward backward straight here there")
 _POSSESSIVES: Final = ("'s", "s'")
-_NOUNS: Final = (
-    lexicon.NOUNS
-    | lexicon.PLACES
-    | lexicon.ROUTES
-    | lexicon.MEASURES
-    | lexicon.PARTS
-    | lexicon.ADDRESSEES
-    | lexicon.COMPOUND_GERUNDS
-)
+_NOUNS: Final = lexicon.NOUNS | lexicon.PLACES | lexicon.ROUTES | lexicon.MEASURES | lexicon.PARTS | lexicon.ADDRESSEES
 _ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most")
 _VERB_ENDINGS: Final = ("ize", "ise", "ify", "ate")
 _VERB_OPENINGS: Final = ("re", "un", "dis", "de", "over", "pre", "mis")
@@ -197,7 +182,11 @@ _CLOSED: Final[dict[str, Options]] = (
     | {" ".join(negation): {Tag.NEGATION: 0} for negation in lexicon.NEGATIONS}
     | {word: {Tag.DETERMINER: 0} for word in lexicon.DETERMINERS}
     | {word: {Tag.INDEFINITE: 0} for word in lexicon.INDEFINITE_PRONOUNS}
-    | {word: _options(line) for line, listed in _CLOSED_LINES for word in listed.split()}
+    | {
+        word: _options(line.partition(": ")[0])
+        for line in _CLOSED_LINES.strip().splitlines()
+        for word in line.partition(": ")[2].split()
+    }
 )
 
 
@@ -213,29 +202,50 @@ def is_adverb(word: str) -> bool:
     if word in lexicon.ADVERBS:
         return True
     ending = word.endswith(("ly", "wise", "wards"))
-    return ending and not (word in lexicon.ADJECTIVES or singular(word) in _NOUNS or word in VERBS or word in _CLOSED)
+    return ending and not (
+        word in lexicon.ADJECTIVES or singular(word) in _NOUNS or word in verbs.VERBS or word in _CLOSED
+    )
+
+
+def _tag_by_neighbours(before: str, word: str, after: str) -> Tag | None:
+    """Return the tag that a word can only have between these neighbours; None if others are possible."""
+    opens, is_place, is_open = before in _OPENERS, after in PREPOSITIONS, word not in _CLOSED
+    ends = not after or is_place or after == "and"
+    stops = word in ("stop", "wait") and ends and _is_noun(before) and before not in lexicon.CONTAINERS
+    commands = (
+        stops  # "walk to the sofa stop", "turn left walk to"
+        or (word in verbs.GO_VERBS and before in _TURNS and is_place)
+        or (word in verbs.VERBS and before in _LEADING_VERBS | _NEGATED_COMMANDS)
+        or (opens and word in _MOTIONS and (is_place or after in _TURNS))
+        or (word in verbs.PLACE_VERBS and before in ("and", "then") and is_place)
+        or (opens and is_open and word in verbs.VERBS and after in lexicon.DETERMINERS)
+        or (opens and is_open and after in _THE and not is_english(word))  # "compost the apple"
+        or (before == "you" and is_open and after in lexicon.DETERMINERS)
+    )
+    named = is_thing(f"{word} {singular(after)}") or (before in _BEFORE_NAMES and _is_noun(after))
+    waits = opens and word in verbs.STOPPING_VERBS and _is_noun(after) and after not in _CLOSED
+    rules = {
+        Tag.VERB: commands,
+        Tag.ADJECTIVE: (word, after) in lexicon.COMPOUND_OPENERS,
+        Tag.ANAPHOR: word == "that" and not after,
+        Tag.RELATIVE: word == "that" and not opens and after in _FINITE,
+        Tag.CLAUSE_BREAK: word == "before" and after in _SUBJECTS,
+        Tag.NOUN: waits or (word.endswith("ing") and named) or (word == "half" and after == "of"),  # "stand lamp"
+        Tag.GERUND: before == "without" and verbs.base_of_ing(word) is not None,
+        Tag.PRONOUN: word == "one" and after in _MODALS_AFTER_ONE,
+        Tag.DETERMINER: word == "one" and after == "of",
+    }
+    return next((tag for tag, holds in rules.items() if holds), None)
 
 
 def _tag_options(before: str, word: str, after: str) -> Options:
-    if before in _LEADING_VERBS | _NEGATED_COMMANDS and word in VERBS:
-        return {Tag.VERB: 0}
-    if (word, after) in lexicon.COMPOUND_OPENERS:
-        return {Tag.ADJECTIVE: 0}
-    if before == "without" and base_of_ing(word) is not None:
-        return {Tag.GERUND: 0}
-    if before in _OPENERS and (
-        (word in _MOTIONS and (after in PREPOSITIONS or after in _TURNS))
-        or (word in VERBS and after in lexicon.DETERMINERS and word not in _CLOSED)
-    ):
-        return {Tag.VERB: 0}
-    if word == "one" and after in _MODALS_AFTER_ONE:
-        return {Tag.PRONOUN: 0}
-    if after == "of" and word in ("one", "half"):
-        return {Tag.DETERMINER: 0} if word == "one" else {Tag.NOUN: 0}
+    forced = _tag_by_neighbours(before, word, after)
+    if forced is not None:
+        return {forced: 0}
     closed = _CLOSED.get(split_bounds(word)[0])
     if closed is not None:
         return closed
-    if after in lexicon.DETERMINERS and base_of_ing(word) is not None:
+    if after in lexicon.DETERMINERS and verbs.base_of_ing(word) is not None:
         return {Tag.GERUND: 0}  # "cleaning the floors"
     if word[0].isdigit():
         return {Tag.DETERMINER: 0, Tag.NOUN: 5}
@@ -245,6 +255,9 @@ def _tag_options(before: str, word: str, after: str) -> Options:
         return {Tag.NOUN: 0}  # "the led"
     is_noun = _is_noun(word)
     options = _verb_options(before, word, is_noun)
+    follows_singular = _is_noun(before) and singular(before) == before
+    if Tag.VERB in options and not is_noun and follows_singular and after in _OBJECTS_OF_VERBS:
+        options[Tag.VERB] = -10  # no subject of this form: "the table pick up the cup"
     if _describes(word):
         options[Tag.ADJECTIVE] = 0
     if is_noun:
@@ -268,18 +281,18 @@ def _is_noun(word: str) -> bool:
     """Return True for a noun of the word lists, and of the vocabulary if it is no form of a known verb."""
     if singular(word) in _NOUNS or word in _NOUNS or word in UNCHANGED:
         return True
-    return is_thing(singular(word)) and verb_base(word) is None and not _describes(word)
+    return is_thing(singular(word)) and verbs.verb_base(word) is None and not _describes(word)
 
 
 def is_english(word: str) -> bool:
     """Return True for a word of the closed classes, the word lists or the vocabulary of nouns."""
-    known = word in _CLOSED or is_adverb(word) or _describes(word) or verb_base(word) is not None
+    known = word in _CLOSED or is_adverb(word) or _describes(word) or verbs.verb_base(word) is not None
     return known or singular(word) in _NOUNS or is_thing(singular(word)) or word.endswith(_POSSESSIVES)
 
 
 def _noun_cost_of_verb(before: str, word: str) -> int:
     """Return the cost of a known verb as a noun, which is low after another noun: "a stop button"."""
-    if word in lexicon.ADJECTIVES or not before or before in _CLOSED or verb_base(word) in _NEVER_NOUNS:
+    if word in lexicon.ADJECTIVES or not before or before in _CLOSED or verbs.verb_base(word) in _NEVER_NOUNS:
         return 30
     return 20 if word.endswith("s") else 12
 
@@ -287,20 +300,22 @@ def _noun_cost_of_verb(before: str, word: str) -> int:
 def _verb_options(before: str, word: str, is_noun: bool) -> Options:
     """Return the tags of the word as a verb form, known or by its ending."""
     options: Options = {}
-    if word in VERBS:
-        usual = not is_noun or (word in _USUALLY_VERBS and (before == "to" or (before == "and" and word in GO_VERBS)))
+    if word in verbs.VERBS and not (is_noun and before in _BE):
+        usual = not is_noun or (
+            word in _USUALLY_VERBS and (before == "to" or (before == "and" and word in verbs.GO_VERBS))
+        )
         options[Tag.VERB] = 0 if usual else 5 if word in _USUALLY_VERBS else 12
         if _is_noun(before):  # "the cup bring": a singular noun is not the verb's subject
             options[Tag.VERB] += 8
-    elif base_of_s(word) is not None:
-        options[Tag.VERB] = 2 if not is_noun else 8 if base_of_s(word) in _USUALLY_VERBS else 18
+    elif verbs.base_of_s(word) is not None:
+        options[Tag.VERB] = 2 if not is_noun else 8 if verbs.base_of_s(word) in _USUALLY_VERBS else 18
     elif not is_noun and (word.endswith(_VERB_ENDINGS) or _prefixed(word)):
         options[Tag.VERB] = 5
-    if base_of_ing(word) is not None:
+    if verbs.base_of_ing(word) is not None:
         options[Tag.GERUND] = 10 if is_noun else 0
     elif word.endswith("ing") and len(word) > 5 and not is_noun:
         options |= {Tag.GERUND: 5, Tag.NOUN: 6}
-    if base_of_ed(word) is not None:
+    if verbs.base_of_ed(word) is not None:
         options[Tag.PARTICIPLE] = 8 if is_noun else 0
     elif word.endswith("ed") and len(word) > 4 and not is_noun:
         options[Tag.PARTICIPLE] = 3
@@ -308,4 +323,4 @@ def _verb_options(before: str, word: str, is_noun: bool) -> Options:
 
 
 def _prefixed(word: str) -> bool:
-    return any(word.startswith(opening) and word[len(opening) :] in VERBS for opening in _VERB_OPENINGS)
+    return any(word.startswith(opening) and word[len(opening) :] in verbs.VERBS for opening in _VERB_OPENINGS)

@@ -35,7 +35,10 @@ _MIN: Final = (
 )
 _ABOUT: Final = r"about|around|roughly|approximately|approx|some|exactly|nearly|almost|just|only|circa"
 # other prepositions that a distance can bound
-_BOUNDED: Final = r"behind|in front|left|right|to the|above|below|under|underneath|beneath|over|inside|on the"
+_BOUNDED: Final = (
+    r"behind|in front|left|right|to the|above|below|under|underneath|beneath|over|inside|on the|before|past|after|"
+    r"beyond"
+)
 _DISTANCE: Final = re.compile(
     rf"\b(?:at a distance of )?(?:(?P<max>{_MAX})|(?P<min>{_MIN}))?(?: ?\b(?:{_ABOUT}))? ?"
     rf"(?:\bbetween )?\b(?:(?P<low>{_VALUE})(?: ?{_UNIT})?(?: ?- ?| to | and | or ))?(?P<value>{_VALUE}) ?{_UNIT}\b"
@@ -112,47 +115,85 @@ def _number(text: str) -> float:
 _PLACED: Final = (
     r"(?:(?:to|on) the (?:left|right)|in front|on top) of|next to|(?:above|below|under|behind|beside|near|in|on)"
 )
-_NUMBER: Final = r"(?:a few|a couple of|several|some|at least|about|one|two|three|four|five|half an?|a|\d+)"
-_LENGTH: Final = r"(?:met(?:er|re)s?|feet|foot|steps?|cm|m|inch(?:es)?|paces?|yards?|centimet(?:er|re)s?)"
-_IDIOMS_DISTANCE: Final = rf"{_NUMBER}(?: (?:one|two|three|a|\d+))? {_LENGTH}"
+_END: Final = r"(?=$| ?[,.;])"
+_NAMED: Final = r"(?:the|an?|my|that|this)(?: \w+){1,3}?"
+_IDIOMS_DISTANCE: Final = rf"(?:(?:at least|about) )?(?:a few|several|some|{_VALUE}) {_UNIT}"
 _PLAIN: Final = {
     # short forms
     r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
     r"(you|we|they)'re": r"\1 are",
     r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
-    rf"at (?:least|most)(?= (?:one|two|three|four|five|six|seven|eight|nine|ten|\d+) (?!{_LENGTH}\b))": "",
+    rf"at (?:least|most)(?= (?:one|two|three|four|five|six|seven|eight|nine|ten|\d+) (?!{_UNIT}\b))": "",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
+    r"^whose": "the",
+    r"^the (?:target|goal|object|item)(?: object)? is": "this is",
+    r"meet (?:me|us)(?= (?:at|by|near|next|behind|in|under|on)\b)": "wait",
+    r"as many (\w+) as (?:possible|you (?:can|need))(?: carry| find| hold)?": r"\1",
     # "a cabinet, above it is a lamp"
     rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
     r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
     rf"(?:which|what) ([\w ]{{2,40}}?) (?:is|are) ([\w ]{{2,40}}?) ({_PLACED})$": r"find the \1 and \2 \3 the \1",
-    r"(?:facing|looking at) ([\w ]{2,40}),": r"there is \1;",
-    r"(?:and|but) (is|are|has)(?= (?:not|no|on|in)\b)": r"and which \1",
+    # a viewpoint: before the description its object may be meant, after it not
+    r"(?:(?:if |when |while |as )?(?:you (?:are )?)?(?:facing|looking at)|(?:if|when|as) you (?:face|look at)) "
+    r"([\w ]{2,40}),(?: (?:it|that) is)?": r"there is \1;",
+    r"tell (?:me|us)": "report",
+    r",? (?:if|when|while|as)(?: you)?(?: are)? (?:facing|looking at|face|look at|enter|entering) "
+    rf"[\w ]{{2,40}}?{_END}": "",
+    # a correction, and what is denied of a place
+    rf"({_NAMED}),? (?:no|sorry|i mean|no wait|wait no|(?:or )?rather|actually),? ({_NAMED}){_END}": r"\2, not \1",
+    r"(?:anywhere|somewhere) but(?= (?:on|in|under|near|at|next to)\b)": ", not",
+    r"with neither (.{2,40}?) nor": r"without \1 or",
+    r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor (on|in|inside|under|near|behind|at|above)": (
+        r"not \1 \2 and not \3"
+    ),
+    r"(stop|wait|halt|pause)(?: just| right| shortly)? (?:(?:before|after|past)(?= (?:the|an?|that|this) )"
+    r"|(?:before|when|once|after) you (?:get to|reach|come to|arrive at|hit))": r"\1 at",
+    r"^not (the \w+)( [^,.;]+?),? but the one( [^,.;]+)": r"\1\3, not the one\2",
+    r"out of the way of": "away from",
+    r"(?:behind|in front of|ahead of|beside|next to) you(?! \w+ing)": "",
+    r"(stop|wait|halt)(?: walking| moving)? (?:once|when|after|as soon as) you(?: are| have)?": r"\1",
+    r"(?:and|but) (is|are|has)(?= (?:not|no|on|in|an?)\b)": r"and which \1",
     r"but (the [\w ]+?) (?:should|must|can|has to) (?:stay|remain)(?: \w+)*": r"but do not touch \1",
     r"nothing (?:but|except|other than)": "",
     r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)": "",
-    r"until you (?:are|stand)(?= (?:between|next|in|beside|near|at|by|under|behind)\b)": "and stop",
+    # where the robot starts gives nothing; a viewpoint is an object to pass
+    r"^you (?:start|begin|stand|are standing|are starting)\b[^.;]*[.;]": "",
+    r"(?:until|till|so that|so) (the|an?) ([\w ]{2,30}?) is(?= (?:on|to|at) your| behind you| in front of you)": (
+        r"and pass \1 \2"
+    ),
+    r"with your (?:back|left|right)(?: side)? (?:to|towards?|against) (.{2,40}?),": r"pass \1;",
+    r"so(?: that)? you(?: are)? fac(?:e|ing)": "; face",
+    r"(?:is |are )?made (?:out )?of (?:(?:solid|dark|light) )?\w+": "",
+    r"(?:could|can|would|will) (?:someone|somebody|anyone|anybody|one of you)": "please",
+    r"is it (?:\w+ ){1,2}to(?= \w)": "",
+    r"(that|it|he|she|who|which)s? (?:is|has) got": r"\1 has",
+    r"throw ((?:[\w']+ ){1,9})(?:away|out)(?=$| ?[,.;]| and )": r"remove \1",
+    r"(?:to|on) your (?:\w+ )?(?:left|right)(?: hand)?(?: side)?(?! of\b)": "",
+    r"on top(?! of\b)": "",
+    rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED})\b)": "and stop",
+    rf"with ((?!no)(?:\w+ ){{1,4}}?)(?:{_PLACED}|inside|around|over) (?:it|them)": r"holding \1",
+    r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)": "",
+    r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
+    rf"where (the [\w ]+?) (?:is|are)(?: \w+(?:ed|ing)| kept)?{_END}": r"\1 with \2",
+    r"the one of(?= an? \w)": "a picture of",
+    r"(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
+    r"leave(?= (?:through|via)\b)": "exit",
     r"(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
     # a double negation is a request
     r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
         "handle"
     ),
-    r"(on|in|inside|under|near|behind|at|above) neither (.{2,40}?) nor(?: \1)?": r"not \1 \2 and not \1",
-    r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor (on|in|inside|under|near|behind|at|above)": (
-        r"not \1 \2 and not \3"
-    ),
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)": "i see",
     r"back(?= where\b)": "",
     r"(?:so|as|very|quite|too) well": "",
     r"reach(?:ing)? for": "grab",
     r"(?:head|make|leave|set off|set out) for(?= (?:the|a|an|my|that|this)\b)": "go to",
-    r"(there|where|what|who)s": r"\1 is",
+    r"(there|where|what|who|that)s": r"\1 is",
     r"(where|how|what|who)'d": r"\1 did",
     r"u": "you",
     r"take (?:a|two|three|\d+) (?:\w+ )?steps?": "go",
-    r"(?:there is )?no need to": "do not",
     r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
@@ -162,30 +203,33 @@ _PLAIN: Final = {
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
     r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
-    r"(?:make|find) (?:your|its) way(?= (?:to|towards?|into|through|past|out|back)\b)": "go",
     r"be careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|take care not to": "do not",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
+    r"(?:stay|keep|remain) close to": "follow",
     r"keep (?:your|a safe|some|a) distance (?:from|to)": "avoid",
     rf"(?:keep|stay|remain) (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
     r"not (?:\w+ )?far (?:away )?from": "near",
     r"(?:farthest|furthest|most distant) away(?! from)|most distant(?! from)": "farthest",
-    r"with no(?= \w)": "without",
-    r"(?:\w+ (?:floor|level|story)) (?=(?:\w+room|kitchen|office|hallway)\b)": "",
-    r"(?:ground|first|second|third|fourth|top|upper|lower|next|\d+(?:st|nd|rd|th)) floor\b"
+    r"(?:\w+ (?:floor|level|story))(?= (?:\w+room|kitchen|office|hallway)\b)": "",
+    r"(?:level|floor|storey) (?:one|two|three|four|\d)": "storey",
+    r"around the (?:corner|bend)(?! of)": "",
+    r"(?:is|are|am|have run|has run|ran)(?: almost)? out of \w+": "is empty",
+    r"a (?:bit|little|lot)(?= (?:to|more|further|and|then)\b|$| ?[,.;])": "",
+    r"(?:^|(?<=[,;.] )|(?<=and )|(?<=then ))plug in(?= (?:the|my|an?)\b)": "activate",
+    r"parallel to": "along",
+    r"(?:ground|first|second|third|fourth|top|upper|lower|next|\d+(?:st|nd|rd|th)) (?:floor|level)\b"
     r"(?! (?:tile|lamp|mat|plan|board))": "storey",
     r"(\w+)-colou?red": r"\1",
     r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
-    r"right(?= (?:next|beside|behind|under|above|in front|by|inside|at|below|between|on top)\b)": "",
     r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
     r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
     r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
     r"(everything|everyone|all|anything) but": r"\1 except",
     r"as well as|along with|together with|in addition to|and also|plus": "and",
-    r"in between": "between",
     r"((?:every|all|any) (?:\w+ ){0,2}\w+) but(?= (?:the|a|an|my|this|that|those) )": r"\1 except",
-    # "give the table a wipe": the last noun carries the meaning
+    # the last noun carries the meaning
     r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
 }
 _IDIOMS: Final = tuple((re.compile(rf"\b(?:{idiom})(?!\w)"), plain) for idiom, plain in _PLAIN.items())
@@ -197,12 +241,18 @@ _TWO_COLOURS: Final = re.compile(
 # no graph states a comparison; comparatives of distance ("further than 2 m from") are no comparisons of objects
 _COMPARISON: Final = re.compile(
     rf"\b(?:{'|'.join(sorted(COMPARATIVES))}) than (?:(?:the|an?|my|your|this|that|its|all|any) )*[\w.]+"
-    rf"(?: (?:{_LENGTH}|kg|others?|ones?|high|tall|wide|long)\b)*"
+    rf"(?: (?:{_UNIT}|kg|others?|ones?|high|tall|wide|long)\b)*"
 )
 _ARROW: Final = re.compile(r"\s*(?:->|=>|\u2192)\s*")
 _LEAVE_ALONE: Final = re.compile(
     r"\bleav(?:e|ing) ((?:\w+ ){1,4})(?:alone|untouched|undisturbed|unchanged|in peace|as (?:it is|is|they are)"
     r"|be|for (?:now|later)|where (?:it is|they are))\b"
+    r"|(?:^|(?<=[,;.] )|(?<=and )|(?<=but )|(?<=please ))leave ((?:\w+ ){1,4}?)(?:on|off|open|closed|shut|running)"
+    r"(?=$| ?[,.;]| and | but )"
+)
+_AHEAD: Final = re.compile(
+    rf"\b(walk|move|go|drive|roll|fly|crawl|step|continue|forwards?|ahead|straight|backwards?|back|left|right|for)"
+    rf"(?: (?:{_ABOUT}|another))? (?:a few|{_VALUE}) ?{_UNIT}\b(?! (?:from|of|away))"
 )
 
 
@@ -223,31 +273,29 @@ def comparisons(text: str) -> list[str]:
 def replace_idioms(text: str) -> str:
     """Return a normalised sentence with idioms replaced."""
     text = _ARROW.sub(" to ", text)
-    text = _LEAVE_ALONE.sub(r"do not touch \1", text)
+    text = _LEAVE_ALONE.sub(lambda match: f"do not touch {match[1] or match[2]}", text)
     text = _BRACKETS.sub(_described_before, text)
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
-    text = _COMPARISON.sub("", text)
+    text = _AHEAD.sub(r"\1", _COMPARISON.sub("", text))
     return mark_distances(_TWO_COLOURS.sub(r"\1-and-\2", text))
 
 
 # a relation that is not a Predicate becomes `near`, with a warning; prepositions are separated by "|"
 _BY_RELATION: Final = {
     "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
-    "connected to|in the vicinity of|next|surrounding|along|close by|by the side of|"
-    "at the side of|right next to|in reach of|within reach of|leaning on|leaning against|at the end of|"
-    "at the foot of|at the base of|at the edge of|on either side of|on both sides of|within arm's reach of|"
-    "within easy reach of|tied to|chained to|hooked to|leashed to|plugged into|propped against|"
-    "resting against",
+    "connected to|in the vicinity of|next|surrounding|along|close by|by the side of|at the side of|right next to|"
+    "in reach of|within reach of|leaning on|leaning against|at the end of|at the foot of|at the base of|"
+    "at the edge of|on either side of|on both sides of|within arm's reach of|within easy reach of|tied to|"
+    "chained to|hooked to|leashed to|plugged into|propped against|resting against",
     "closer": "closer to",
-    "on": "on|all over|scattered over|spread over|"
-    "on top of|upon|atop|resting on|on the top of|at the top of|on the surface of|mounted on|on to|"
-    "on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|nailed to|screwed to|"
-    "bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|mounted to|"
-    "hung up on|hanging off",
+    "on": "on|all over|scattered over|spread over|on top of|upon|atop|resting on|on the top of|at the top of|"
+    "on the surface of|mounted on|on to|on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|"
+    "nailed to|screwed to|bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|"
+    "mounted to|hung up on|hanging off",
     "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
-    "farthest_from": "farthest from|furthest from|farthest to|farthest away from|furthest away from|most distant from|"
-    "furthest to",
+    "farthest_from": "farthest from|furthest from|farthest to|farthest away from|furthest away from|"
+    "most distant from|furthest to",
     "far_from": "far from|away from|far away from|clear of|far off",
     "at_distance": VAGUE_MARKER,
     "inside": "in|inside|inside of|within|in the middle of|in the center of|in the centre of|in the corner of",
@@ -261,7 +309,7 @@ _BY_RELATION: Final = {
     "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|right to|"
     "on the right-hand side of|on the right hand side of|at the right of|right side of",
     "between": "between|in between|among|amongst|amid",
-    "opposite": "opposite|opposite to|across from|facing|opposite of",
+    "opposite": "opposite|opposite to|opposite from|across from|facing|opposite of",
     "outside": "outside|outside of|out in front of",
     "beyond": "beyond",
     "past": "past|through|across|via|up|down",

@@ -1,10 +1,14 @@
-"""Known verbs, grouped by the roles that they give to nouns."""
+"""The vocabulary of verbs: known verbs by the roles that they give to their nouns, and the forms of a verb."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from gausslite.task.lexicon import word_set
+
+def word_set(text: str) -> frozenset[str]:
+    """Return the set of the words of a text."""
+    return frozenset(text.split())
+
 
 GO_VERBS: Final = word_set(
     "go navigate drive move walk head proceed travel come approach reach follow cross enter exit return run roll fly "
@@ -41,7 +45,11 @@ MOVING_VERBS: Final = word_set("move roll run advance return get land park dock 
 # "stop behind the car": the car is the target
 # a room that the robot leaves or crosses
 LEAVING_VERBS: Final = word_set("exit leave cross pass traverse")
+LEADING_VERBS: Final = word_set("follow escort guide lead accompany")
+# the person is the recipient
+SPEAKING_VERBS: Final = word_set("tell say speak talk")
 STOPPING_VERBS: Final = word_set("stop wait stand stay sit halt pause hover")
+TRAVEL_VERBS: Final = GO_VERBS | STOPPING_VERBS
 # "hand the nurse the towel": the first noun is the recipient
 GIVING_VERBS: Final = word_set(
     "hand give bring pass fetch get send offer serve show throw feed find grab lend buy read toss"
@@ -71,7 +79,7 @@ FETCHING_VERBS: Final = word_set(
 POSTURE_VERBS: Final = word_set("hang stand sit lie rest lean belong locate live stick place mount park")
 # negated, these mean contact or harm: the object is an obstacle
 CONTACT_VERBS: Final = word_set(
-    "touch hit bump knock collide mess tamper fiddle meddle interfere stamp "
+    "touch cross hit bump knock collide mess tamper fiddle meddle interfere stamp "
     "break damage scratch crush spill step disturb wake scare move erase strike ram graze "
     "trample squash harm hurt shatter smash crash kick nudge tip topple tread stain rattle interact contact "
     "brush scrape dent smudge burn tear rip injure stumble trip startle frighten endanger tilt overturn upset crack"
@@ -94,57 +102,46 @@ HANDLING_VERBS: Final = word_set(
     "hang"
 )
 _OTHER_VERBS: Final = word_set(
-    # manipulation
-    "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press push turn "
-    "switch rotate touch hit bump knock break disturb move tilt flip fill empty refill squeeze assemble disassemble "
-    "manipulate handle serve cook feed harvest prune recycle swap change replace unplug unlock lock light aim stir "
-    "tighten loosen fold unfold wrap unwrap unpack untie sew knit drill hammer saw unscrew peel chop slice dice grate "
-    "mix blend whisk bake fry boil roast grill heat warm cool freeze thaw chill toast brew crush smash tear rip bend "
-    "straighten stretch squash pluck trim shave bathe dress soak dampen wring reload unblock block unclog adjust align "
-    "calibrate tune configure uninstall unmount dismount detach unfasten secure unhook latch unlatch unbolt disconnect "
-    "rewire refuel recharge restock replenish top patch mend restore rebuild renew update upgrade twist spin swivel "
-    "nudge wind unwind coil uncoil unroll dim brighten mute unmute activate deactivate enable disable trigger operate "
-    "reboot restart reset silence defrost fertilize reap glean herd milk shear saddle walk pet stroke pat steady "
-    "kick punch crank pump flush pry poke tap grip clasp clench pinch yank tug seal unseal cap uncap cork uncork plow "
-    "plough till sow flatten level shake strip extract excavate free release trap dismantle demolish rock"
-    # perception and communication
-    " find locate identify detect recognize recognise spot seek discover determine point show tell see view observe "
-    "monitor photograph capture record map reconstruct model measure count track list report describe mark label "
-    "localize localise verify assess evaluate review focus attend concentrate read test document catalog catalogue "
-    "digitize film image audit compare gaze watch oversee supervise log note sketch draw write print type sign stamp "
-    "highlight circle tag annotate classify categorize categorise group separate distinguish estimate calculate weigh "
-    "warn alert notify inform remind ask answer reply speak talk say shout call sing play hear listen smell sniff "
-    "taste feel sense confirm ensure double-check recount pinpoint trace face eye peek peer glance"
-    # navigation and general
-    " avoid dodge evade circumvent bypass pass circle stop wait stay keep mind beware prepare start begin try help "
-    "make use need want know build sit stand step select choose plan compute plot route work supply charge guide lead "
-    "obstruct harm damage scratch spill scare wake block interact collide contact dispose hurt crash stain drop "
-    "pause resume continue finish end complete cancel abort halt chase pursue hide jump hop leap duck crouch kneel "
-    "buy sell order rent borrow lend owe post export import evacuate rescue save extinguish ignite smother quench "
-    "guard protect shield defend sleep think believe guess suspect wonder imagine assume expect hope wish remember "
-    "recall forget learn teach let allow remain bother worry care belong contain include own steal lose die live "
-    "swap switch trade share split merge combine divide bite chew eat drink sip wear dust strew infest shatter"
-    # rare
-    " discard dispose abandon absorb accompany acquire aid apply appraise assist beat boost brace bundle center centre "
-    "chuck collate comfort compile compress conceal conduct consume convey cradle crop curl cycle dab decant decorate "
-    "deflate dip direct discharge dish display dispatch dissolve distribute donate drape ease eject elevate eliminate "
-    "embed encircle engage enlarge erase erect exchange expose extend fish fit flick fumigate grind heave hitch "
-    "immerse inflate initiate inventory invert isolate jerk jiggle jot kill lace lash lick line link litter lodge "
-    "loop magnify maintain marinate massage mist moisten mulch nest obtain orient outline overturn package pad paste "
-    "peg perform pierce pitch pivot pop preheat preserve produce provide puncture purge quarantine raid ram rank "
-    "receive reinforce relay remedy request restrain retain retract reverse revolve rub ruin salvage seat season "
-    "segment simmer siphon skim slam snap snatch snip soothe splash squirt stabilise stabilize stash stitch strain "
-    "strap suck surround suspend swipe tack tally target tend terminate tether thread throttle tick treat truck unbox "
-    "uncover undo unhitch unveil usher vacate validate vent visualise visualize whip widen winch zip unzip zoom "
-    "support house wet rid roam teach greet meet welcome invite introduce accept reject approve reserve book cater "
-    "celebrate gift hail signal wink nod shrug point salute collide crack pack unwind sprawl rest recline snooze nap "
-    "relax play pose queue gather crowd swarm graze nibble peck hatch roost burrow"
-    # processes without an agent
-    " fall lie hang lurk dwell float sink drift dangle hover perch bounce skid exist occur happen leak drip flow blink "
-    "flash beep ring buzz hum smoke burn glow shine rattle wobble vibrate function fail matter depend grow bloom wilt "
-    "rust rot sprout fade crack squeak stink bark meow cry laugh smile wave sway swing spring blow melt overflow "
-    "collapse tumble topple trip slump arrive forgive excuse pardon thank appreciate trouble bother surprise show "
-    "appear seem look become weave bind sting deal meet swell"
+    "pick grab grasp lift hold collect gather retrieve remove catch seize lower raise open close shut press turn "
+    "switch rotate flip empty assemble disassemble manipulate handle feed harvest prune swap change replace unplug "
+    "unlock lock light aim stir tighten loosen fold unfold wrap unwrap unpack untie sew knit drill hammer saw unscrew "
+    "peel chop slice dice grate mix blend whisk grill brew bend straighten stretch pluck trim shave bathe dress "
+    "dampen wring unblock block unclog adjust align calibrate tune configure uninstall unmount dismount detach "
+    "unfasten secure unhook latch unlatch unbolt disconnect rewire refuel recharge replenish top patch mend restore "
+    "rebuild renew update upgrade twist spin swivel wind unwind coil uncoil unroll dim brighten mute unmute activate "
+    "deactivate enable disable trigger operate reboot restart reset silence defrost fertilize reap glean herd milk "
+    "shear saddle pet stroke pat steady punch crank pump flush pry poke tap grip clasp clench pinch yank tug seal "
+    "unseal cap uncap cork uncork plow plough till sow flatten level shake strip extract excavate free release trap "
+    "dismantle demolish rock find locate identify detect recognize recognise spot seek discover determine point show "
+    "tell see view observe photograph capture record map reconstruct model measure count track list report describe "
+    "mark label localize localise verify evaluate review focus attend concentrate read document catalog catalogue "
+    "digitize film image compare gaze oversee supervise log note sketch draw write print type sign highlight tag "
+    "annotate classify categorize categorise group separate distinguish estimate calculate weigh warn alert notify "
+    "inform remind ask answer reply speak talk say shout call sing play hear listen smell sniff taste feel sense "
+    "confirm ensure double-check recount pinpoint trace face eye peek peer glance avoid dodge evade circumvent bypass "
+    "stop wait stay mind beware prepare start begin try help make use need want know build sit stand select choose "
+    "plan compute plot route work supply charge obstruct dispose pause resume finish end complete cancel abort halt "
+    "chase pursue jump hop leap duck crouch kneel buy sell order rent borrow lend owe post export import evacuate "
+    "rescue save extinguish ignite smother quench guard protect shield defend sleep think believe guess suspect "
+    "wonder imagine assume expect hope wish remember recall forget learn teach let allow remain bother worry care "
+    "belong contain include own steal lose die live trade share split merge combine divide bite chew eat drink sip "
+    "wear strew infest abandon absorb accompany acquire aid apply appraise assist beat boost brace bundle center "
+    "centre chuck collate comfort compile compress conceal conduct consume convey cradle crop curl cycle dab decant "
+    "decorate deflate direct discharge dish display dispatch dissolve distribute donate ease eject elevate eliminate "
+    "encircle engage enlarge erect exchange expose extend fish flick fumigate grind heave hitch inflate initiate "
+    "inventory invert isolate jerk jiggle jot kill lace lash lick line link litter loop magnify maintain marinate "
+    "massage mist moisten mulch nest obtain orient outline package pad paste peg perform pierce pitch pivot preheat "
+    "preserve produce provide puncture purge quarantine raid rank receive reinforce relay remedy request restrain "
+    "retain retract revolve rub ruin salvage seat season segment simmer siphon skim slam snap snatch snip soothe "
+    "splash squirt stabilise stabilize stitch strain strap suck surround swipe tack tally target tend terminate "
+    "tether thread throttle tick treat truck unbox uncover undo unhitch unveil usher vacate validate vent visualise "
+    "visualize whip widen winch zip unzip zoom support house wet rid greet meet welcome invite introduce accept "
+    "reject approve reserve book cater celebrate gift hail signal wink nod shrug salute sprawl recline snooze nap "
+    "relax pose queue crowd swarm nibble peck hatch roost burrow fall lie lurk dwell float sink drift dangle hover "
+    "perch bounce skid exist occur happen leak drip flow blink flash beep ring buzz hum smoke glow shine wobble "
+    "vibrate function fail matter depend grow bloom wilt rust rot sprout fade squeak stink bark meow cry laugh smile "
+    "wave sway spring blow melt overflow collapse tumble slump arrive forgive excuse pardon thank appreciate trouble "
+    "surprise appear seem become weave bind sting deal swell"
 )
 VERBS: Final = (
     GO_VERBS
@@ -159,26 +156,22 @@ VERBS: Final = (
 
 
 # past forms and participles that do not end in -ed
-_IRREGULAR: Final = {
-    "fell": "fall", "fallen": "fall", "went": "go", "gone": "go", "got": "get", "gotten": "get", "came": "come",
-    "stood": "stand", "sat": "sit", "lay": "lie", "laid": "lay", "lain": "lie", "ran": "run", "left": "leave",
-    "kept": "keep", "hid": "hide", "hidden": "hide", "lost": "lose", "stuck": "stick", "hung": "hang",
-    "found": "find", "put": "put", "set": "set", "seen": "see", "saw": "see", "made": "make", "built": "build",
-    "held": "hold", "threw": "throw", "thrown": "throw", "broke": "break", "broken": "break", "sunk": "sink",
-    "bent": "bend", "spilt": "spill", "took": "take", "taken": "take", "gave": "give", "given": "give",
-    "brought": "bring", "bought": "buy", "sent": "send", "forgot": "forget", "forgotten": "forget", "shut": "shut",
-    "cut": "cut", "hit": "hit", "let": "let", "lit": "light", "wore": "wear", "worn": "wear", "torn": "tear",
-    "tore": "tear", "woke": "wake", "wrote": "write", "written": "write", "drawn": "draw", "drew": "draw",
-    "grew": "grow", "grown": "grow", "blown": "blow", "blew": "blow", "swept": "sweep", "wound": "wind",
-    "fed": "feed", "felt": "feel", "led": "lead", "met": "meet", "read": "read", "said": "say", "told": "tell",
-    "sold": "sell", "slid": "slide", "spread": "spread", "stolen": "steal", "stole": "steal", "frozen": "freeze",
-    "driven": "drive", "drove": "drive", "flown": "fly", "flew": "fly", "eaten": "eat", "ate": "eat",
-    "drunk": "drink", "drank": "drink", "chosen": "choose", "knew": "know", "known": "know", "thought": "think",
-    "burnt": "burn", "dug": "dig", "bound": "bind", "dealt": "deal", "heard": "hear",
-    "leant": "lean", "leapt": "leap", "meant": "mean", "shown": "show", "slept": "sleep", "stung": "sting",
-    "swung": "swing", "done": "do", "lent": "lend", "hurt": "hurt",
-    "sprung": "spring", "woven": "weave", "strewn": "strew",
-}  # fmt: skip
+_IRREGULAR: Final = dict(
+    pair.split(":")
+    for pair in word_set(
+        "fell:fall fallen:fall went:go gone:go got:get gotten:get came:come stood:stand sat:sit lay:lie laid:lay "
+        "lain:lie ran:run left:leave kept:keep hid:hide hidden:hide lost:lose stuck:stick hung:hang found:find put:put "
+        "set:set seen:see saw:see made:make built:build held:hold threw:throw thrown:throw broke:break broken:break "
+        "sunk:sink bent:bend spilt:spill took:take taken:take gave:give given:give brought:bring bought:buy sent:send "
+        "forgot:forget forgotten:forget shut:shut cut:cut hit:hit let:let lit:light wore:wear worn:wear torn:tear "
+        "tore:tear woke:wake wrote:write written:write drawn:draw drew:draw grew:grow grown:grow blown:blow blew:blow "
+        "swept:sweep wound:wind fed:feed felt:feel led:lead met:meet read:read said:say told:tell sold:sell slid:slide "
+        "spread:spread stolen:steal stole:steal frozen:freeze driven:drive drove:drive flown:fly flew:fly eaten:eat "
+        "ate:eat drunk:drink drank:drink chosen:choose knew:know known:know thought:think burnt:burn dug:dig "
+        "bound:bind dealt:deal heard:hear leant:lean leapt:leap meant:mean shown:show slept:sleep stung:sting "
+        "swung:swing done:do lent:lend hurt:hurt sprung:spring woven:weave strewn:strew"
+    )
+)
 _PARTICLES: Final = word_set("up down off out over away around about back through along past at into across onto for")
 _SWITCHED_ON: Final = word_set("turn switch power put bring check focus concentrate spot home work plug report")
 # after these verbs "in" or "on" is a particle: "bring in the boxes"
