@@ -163,17 +163,9 @@ class ChunkBuffer:
             )
         )
 
-    def _ends_with_state(self) -> bool:
-        """Return True for an unknown word after a noun, in "are the plants on the balcony dead"."""
-        *before, last = self.words
-        known = last in lexicon.NOUNS or is_thing(singular(last))
-        return bool(before) and not known and is_thing(before[-1]) and not self.tag(1)
-
     def close(self) -> None:
         """End the current noun phrase."""
         if self.words:
-            if self.tagged[0][1] is Tag.AUXILIARY and self.has_determiner and self._ends_with_state():
-                self.words.pop()
             noun = noun_phrase(self.words, self.has_determiner)
             is_definite = self.has_determiner and self.tagged[self.determiner_at][0] in _DEFINITE
             noun = replace(noun, is_definite=is_definite, is_plural=noun.head != self.words[-1])

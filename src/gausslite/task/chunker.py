@@ -346,6 +346,8 @@ class _Chunker:
         before, after = buffer.tag(-1), buffer.tag(1)
         if word == "of" and before is Tag.DETERMINER and not buffer.words:
             return
+        if not buffer.words and buffer.chunks and buffer.chunks[-1].word == "via":
+            return  # "around the left side of the table"
         directly = not buffer.words and buffer.last_kind() is ChunkKind.VERB and before is Tag.VERB
         elided = word == "in" and [chunk.kind for chunk in buffer.chunks[-3:-1]] == [
             ChunkKind.NOUN,

@@ -121,12 +121,13 @@ class GraphBuilder:
             self._draft.excluded.pop()
             self._negated = False
             return
+        if word not in ("not", "no", "but not", "not to") and self._clause.verb is not None:
+            self._assigner.reach_places()  # "wait by the door but don't open it"
         self._corrects = word == "not" and not self._draft.targets
         self._negate()
         self._avoids = word.startswith("avoid ")
 
     def _negate(self) -> None:
-        self._assigner.reach_places()  # "wait by the door but don't open it"
         self._pending, self._negated, self._avoids, self._negated_objects = None, True, False, []
         self._clause.nouns_since_negation = 0
         self._clause.verb_since_negation = False
@@ -135,7 +136,8 @@ class GraphBuilder:
         """Return True if "leave" excludes its object, as in "take the cups and leave the plates"."""
         rest = [chunk.kind for chunk in self._following if chunk.kind not in (ChunkKind.NOUN, ChunkKind.CONJUNCTION)]
         named = bool(self._following) and self._following[0].kind is ChunkKind.NOUN
-        if named and before is not None and before.word == "but":
+        contrasts = named and self._following[0].word in ("one", "ones")  # "leave the green ones on the vine"
+        if contrasts or (named and before is not None and before.word == "but"):
             return True  # "but leave the plates on the table"
         return named and (not rest or rest[0] in (ChunkKind.CLAUSE_BREAK, ChunkKind.VERB))
 
@@ -162,7 +164,7 @@ class GraphBuilder:
         if not same_negation and clause_has_nouns:
             self._new_clause(chunk.word)
         else:
-            self._clause.verb = chunk.word
+            self._clause.verb, self._clause.crosses = chunk.word, False
 
     def _new_clause(self, verb: str | None) -> None:
         self._assigner.end_clause(verb)
@@ -245,6 +247,15 @@ class GraphBuilder:
         if pending == "of" and not self._clause.skip_of_phrase and is_picture:
             self._draft.warnings.append(f"what {self._described!r} shows is not understood: {noun.text!r} is dropped")
             return
+        longer = [phrase for phrase in self._draft.targets if phrase.endswith(f" {noun.text}")]
+        if (
+            pending is None
+            and noun.is_definite
+            and noun.has_determiner
+            and len(longer) == 1
+            and noun.text not in self._draft.mentions
+        ):
+            noun = phrase_from_text(longer[0])  # "take the alarm clock and look at the clock"
         if self._partitive is not None and pending in (None, "of"):
             (superlative, pending), self._partitive = self._partitive, None
             noun = NounPhrase((*superlative.words, *noun.words), True)
@@ -264,7 +275,9 @@ class GraphBuilder:
         self._adjectives = []
         for listed in nouns:
             goes = pending == "to" or (self._clause.verb in PLACE_VERBS and not self._clause.current_place)
-            if self._negated and pending and goes and not self._clause.verb_since_negation and self._negated_objects:
+            excepted = bool(self._negated_objects) and self._negated_objects[-1] in self._draft.excluded
+            goes = goes and not self._clause.places and not self._clause.verb_since_negation and excepted
+            if self._negated and pending and goes:
                 self._negated = False  # "bring everything except the knife to the sink"
             if self._negated:
                 self._exclude(listed, pending)
@@ -360,7 +373,8 @@ class GraphBuilder:
 
 def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chunk], verb: str | None) -> bool:
     """Return False for names of the robot, and for places, routes and amounts that stand for another noun."""
-    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES and not (noun.has_determiner and pending == "to"):
+    is_named = (noun.has_determiner and pending == "to") or (noun.is_plural and pending == "with")
+    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES and not is_named:
         return False
     if noun.head in lexicon.TASK_NOUNS and pending is None:
         return False

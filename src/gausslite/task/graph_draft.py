@@ -122,7 +122,8 @@ class GraphDraft:
         shown = f"'{terms.relation.replace('_', ' ')}' {anchor!r}"
         if terms.relation == "far_from":
             return Predicate.NEAR, not terms.negated
-        if terms.relation == "outside" and anchor.split()[-1] in lexicon.CONTAINERS:
+        encloses = anchor.split()[-1] in lexicon.CONTAINERS or lexicon.is_space(tuple(anchor.split()))
+        if terms.relation == "outside" and encloses:
             return Predicate.INSIDE, not terms.negated
         if terms.relation == "at_distance":
             self.warnings.append(f"the distance from {anchor!r} is vague or negative: it is dropped")
@@ -161,7 +162,8 @@ class Clause:
 
     places: the destinations or tools named last, which further places describe. terms: of the latest preposition.
     superlative: "nearest" or "farthest" before the latest object. conjoined, is_alternative: a conjunction, or "or",
-    precedes the latest noun. describes: an indefinite noun after "with" does. by_pronoun: the objects come from "it".
+    precedes the latest noun. describes: an indefinite noun after "with" does. crosses: the way crosses a place.
+    by_pronoun: the objects come from "it".
     adds_place: the preposition follows a conjunction. route: the clause mentions a path. skip_of_phrase: the next "of"
     continues a noun that names no object.
     """
@@ -178,6 +180,7 @@ class Clause:
         self.statement = False
         self.conjoined = False
         self.describes = False
+        self.crosses = False
         self.is_alternative = False
         self.is_part = False
         self.between = False

@@ -54,8 +54,8 @@ class RoleAssigner:
         before = self.clause
         if self._searches_for_referent():
             self._search_places_for_referents(before)
-        elif not before.statement:
-            self._make_places_targets()
+        elif not before.statement:  # "walk between the columns and stop at the altar"
+            self._make_places_targets(passes=before.verb in _PASSING_VERBS and verb in verbs.TRAVEL_VERBS)
         self._relations.clause = Clause(verb=verb, referents=before.objects or before.referents)
         self.clause.pending_places, self.clause.follows_statement = before.pending_places, before.statement
 
@@ -76,7 +76,7 @@ class RoleAssigner:
 
     def reach_places(self) -> None:
         """Make the places of "wait by the door" destinations."""
-        if self.clause.verb in verbs.TRAVEL_VERBS:
+        if self.clause.verb is not None:
             self._make_places_targets()
 
     def _make_places_targets(self, passes: bool = False) -> None:
@@ -93,8 +93,9 @@ class RoleAssigner:
             pending, conjoined = clause.inherited_preposition, clause.inherited_conjoined
             clause.skip_of_phrase, clause.inherited_preposition = False, None
         if pending is None:
-            if lexicon.is_space(noun.words) and clause.verb in _CROSSING_VERBS:
+            if lexicon.is_space(noun.words) and clause.verb in _CROSSING_VERBS | {"take"} and not clause.objects:
                 self._draft.add_context(noun.text)
+                clause.crosses, clause.verb = True, "cross"  # "leave the kitchen through the door"
             elif conjoined and clause.last_relation is not None and self._is_second_anchor(noun, after):
                 self._add_anchor(clause.last_relation, noun)
             elif self._is_recipient(following):
@@ -134,7 +135,7 @@ class RoleAssigner:
             self._relations.relate("near", noun)
         elif self._assign_on_route(pending, noun):
             return
-        elif pending == "with" and clause.terms.negated and clause.places:
+        elif pending == "with" and clause.terms.negated and (clause.places or clause.verb in verbs.TOOL_VERBS):
             self._draft.exclude(noun.text)  # "with the sponge, not with the towel"
         elif pending == "with":
             self._assign_with(noun)
@@ -170,7 +171,8 @@ class RoleAssigner:
         if clause.verb in verbs.FILLING_VERBS and clause.objects:
             self._assign_loaded(noun)
             return
-        self.reach_places()  # "stop at the shelf with the boxes"
+        if clause.verb in verbs.TRAVEL_VERBS:
+            self.reach_places()  # "stop at the shelf with the boxes"
         if not clause.objects and clause.verb is None and not clause.terms.negated:
             clause.pending_places.append((clause.terms, noun))  # "with a sponge, wipe the table"
         elif (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
@@ -179,6 +181,8 @@ class RoleAssigner:
     def _assign_place(self, pending: str, noun: NounPhrase, following: Sequence[Chunk]) -> None:
         """Assign a noun after a preposition of place: a destination, or where an object or a destination is."""
         clause = self.clause
+        if clause.crosses and not clause.objects:
+            return  # "take the hallway to the left of the stairs"
         if clause.terms.negated and clause.adds_place and self._has_destination(pending):
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
         elif pending == "far_from" and clause.verb in verbs.GO_VERBS and not (clause.objects or clause.pending_places):
@@ -268,7 +272,7 @@ class RoleAssigner:
         """Assign the noun after "with": the hat of "find a man with a hat" is near him, a sponge is a tool."""
         clause = self.clause
         is_part = noun.head in lexicon.PARTS or noun.head in lexicon.CLOTHING
-        if noun.head in lexicon.BODY_PARTS and clause.objects and not self._are_people(clause.objects):
+        if noun.head in lexicon.BODY_PARTS and clause.verb and clause.objects and not self._are_people(clause.objects):
             return  # "with both hands"
         if clause.last_relation == "for":
             return  # "for the man with the trolley"

@@ -213,7 +213,9 @@ def _tag_by_neighbours(before: str, word: str, after: str) -> Tag | None:
     ends = not after or is_place or after == "and"
     stops = word in ("stop", "wait") and ends and _is_noun(before) and before not in lexicon.CONTAINERS
     commands = (
-        stops  # "walk to the sofa stop", "turn left walk to"
+        (word == "turn" and after in _TURNS)
+        or (word in ("exit", "enter") and before in ("and", "then") and after in _OPENERS)
+        or stops  # "walk to the sofa stop", "turn left walk to"
         or (word in verbs.GO_VERBS and before in _TURNS and is_place)
         or (word in verbs.VERBS and before in _LEADING_VERBS | _NEGATED_COMMANDS)
         or (opens and word in _MOTIONS and (is_place or after in _TURNS))

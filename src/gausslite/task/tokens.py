@@ -123,13 +123,13 @@ _PLAIN: Final = {
     r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
     r"(you|we|they)'re": r"\1 are",
     r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
-    rf"at (?:least|most)(?= (?:one|two|three|four|five|six|seven|eight|nine|ten|\d+) (?!{_UNIT}\b))": "",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
     r"^whose": "the",
+    r"with (?:its|their|the) backs? (?:to|against)": "near",
+    r"the (?:one|object|thing) (?:that )?(?:i|we|you) (?:want|need|mean|(?:am |are )?look(?:ing)? for) is": "it is",
+    r"belonging to": "of",
     r"^the (?:target|goal|object|item)(?: object)? is": "this is",
-    r"meet (?:me|us)(?= (?:at|by|near|next|behind|in|under|on)\b)": "wait",
-    r"as many (\w+) as (?:possible|you (?:can|need))(?: carry| find| hold)?": r"\1",
     # "a cabinet, above it is a lamp"
     rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
     r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
@@ -158,7 +158,8 @@ _PLAIN: Final = {
     r"nothing (?:but|except|other than)": "",
     r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)": "",
     # where the robot starts gives nothing; a viewpoint is an object to pass
-    r"^you (?:start|begin|stand|are standing|are starting)\b[^.;]*[.;]": "",
+    r"^(?:you (?:stand|are standing|are starting)|(?:you )?(?:start|begin|starting|beginning) (?:at|in|from|by|next))\b"
+    r"[^.;,]*[.;,]": "",
     r"(?:until|till|so that|so) (the|an?) ([\w ]{2,30}?) is(?= (?:on|to|at) your| behind you| in front of you)": (
         r"and pass \1 \2"
     ),
@@ -176,7 +177,6 @@ _PLAIN: Final = {
     r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)": "",
     r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
     rf"where (the [\w ]+?) (?:is|are)(?: \w+(?:ed|ing)| kept)?{_END}": r"\1 with \2",
-    r"the one of(?= an? \w)": "a picture of",
     r"(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
     r"leave(?= (?:through|via)\b)": "exit",
     r"(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
@@ -201,23 +201,21 @@ _PLAIN: Final = {
     r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
-    r"keep (?:an|your|a close|a watchful) eye on|keep watch (?:over|on)": "watch",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
     r"be careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|take care not to": "do not",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
     r"(?:stay|keep|remain) close to": "follow",
-    r"keep (?:your|a safe|some|a) distance (?:from|to)": "avoid",
+    r"keep (?:your|a safe|some|a) distance (?:from|to)|(?:stay|keep) off(?: of)?(?= \w)": "avoid",
     rf"(?:keep|stay|remain) (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
     r"not (?:\w+ )?far (?:away )?from": "near",
     r"(?:farthest|furthest|most distant) away(?! from)|most distant(?! from)": "farthest",
     r"(?:\w+ (?:floor|level|story))(?= (?:\w+room|kitchen|office|hallway)\b)": "",
     r"(?:level|floor|storey) (?:one|two|three|four|\d)": "storey",
     r"around the (?:corner|bend)(?! of)": "",
-    r"(?:is|are|am|have run|has run|ran)(?: almost)? out of \w+": "is empty",
-    r"a (?:bit|little|lot)(?= (?:to|more|further|and|then)\b|$| ?[,.;])": "",
+    r"(?:is|are|am|have run|has run|ran)(?: almost)? out of (?!the\b|my\b)\w+": "is empty",
     r"(?:^|(?<=[,;.] )|(?<=and )|(?<=then ))plug in(?= (?:the|my|an?)\b)": "activate",
-    r"parallel to": "along",
+    r"until you (?:see|find|spot|notice|come to|get to|hit)": "until you reach",
     r"(?:ground|first|second|third|fourth|top|upper|lower|next|\d+(?:st|nd|rd|th)) (?:floor|level)\b"
     r"(?! (?:tile|lamp|mat|plan|board))": "storey",
     r"(\w+)-colou?red": r"\1",
@@ -226,9 +224,8 @@ _PLAIN: Final = {
     r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
     r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
-    r"(everything|everyone|all|anything) but": r"\1 except",
+    r"((?:every|any)(?:thing|one)|all|(?:every|all|any) (?:\w+ ){0,2}\w+(?= but (?:the|an?|my)\b)) but": r"\1 except",
     r"as well as|along with|together with|in addition to|and also|plus": "and",
-    r"((?:every|all|any) (?:\w+ ){0,2}\w+) but(?= (?:the|a|an|my|this|that|those) )": r"\1 except",
     # the last noun carries the meaning
     r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",
 }
@@ -241,7 +238,7 @@ _TWO_COLOURS: Final = re.compile(
 # no graph states a comparison; comparatives of distance ("further than 2 m from") are no comparisons of objects
 _COMPARISON: Final = re.compile(
     rf"\b(?:{'|'.join(sorted(COMPARATIVES))}) than (?:(?:the|an?|my|your|this|that|its|all|any) )*[\w.]+"
-    rf"(?: (?:{_UNIT}|kg|others?|ones?|high|tall|wide|long)\b)*"
+    rf"(?: (?:{_UNIT}|kg|kilos?|kilograms?|pounds?|others?|ones?|high|tall|wide|long)\b)*"
 )
 _ARROW: Final = re.compile(r"\s*(?:->|=>|\u2192)\s*")
 _LEAVE_ALONE: Final = re.compile(
@@ -285,7 +282,7 @@ def replace_idioms(text: str) -> str:
 _BY_RELATION: Final = {
     "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
     "connected to|in the vicinity of|next|surrounding|along|close by|by the side of|at the side of|right next to|"
-    "in reach of|within reach of|leaning on|leaning against|at the end of|at the foot of|at the base of|"
+    "in reach of|within reach of|leaning on|leaning against|at the end of|at the head of|at the foot of|at the base of|"
     "at the edge of|on either side of|on both sides of|within arm's reach of|within easy reach of|tied to|"
     "chained to|hooked to|leashed to|plugged into|propped against|resting against",
     "closer": "closer to",

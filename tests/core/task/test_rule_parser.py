@@ -43,6 +43,33 @@ def test_no_sentence_of_a_foreign_set_is_read_as_its_opposite(path):
     assert score.exact >= 0.6
 
 
+@pytest.mark.parametrize(
+    ("text", "denied"),
+    [
+        ("Set the cup beside the sink, not in the tub", "tub"),
+        ("Hand me the cup, no, the glass", "cup"),
+        ("Clean the mirror but not with the sponge", "sponge"),
+        ("Move all the chairs but the broken one to the garage", "broken chair"),
+        ("Do not put the knife in the dishwasher, wash it in the sink", "dishwasher"),
+        ("Sweep the hall but stay off the yellow line", "line"),
+        ("Pick the ripe plums and leave the green ones on the tree", "plum"),
+    ],
+)
+def test_what_is_denied_is_not_handled(text, denied):
+    graph = RuleParser().parse(text)
+    handled = {name for name, role in zip(graph.targets, graph.roles, strict=True) if role is not TargetRole.OBSTACLE}
+    assert denied not in handled
+    assert denied in (*graph.excluded, *graph.targets)
+
+
+@pytest.mark.parametrize(
+    "text", ["Bring die rote Tasse bitte", "Apporte-moi la tasse rouge", "Porta la tazza in cucina"]
+)
+def test_a_sentence_in_another_language_is_refused(text):
+    with pytest.raises(TaskError):
+        RuleParser().parse(text)
+
+
 @pytest.mark.parametrize("expected", load_sentences(DAILY_TASKS), ids=lambda graph: graph.text)
 def test_daily_tasks(expected):
     parsed = RuleParser().parse(expected.text)
