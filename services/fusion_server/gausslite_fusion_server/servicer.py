@@ -145,8 +145,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._gate = DrainGate()
         find = functools.partial(self._work, session_of, engine)
         self._contributions = Contributions(find, self._store_message, engine.record_traffic, RejectionLog(_log))
-        # one at a time: they hold megabytes, or the interpreter's lock
-        self._exports, self._keyframes, self._queries = (asyncio.Semaphore(1) for _ in range(3))
+        # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
+        self._exports, self._keyframes, self._queries, self._joins = (asyncio.Semaphore(1) for _ in range(4))
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
@@ -214,7 +214,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
         declared_frame_from_message(request)
-        joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map, request.token)
+        async with self._joins:
+            joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map, request.token)
         await self._work(declare_frame, self._engine, request)
         if task is not None:
             report = ObjectReport(task, self._engine.reported_objects(request.agent_id, task))

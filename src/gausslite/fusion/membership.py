@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import secrets
 import time
 from collections import deque
@@ -21,6 +22,7 @@ from gausslite.fusion.agent_data import is_earlier_map
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord, SharedRows, reconcile
 
+_log = logging.getLogger(__name__)
 RECORD = "ban"
 _BANNED = b"banned"
 
@@ -211,10 +213,11 @@ class Membership:
 
     def __init__(self, store: FusionStore, settings: FusionSettings, others: SharedRows | None = None) -> None:
         self._store, self._settings = store, settings
-        own = settings.mission_config
-        self._mission_config = reconcile(store.mission_config() or own, own)
+        own, self._stored_config = settings.mission_config, store.mission_config()
+        self._mission_config = reconcile(self._stored_config or own, own)
         self._sessions = SessionRegistry(store, settings.lease_s, others=others)
         self._bans = BanList(store)
+        self._most_agents = len(self._agents())
 
     @property
     def mission_config(self) -> MissionConfig:
@@ -252,7 +255,9 @@ class Membership:
         ended = self._make_room(agent_id)
         agreed = self._mission_config if self._is_agreed(agent_id) else self._settings.mission_config
         mission_config = reconcile(agreed, requested).with_default_names()
-        self._store.set_mission_config(mission_config)
+        if mission_config != self._stored_config:
+            self._store.set_mission_config(mission_config)
+            self._stored_config = mission_config
         self._mission_config = mission_config
         return ended
 
@@ -262,7 +267,12 @@ class Membership:
 
     def open_session(self, agent_id: str, token: str) -> SessionRecord:
         """Return a new session of an admitted agent; its earlier one ends. Raises NameInUseError, StorageError."""
-        return self._sessions.open(agent_id, token)
+        session, agents = self._sessions.open(agent_id, token), len(self._agents())
+        # names that come and go fill no log
+        if agents > self._most_agents:
+            self._most_agents, limit = agents, self._settings.quotas.agents
+            _log.info("agent %s has joined; %d of at most %d names are in use", quote_name(agent_id), agents, limit)
+        return session
 
     def save_token(self, agent_id: str, token: str) -> None:
         """Store the token of the agent's session again, see SessionRegistry."""

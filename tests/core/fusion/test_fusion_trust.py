@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -215,6 +216,21 @@ def test_no_flood_of_names_ends_a_live_lease() -> None:
     crowded.evict("junk-0")
     join(crowded, "late")
     assert {agent.agent_id for agent in crowded.status().agents} == {"honest", "with-data", "late"}
+
+
+def test_new_names_are_logged_and_names_that_come_and_go_fill_no_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gausslite.fusion.membership")
+    engine = new_engine(quotas=Quotas(agents=3))
+    for _ in range(5):
+        for number in range(3):
+            engine.leave(join(engine, f"junk-{number}"))
+    sessions = [join(engine, f"name-{number}") for number in range(3)]
+    assert len(sessions) == 3
+    assert [record.getMessage() for record in caplog.records] == [
+        "agent 'junk-0' has joined; 1 of at most 3 names are in use",
+        "agent 'name-1' has joined; 2 of at most 3 names are in use",
+        "agent 'name-2' has joined; 3 of at most 3 names are in use",
+    ]
 
 
 @pytest.mark.parametrize("how", ["leave", "evict", "unban"])
