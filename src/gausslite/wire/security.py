@@ -9,7 +9,7 @@ import os
 import ssl
 import time
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -434,10 +434,3 @@ async def wait_for_bandwidth(bandwidth: TokenBucket | None, message_bytes: int) 
     bandwidth.spend(MESSAGE_BYTES + message_bytes)
     while (wait_s := bandwidth.seconds_until_positive(time.monotonic())) > 0:
         await asyncio.sleep(wait_s)
-
-
-async def limit_stream(requests: AsyncIterator[bytes], bandwidth: TokenBucket | None) -> AsyncIterator[bytes]:
-    """Yield the requests at the caller's bandwidth; HTTP/2's flow control then slows the caller down."""
-    async for data in requests:
-        await wait_for_bandwidth(bandwidth, len(data))
-        yield data

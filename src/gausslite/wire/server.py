@@ -32,7 +32,6 @@ from gausslite.wire.security import (
     RejectionLog,
     Tls,
     TokenBucket,
-    limit_stream,
     require_role,
     wait_for_bandwidth,
 )
@@ -314,7 +313,7 @@ class _Guard:
                 caller = Caller.of(context)
                 require_role(self.method, caller)
                 with self.usage.open_call(caller) as bandwidth:
-                    return await inner(await self._admit(request, bandwidth), context)
+                    return await inner(await self._admit(request, bandwidth, context), context)
             except Exception as error:
                 await self._abort(error, context)
 
@@ -326,17 +325,17 @@ class _Guard:
                 caller = Caller.of(context)
                 require_role(self.method, caller)
                 with self.usage.open_call(caller) as bandwidth:
-                    async for response in inner(await self._admit(request, bandwidth), context):
+                    async for response in inner(await self._admit(request, bandwidth, context), context):
                         yield response
             except Exception as error:
                 await self._abort(error, context)
 
         return guarded
 
-    async def _admit(self, request: Any, bandwidth: TokenBucket | None) -> Any:
+    async def _admit(self, request: Any, bandwidth: TokenBucket | None, context: Any) -> Any:
         """Return the decoded request or stream of requests, at the caller's bandwidth. Raises InvalidInputError."""
         if self.request_streaming:
-            return self._decode_stream(limit_stream(request, bandwidth))
+            return self._read_stream(context, bandwidth)
         await wait_for_bandwidth(bandwidth, len(request))
         return self._decode(request)
 
@@ -355,9 +354,14 @@ class _Guard:
         await context.abort_with_status(to_status(error))
         raise error
 
-    async def _decode_stream(self, requests: AsyncIterator[bytes]) -> AsyncIterator[Any]:
-        async for data in requests:
-            yield self._decode(data)
+    async def _read_stream(self, context: Any, bandwidth: TokenBucket | None) -> AsyncIterator[Any]:
+        """Yield the requests at the caller's bandwidth; HTTP/2's flow control then slows the caller down."""
+        # gRPC's iterator would keep the bytes of a request while the method works on it
+        while (data := await context.read()) is not grpc.aio.EOF:  # type: ignore[attr-defined]
+            await wait_for_bandwidth(bandwidth, len(data))
+            request = self._decode(data)
+            del data
+            yield request
 
     def _decode(self, data: bytes) -> Any:
         try:
