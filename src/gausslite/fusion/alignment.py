@@ -1,6 +1,6 @@
 """Compare two maps by samples of their surfaces: how they fit, and the rigid motion with which they fit better.
 
-small_gicp finds motions from half of the overlap. Whether one of them holds is decided on the other half, by distance
+Registrations find motions from half of the overlap. Whether one of them holds is decided on the other half, by distance
 and by colour, because the optimum of a registration alone is 15 to 30 mm off even between maps in the same frame.
 """
 
@@ -11,22 +11,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import small_gicp
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.pose import rotation_angle_deg, transform_points
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, gather_rows
+from gausslite.places.registration import Surface
 
 MIN_SAMPLES = 60
 _SAMPLES_PER_VOXEL = 3
 _MIN_OPACITY = 0.3
 LUMINANCE = np.array([0.299, 0.587, 0.114])
-_NEIGHBOURS = 10
 _REACH_M = (0.15, 0.5, 1.0)
 """Longest distance of a match in the first registration of each trial; the later ones are shorter."""
 _REFINE_M = (0.3, 0.15)
-_ITERATIONS = 30
 _MAX_SHIFT_M, _MAX_ROTATION_DEG = 1.5, 45.0
 """Larger motions fit some other part of the map by chance."""
 _MAX_DISTANCE_M, _MAX_COLOUR = 0.1, 0.25
@@ -133,24 +131,20 @@ Fit = Callable[[SurfaceSamples, SurfaceSamples], FrameFit | None]
 
 
 class TargetSurface:
-    """Samples with a search tree and normals, to which others are compared. cloud, tree: for small_gicp."""
+    """Samples and their surface, to which others are compared."""
 
     def __init__(self, samples: SurfaceSamples) -> None:
         self._samples = samples
-        self.cloud = small_gicp.PointCloud(samples.points_m)
-        self.tree = small_gicp.KdTree(self.cloud)
-        small_gicp.estimate_normals_covariances(self.cloud, self.tree, num_neighbors=_NEIGHBOURS)
-        self._normals = np.asarray(self.cloud.normals())[:, :3]
+        self.surface = Surface(samples.points_m)
 
     def residuals(
         self, moved: SurfaceSamples
     ) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"], Bool[ndarray, " n"]]:
         """Return distance and colour difference of each sample as shares of their limits, and which have a match."""
-        found, squares = self.tree.batch_nearest_neighbor_search(moved.points_m)
-        near, away_m = np.asarray(found, np.int64), np.sqrt(np.asarray(squares, np.float64))
+        near, away_m = self.surface.nearest(moved.points_m)
         offset = moved.points_m - self._samples.points_m[near]
         matched = away_m < _MAX_DISTANCE_M
-        distance_m = np.abs(np.einsum("ni,ni->n", offset, self._normals[near]))
+        distance_m = np.abs(np.einsum("ni,ni->n", offset, self.surface.normals[near]))
         colour = moved.luminance - self._samples.luminance[near]
         if matched.any():
             # agents' exposures may differ
@@ -160,8 +154,7 @@ class TargetSurface:
 
     def nearest_luminance(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
         """Return the luminance of the sample nearest to each point."""
-        found = np.asarray(self.tree.batch_nearest_neighbor_search(points_m)[0], np.int64)
-        luminance: Float64[ndarray, " n"] = self._samples.luminance[found]
+        luminance: Float64[ndarray, " n"] = self._samples.luminance[self.surface.nearest(points_m)[0]]
         return luminance
 
 
@@ -193,13 +186,11 @@ def _trials(
     source: SurfaceSamples, target: TargetSurface, centre_m: Float64[ndarray, "3"]
 ) -> Iterator[Float64[ndarray, "4 4"]]:
     """Yield the motions that registrations with different first reaches find."""
-    cloud = small_gicp.PointCloud(source.points_m)
-    small_gicp.estimate_normals_covariances(cloud, num_neighbors=_NEIGHBOURS)
+    surface = Surface(source.points_m)
     for first_m in _REACH_M:
         T = np.eye(4)
         for reach_m in (first_m, *(reach_m for reach_m in _REFINE_M if reach_m < first_m)):
-            result = small_gicp.align(target.cloud, cloud, target.tree, T, "GICP", reach_m, max_iterations=_ITERATIONS)
-            T = np.asarray(result.T_target_source, np.float64)
+            T = target.surface.refined(surface, T, reach_m)
         if _shift_m(T, centre_m) <= _MAX_SHIFT_M and rotation_angle_deg(T, np.eye(4)) <= _MAX_ROTATION_DEG:
             yield T
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from threading import RLock
 
 import numpy as np
-import small_gicp
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
@@ -36,7 +35,7 @@ from gausslite.fusion.frame_aligner import FrameAligner, log_change
 from gausslite.fusion.frames import FrameAlignment, FrameAlignments
 from gausslite.fusion.keyframes import KeyframePool
 from gausslite.fusion.store import FusionStore
-from gausslite.places.registration import GICP_ITERATIONS, Surface, can_match_without_guess, matched_motion
+from gausslite.places.registration import Surface, can_match_without_guess, matched_motion
 
 _log = logging.getLogger(__name__)
 _MIN_SAMPLES = 300
@@ -44,7 +43,6 @@ _SPACINGS_M = (0.1, 0.15, 0.2)
 """Of the samples whose features are matched: no single one finds the motions of all homes."""
 _MIN_INLIERS = 3
 _REACH_M = (0.5, 0.3, 0.15)
-_NEIGHBOURS = 10
 _COARSE_SAMPLES = 1500
 _MIN_BLOCKS = 30
 _MIN_MATCHED, _MIN_TEXTURE = 0.9, 0.35
@@ -141,7 +139,7 @@ class _Search:
         self._places = TargetSurface(target)
         rng = np.random.default_rng(0)
         few = rng.permutation(len(self._first))[:_COARSE_SAMPLES]
-        self._coarse, self._cloud = (_cloud(points_m) for points_m in (self._first.points_m[few], self._first.points_m))
+        self._coarse, self._whole = Surface(self._first.points_m[few]), Surface(self._first.points_m)
 
     def matched_motions(
         self, source: SurfaceSamples, target: SurfaceSamples, spacings_m: Sequence[float]
@@ -198,7 +196,7 @@ class _Search:
 
     def fit(self, motion: Float64[ndarray, "4 4"]) -> FrameFit:
         """Return the fit of a motion that passes, refined on the whole first half."""
-        motion = self._registered(self._cloud, motion, _REACH_M[-1:])
+        motion = self._registered(self._whole, motion, _REACH_M[-1:])
         shared = self._shared(self._source.moved(motion))
         centre_m = self._source.points_m[shared].mean(axis=0)
         return evaluate_motion(self._source.take(shared), self._blocks[shared], self._places, motion, centre_m)
@@ -214,21 +212,12 @@ class _Search:
         return shared
 
     def _registered(
-        self, cloud: small_gicp.PointCloud, T: Float64[ndarray, "4 4"], reaches_m: Sequence[float] = _REACH_M
+        self, surface: Surface, T: Float64[ndarray, "4 4"], reaches_m: Sequence[float] = _REACH_M
     ) -> Float64[ndarray, "4 4"]:
         for reach_m in reaches_m:
-            result = small_gicp.align(
-                self._places.cloud, cloud, self._places.tree, T, "GICP", reach_m, max_iterations=GICP_ITERATIONS
-            )
-            T = np.asarray(result.T_target_source, np.float64)
+            T = self._places.surface.refined(surface, T, reach_m)
         registered: Float64[ndarray, "4 4"] = orthonormal(T)
         return registered
-
-
-def _cloud(points_m: Float64[ndarray, "n 3"]) -> small_gicp.PointCloud:
-    cloud = small_gicp.PointCloud(points_m)
-    small_gicp.estimate_normals_covariances(cloud, num_neighbors=_NEIGHBOURS)
-    return cloud
 
 
 def _block_correlation(

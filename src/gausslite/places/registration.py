@@ -20,7 +20,7 @@ from gausslite.domain.pose import orthonormal, transform_points
 from gausslite.process import import_extra
 
 _NEIGHBOURS = 10
-GICP_ITERATIONS = 30
+_GICP_ITERATIONS = 30
 _SPACING_M, _MAX_SAMPLES = 0.08, 6000
 """At 8 cm, kiss-matcher finds 23 of 48 pairs of a kitchen frame and a rendered keyframe; at 5 cm 9, at 13 cm 12."""
 _DEPTH_EDGE_PX = 2
@@ -42,15 +42,15 @@ _MIN_STIFFNESS = 0.01
 
 
 class Surface:
-    """Samples of a surface with search tree and normals. spacing_m: their least distance. `cloud`: for small_gicp."""
+    """Samples of a surface with search tree and normals. spacing_m: their least distance."""
 
     def __init__(self, points_m: Float[ndarray, "n 3"], spacing_m: float = _SPACING_M) -> None:
         self.spacing_m = spacing_m
         self.points_m: Float64[ndarray, "n 3"] = points_m.astype(np.float64)
-        self.cloud = small_gicp.PointCloud(self.points_m)
-        self.tree = small_gicp.KdTree(self.cloud)
-        small_gicp.estimate_normals_covariances(self.cloud, self.tree, num_neighbors=_NEIGHBOURS)
-        self.normals: Float64[ndarray, "n 3"] = np.asarray(self.cloud.normals())[:, :3]
+        self._cloud = small_gicp.PointCloud(self.points_m)
+        self._tree = small_gicp.KdTree(self._cloud)
+        small_gicp.estimate_normals_covariances(self._cloud, self._tree, num_neighbors=_NEIGHBOURS)
+        self.normals: Float64[ndarray, "n 3"] = np.asarray(self._cloud.normals())[:, :3]
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -68,13 +68,13 @@ class Surface:
 
     def nearest(self, points_m: Float64[ndarray, "n 3"]) -> tuple[Int64[ndarray, " n"], Float64[ndarray, " n"]]:
         """Return the nearest sample of each point and its distance in metres."""
-        found, squares = self.tree.batch_nearest_neighbor_search(points_m)
+        found, squares = self._tree.batch_nearest_neighbor_search(points_m)
         return np.asarray(found, np.int64), np.sqrt(np.asarray(squares, np.float64))
 
     def refined(self, source: Surface, T: Float64[ndarray, "4 4"], reach_m: float) -> Float64[ndarray, "4 4"]:
         """Return T_target_source after a GICP registration with matches up to this distance; this is the target."""
         result = small_gicp.align(
-            self.cloud, source.cloud, self.tree, T, "GICP", reach_m, max_iterations=GICP_ITERATIONS
+            self._cloud, source._cloud, self._tree, T, "GICP", reach_m, max_iterations=_GICP_ITERATIONS
         )
         return np.asarray(result.T_target_source, np.float64)
 
