@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -46,24 +46,33 @@ class DepthView:
         """Return the view of a frame."""
         return cls.of(frame.depth_m, frame.camera, frame.T_world_camera)
 
+    def sees_through(
+        self, points_m: Float32[ndarray, "n 3"], slack_m: float = _THROUGH_M, slack_share: float = _THROUGH_SHARE
+    ) -> Bool[ndarray, " n"]:
+        """Return the points that the camera sees through: depth around is farther by slack_m + slack_share · z."""
+        z_m, nearest_m, _ = self._depths(points_m)
+        through: Bool[ndarray, " n"] = z_m < nearest_m - (np.float32(slack_m) + np.float32(slack_share) * z_m)
+        return through
+
     def classify(self, points_m: Float32[ndarray, "n 3"]) -> tuple[Bool[ndarray, " n"], Bool[ndarray, " n"]]:
         """Return which points the camera sees through, and at which it sees a surface; all others are unknown."""
-        through, shown = (np.zeros(len(points_m), np.bool_) for _ in range(2))
+        z_m, nearest_m, farthest_m = self._depths(points_m)
+        slack_m = np.float32(_SHOWN_M) + np.float32(_SHOWN_SHARE) * z_m
+        shown = (nearest_m > 0) & (z_m >= nearest_m - slack_m) & (z_m <= farthest_m + slack_m)
+        return self.sees_through(points_m), shown
+
+    def _depths(
+        self, points_m: Float32[ndarray, "n 3"]
+    ) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"], Float32[ndarray, " n"]]:
+        """Return each point's depth, and the nearest and farthest depth around its pixel; 0 outside the image."""
         points = transform_points(self.T_camera_world, points_m)
         ids = np.flatnonzero(points[:, 2] > NEAR_M)
         columns, rows = np.floor(project(points[ids], self.camera)).astype(np.int64).T
         inside = (rows >= 0) & (rows < self.camera.height_px) & (columns >= 0) & (columns < self.camera.width_px)
         ids, rows, columns = ids[inside], rows[inside], columns[inside]
-        z_m, nearest_m = points[ids, 2], self.nearest_m[rows, columns]
-        through_m, shown_m = (
-            np.float32(base_m) + np.float32(share) * z_m
-            for base_m, share in ((_THROUGH_M, _THROUGH_SHARE), (_SHOWN_M, _SHOWN_SHARE))
-        )
-        measured = nearest_m > 0
-        through[ids] = measured & (z_m < nearest_m - through_m)
-        farthest_m = self.farthest_m[rows, columns]
-        shown[ids] = measured & (z_m >= nearest_m - shown_m) & (z_m <= farthest_m + shown_m)
-        return through, shown
+        nearest_m, farthest_m = (np.zeros(len(points), np.float32) for _ in range(2))
+        nearest_m[ids], farthest_m[ids] = self.nearest_m[rows, columns], self.farthest_m[rows, columns]
+        return np.maximum(points[:, 2], np.float32(0.0)), nearest_m, farthest_m
 
 
 def view_counts(
@@ -78,10 +87,12 @@ def view_counts(
     return through, shown
 
 
-def seen_through(points_m: Float32[ndarray, "n 3"], views: Iterable[DepthView]) -> Bool[ndarray, " n"]:
-    """Return the points that these views contradict: at least three see through them, and few show a surface there."""
+def seen_through(
+    points_m: Float32[ndarray, "n 3"], views: Iterable[DepthView], min_views: int = _MIN_VIEWS
+) -> Bool[ndarray, " n"]:
+    """Return the points that these views contradict: enough see through them, and few show a surface there."""
     through, shown = view_counts(points_m, views)
-    contradicted: Bool[ndarray, " n"] = (through >= _MIN_VIEWS) & (through >= _MIN_RATIO * shown)
+    contradicted: Bool[ndarray, " n"] = (through >= min_views) & (through >= _MIN_RATIO * shown)
     return contradicted
 
 
@@ -94,3 +105,17 @@ def contradicted_rows(
         return rows
     contradicted: Int64[ndarray, " m"] = rows[seen_through(means_m[rows], map(DepthView.of_frame, keyframes))]
     return contradicted
+
+
+def left_behind(
+    means_m: Float32[ndarray, "n 3"], frame: Frame, moved: Bool[ndarray, "h w"], others: Iterable[Frame]
+) -> Int64[ndarray, " m"]:
+    """Return the rows of the means that a frame shows on pixels that moved later, and that other frames contradict.
+
+    Two views suffice: the pixels have been compared before.
+    """
+    view = DepthView.of_frame(frame)
+    view = replace(view, nearest_m=np.where(moved, view.nearest_m, np.float32(0.0)))
+    rows = np.flatnonzero(view.classify(means_m)[1])
+    behind: Int64[ndarray, " m"] = rows[seen_through(means_m[rows], map(DepthView.of_frame, others), min_views=2)]
+    return behind

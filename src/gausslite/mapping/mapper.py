@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
@@ -28,7 +29,7 @@ from gausslite.domain.state import (
 )
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
-from gausslite.mapping.free_space import contradicted_rows
+from gausslite.mapping.free_space import contradicted_rows, left_behind
 from gausslite.mapping.keyframes import (
     Keyframe,
     KeyframeStore,
@@ -272,14 +273,15 @@ class GaussianMapper:
             depth_m=np.where(pixels, np.float32(0), frame.depth_m),
         )
 
-    def hide(self, pixels: Bool[ndarray, "h w"], keyframe: Keyframe) -> None:
-        """Take these pixels of a keyframe out of training."""
-        recorded = None if keyframe.recorded is None else self.without(pixels, keyframe.recorded)
+    def hide(self, moved: Bool[ndarray, "h w"], keyframe: Keyframe, others: Sequence[Frame]) -> None:
+        """Take pixels of a keyframe out of training, and remove their Gaussians that the other frames contradict."""
+        self._remove(left_behind(self._table.means_m, keyframe.frame, moved, others))
+        recorded = None if keyframe.recorded is None else self.without(moved, keyframe.recorded)
         hidden = replace(
             keyframe,
-            frame=self.without(pixels, keyframe.frame),
+            frame=self.without(moved, keyframe.frame),
             recorded=recorded,
-            relevance=keyframe.relevance.without(pixels),
+            relevance=keyframe.relevance.without(moved),
         )
         self._keyframes.exchange(keyframe, hidden, self._window_view)
 
@@ -415,10 +417,12 @@ class GaussianMapper:
         """Set the active flags of what a keyframe shows, and remove the Gaussians that the keyframes see through."""
         update_roi_evidence(self._table, keyframe.frame, keyframe.relevance)
         frames = (earlier.frame for earlier in self._keyframes.buffer)
-        contradicted = contradicted_rows(self._table.means_m, keyframe.frame, frames)
-        if len(contradicted):
+        self._remove(contradicted_rows(self._table.means_m, keyframe.frame, frames))
+
+    def _remove(self, rows: Int64[ndarray, " m"]) -> None:
+        if len(rows):
             keep = np.ones(self._table.count, np.bool_)
-            keep[contradicted] = False
+            keep[rows] = False
             self._table.keep(keep)
 
     def _insert(self, seeds: Seeds) -> int:

@@ -93,6 +93,7 @@ def paper_policy() -> MapperSettings:
     a binary mask, and the loss is divided by the mask's pixels.
     MVO (III-D.2): every 5th frame is a keyframe and the 24 most recent ones train the map; Adam with Gaussian-SLAM's
     constant learning rates; standard clone, split and prune without a growth limit; the map is shown as trained.
+    The scene is static: pixels of things that move are used like all others.
     Poses are an external input (III-C): combine this policy with an exact `MapperSettings.pose_prior`, the default.
     """
     return MapperSettings(
@@ -116,6 +117,7 @@ def paper_policy() -> MapperSettings:
         ),
         saturation=SaturationSettings(max_released=0.0),
         density=DensitySettings(max_growth=1.0),
+        leaves_out_moving=False,
     )
 
 
@@ -182,6 +184,10 @@ def _without_saturation(settings: MapperSettings) -> MapperSettings:
     return replace(settings, saturation=replace(settings.saturation, max_released=0.0))
 
 
+def _without_motion_mask(settings: MapperSettings) -> MapperSettings:
+    return replace(settings, leaves_out_moving=False)
+
+
 EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "long-term-keyframes": _without_long_term_keyframes,
     "roi-context": _without_roi_context,
@@ -191,6 +197,7 @@ EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
     "ema": _without_ema,
     "lr-decay": _without_lr_decay,
     "saturation": _without_saturation,
+    "motion-mask": _without_motion_mask,
 }
 """Extensions of the paper's method that can be disabled, in the order of the ablation in bench/results."""
 

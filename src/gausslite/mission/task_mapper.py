@@ -18,6 +18,7 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.loops import LoopCounts
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.moving import MovingSettings, moving_pixels
 from gausslite.mapping.poses import PoseHistory
 from gausslite.mapping.seeding import RenderedView
 from gausslite.mapping.task_change import Reevaluation
@@ -25,7 +26,6 @@ from gausslite.mapping.tracking import CameraTracker
 from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
-from gausslite.perception.moving import MovingSettings, moving_pixels
 from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
@@ -237,15 +237,16 @@ class TaskMapper:
 
     def _without_moving(self, frame: Frame) -> Frame:
         """Return the frame without the things that move; hide in an earlier keyframe what has moved since."""
-        if not frame.has_depth:
+        if not frame.has_depth or not self._mapper.settings.leaves_out_moving:
             return frame
         keyframes = self._mapper.keyframes()[-MovingSettings().references :]
         frames = [keyframe.frame for keyframe in keyframes]
         if keyframes:
             chosen = self._mapper.revision % len(keyframes)
-            moved = moving_pixels(frames[chosen], [*frames[chosen + 1 :], frame])
+            later = [*frames[chosen + 1 :], frame]
+            moved = moving_pixels(frames[chosen], later)
             if moved.any():
-                self._mapper.hide(moved, keyframes[chosen])
+                self._mapper.hide(moved, keyframes[chosen], [*frames[:chosen], *later])
         moving = moving_pixels(frame, frames)
         return self._mapper.without(moving, frame) if moving.any() else frame
 

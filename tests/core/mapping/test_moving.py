@@ -10,10 +10,10 @@ import pytest
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
+from gausslite.mapping.moving import moving_pixels
 from gausslite.mission.build import build_mapper, region_estimator
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.moving import moving_pixels
 from gausslite_sim.home_settings import HomeSettings
 from gausslite_sim.source import open_simulated
 
@@ -73,6 +73,7 @@ def test_a_keyframe_loses_what_has_left_its_place_later() -> None:
     first = mapper.keyframes()[0].frame
     assert first.index == 0
     assert not first.depth_m[32:88, 82:118].any()
+    assert (mapper.gaussians().means_m[:, 2] > (WALL_M + BOX_M) / 2).all(), "a thing left Gaussians behind"
 
 
 def test_a_simulated_home_has_a_box_that_moves() -> None:

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool
 from numpy import ndarray
 
-from gausslite.domain.camera import lift, project
+from gausslite.domain.camera import lift
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse, transform_points
-
-_NEAR_M = 0.05
+from gausslite.domain.pose import transform_points
+from gausslite.mapping.free_space import DepthView
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +52,9 @@ def moving_pixels(
     p_world = transform_points(frame.T_world_camera, points)
     count = np.zeros(len(p_world), np.int64)
     for reference in earlier[-settings.references :]:
-        count += _seen_through(p_world, reference, settings)
+        count += DepthView.of_frame(reference).sees_through(
+            p_world.astype(np.float32), settings.depth_slack_m, settings.depth_slack_share
+        )
     grid = np.zeros(depth_m.shape, np.uint8)
     grid[rows, columns] = count >= settings.min_references
     # single pixels are at depth edges
@@ -63,20 +64,3 @@ def moving_pixels(
     shown = cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((2 * settings.grown + 1,) * 2, np.uint8))
     moving: Bool[ndarray, "h w"] = np.repeat(np.repeat(shown > 0, step, axis=0), step, axis=1)[:height, :width]
     return moving
-
-
-def _seen_through(p_world: Float64[ndarray, "n 3"], reference: Frame, settings: MovingSettings) -> Bool[ndarray, " n"]:
-    """Return which points are well in front of all that the reference measured around their pixel."""
-    p_camera = transform_points(inverse(reference.T_world_camera), p_world)
-    z_m = p_camera[:, 2]
-    in_front = np.column_stack([p_camera[:, :2], np.maximum(z_m, _NEAR_M)]).astype(np.float32)
-    pixels = np.floor(project(in_front, reference.camera)).astype(np.int64)
-    height, width = reference.depth_m.shape
-    inside = (z_m > _NEAR_M) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-    # a pixel without depth is 0: nothing is seen through there
-    nearest_m = cv2.erode(reference.depth_m, np.ones((3, 3), np.uint8))
-    columns, rows = pixels[inside].T
-    limit_m = z_m[inside] * (1.0 + settings.depth_slack_share) + settings.depth_slack_m
-    seen = np.zeros(len(p_world), np.bool_)
-    seen[inside] = nearest_m[rows, columns] > limit_m
-    return seen
