@@ -247,6 +247,24 @@ def align(
     return Alignment(T_world_rendered @ inverse(solution.T_camera_rendered), solution.overlap, solution.residual)
 
 
+def align_images(
+    reference: Frame, frame: Frame, T_reference_camera: Float64[ndarray, "4 4"], prior_std: Float64[ndarray, "6"]
+) -> Alignment | None:
+    """Return the frame's pose in the reference's camera, near the given one; None if too few points agree.
+
+    Both are images of a camera, which have more detail than a rendering of the map. prior_std: as in `align`.
+    """
+    measured = (reference.depth_m > 0).astype(np.float32)
+    rgb = reference.rgb.astype(np.float32) / np.float32(255.0)
+    model = _Model.of_surface(Rendering(rgb, reference.depth_m, measured, None), reference.camera, FINE)
+    if model is None:
+        return None
+    solution = _solve(model, frame, FINE, T_reference_camera, prior_std, inverse(T_reference_camera))
+    if solution is None:
+        return None
+    return Alignment(inverse(solution.T_camera_rendered), solution.overlap, solution.residual)
+
+
 def fit_pose(
     rendering: Rendering, T_rendered_world: Float64[ndarray, "4 4"], frame: Frame, prior: PoseExposurePrior
 ) -> Float64[ndarray, "4 4"]:
@@ -298,14 +316,14 @@ def _solve(
     levels: Sequence[PyramidLevel],
     T_rendered_prior: Float64[ndarray, "4 4"],
     prior_std: Float64[ndarray, "6"],
+    T_camera_rendered: Float64[ndarray, "4 4"] = np.eye(4),  # noqa: B008 - never written
 ) -> _Solution | None:
     """Return the pose that minimises the residuals under the prior; None if too few points agree with the frame.
 
-    The steps start at the rendered pose. T_rendered_prior: its mean. prior_std: translation (m), rotation (rad).
+    The steps start at T_camera_rendered. T_rendered_prior: its mean. prior_std: translation (m), rotation (rad).
     """
     parameters_std = np.append(prior_std, (_NUISANCE_STD, _NUISANCE_STD))
     solution: _Solution | None = None
-    T_camera_rendered = np.eye(4)
     for i, level in enumerate(levels):
         photograph = with_gradients(blurred_luminance(frame.rgb, level.blur_px))
         for _ in range(level.steps):

@@ -115,14 +115,13 @@ class Keyframe:
         return self.frame if self.recorded is None else self.recorded
 
     def moved(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> Keyframe:
-        """Return the keyframe moved with its anchor, given the motions by keyframe number."""
-        T = T_corrected_earlier[self.anchor]
-        frame, recorded = (
-            None if frame is None else replace(frame, T_world_camera=orthonormal(T @ frame.T_world_camera))
-            for frame in (self.frame, self.recorded)
-        )
-        assert frame is not None
-        return replace(self, frame=frame, recorded=recorded)
+        """Return the keyframe moved with its anchor, given the motions by keyframe number.
+
+        Its next refinement starts from the corrected pose, which replaces the odometry's.
+        """
+        T_world_camera = orthonormal(T_corrected_earlier[self.anchor] @ self.frame.T_world_camera)
+        recorded = None if self.recorded is None else replace(self.recorded, T_world_camera=T_world_camera)
+        return replace(self, frame=replace(self.frame, T_world_camera=T_world_camera), recorded=recorded)
 
     def state(self) -> State:
         """Return the keyframe as named arrays."""

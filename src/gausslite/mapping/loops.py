@@ -1,9 +1,9 @@
 """Close loops: register a keyframe with one of long ago that saw the same place, and correct all poses by the graph.
 
 Candidates are the nearest earlier keyframe by position, and the most similar one by its place descriptor. Their depth
-surfaces give the motion, to a centimetre. A motion that would move the map is verified: what earlier keyframes have
-mapped, rendered from the new pose, must agree with the image. The pose graph then decides which loops are true. One
-that it rejects, at once or later, is counted and reported, and does not correct the map.
+surfaces give the motion to a centimetre, and their images refine it. A motion that would move the map is verified: what
+earlier keyframes have mapped, rendered from the new pose, must agree with the image. The pose graph then decides which
+loops are true. One that it rejects, at once or later, is counted and reported, and does not correct the map.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.calibration.alignment import align_images
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
+from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, translation_m
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.mapping.keyframes import Keyframe
@@ -36,10 +37,13 @@ _MAX_DISTANCE = 1.5
 """Of a candidate by position: metres plus radians."""
 _MIN_SIMILARITY = 0.6
 """Of the descriptors of a candidate by appearance."""
-_NOISE_M, _NOISE_DEG = 0.015, 0.5
-_NOISE_STDS = 2.0 * 2.0**0.5
-"""A loop that the poses contradict by less than these, or by less than this many standard deviations of a pose's error,
-moves nothing until another one does: it is noise of single poses and no drift."""
+_ALIGNED_STD = np.array([0.03] * 3 + [np.radians(0.7)] * 3)
+"""Error of a registered motion before images refine it: translation (m) and rotation (rad)."""
+_MIN_ALIGNED = 0.5
+"""Share of the points in both images whose depth must agree."""
+_NOISE_M, _NOISE_DEG, _NOISE_STDS = 0.006, 0.15, 2.0
+"""A motion that the poses contradict by less than these, or by less than this many standard deviations of a pose's
+error, moves nothing until another one does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +79,11 @@ class LoopCloser:
         require_graph_solver()
         self._table = table
         self._rasterizer = rasterizer
-        self._graph = PoseGraph()
+        self._graph = PoseGraph(prior)
         self._noise_m = max(_NOISE_M, _NOISE_STDS * prior.translation_m)
         self._noise_deg = max(_NOISE_DEG, _NOISE_STDS * prior.rotation_deg)
         self._descriptors: list[PlaceDescriptor] = []
+        self._times_ns: list[int] = []
         self._refused = self._withdrawn = self._corrections = 0
 
     @property
@@ -98,14 +103,20 @@ class LoopCloser:
 
         prior: the frame with the pose before refinement, by the odometry or by tracking. kept: keyframes with images.
         """
-        self._graph.add(prior.T_world_camera, keyframe.frame.T_world_camera)
+        last = None
+        for old in kept:
+            if old.frame.capture_time_ns == self._times_ns[old.anchor]:
+                self._graph.set_pose(old.anchor, old.frame.T_world_camera)
+                last = old if old.anchor == keyframe.anchor - 1 else last
+        T_last_keyframe = None if last is None else _aligned(last, keyframe, _relative(last, keyframe))
+        self._graph.add(prior.T_world_camera, keyframe.frame.T_world_camera, T_last_keyframe)
+        self._times_ns.append(keyframe.frame.capture_time_ns)
         view = View.of(keyframe.frame)
         self._descriptors.append(view.descriptor)
         loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - _MIN_GAP])
-        if loop is None:
-            return None
-        is_noise = self._is_noise(loop)
-        self._graph.add_loop(loop)
+        is_noise = all(motion is None or self._is_noise(motion) for motion in (loop, self._graph.newest_step))
+        if loop is not None:
+            self._graph.add_loop(loop)
         return None if is_noise else self._solve(loop)
 
     def state(self) -> State:
@@ -115,6 +126,7 @@ class LoopCloser:
         return {
             "counts": counts,
             "descriptors": descriptors.reshape(-1, DESCRIPTOR_BYTES),
+            "times_ns": np.array(self._times_ns, np.int64),
             **add_prefix("graph", self._graph.state()),
         }
 
@@ -124,18 +136,18 @@ class LoopCloser:
         self._graph.restore(select_prefix(state, "graph"))
         descriptors = get_array(state, "descriptors", (len(self._graph), DESCRIPTOR_BYTES), np.uint8)
         self._descriptors = [PlaceDescriptor(values.copy()) for values in descriptors]
+        self._times_ns = get_array(state, "times_ns", (len(self._graph),), np.int64).tolist()
 
-    def _solve(self, newest: Loop) -> Float64[ndarray, "k 4 4"]:
+    def _solve(self, newest: Loop | None) -> Float64[ndarray, "k 4 4"]:
         """Solve the pose graph and report the loops that it rejects."""
         solution = self._graph.solve()
-        withdrawn = self._graph.accepted[:-1] & ~solution.accepted[:-1]
-        rejected = [newest] if not solution.accepted[-1] else []
-        for loop in (*rejected, *(self._graph.loops[i] for i in np.flatnonzero(withdrawn).tolist())):
+        for i in np.flatnonzero(self._graph.accepted & ~solution.accepted).tolist():
+            loop = self._graph.loops[i]
             print_message(
                 f"loop between keyframes {loop.earlier} and {loop.later} rejected: it contradicts the others; "
                 "it does not correct the map"
             )
-        self._withdrawn += int(np.count_nonzero(withdrawn))
+            self._withdrawn += loop is not newest
         self._corrections += 1
         return self._graph.apply(solution)
 
@@ -146,8 +158,7 @@ class LoopCloser:
         frame = keyframe.frame
         nearest = min(earlier, key=lambda old: _distance(old.frame, frame))
         if _distance(nearest.frame, frame) < _MAX_DISTANCE:
-            guess = inverse(nearest.frame.T_world_camera) @ frame.T_world_camera
-            loop = self._registered(keyframe, view, nearest, guess)
+            loop = self._registered(keyframe, view, nearest, _relative(nearest, keyframe))
             if loop is not None:
                 return loop
         similar = max(earlier, key=self._similarity)
@@ -166,9 +177,10 @@ class LoopCloser:
     def _registered(self, keyframe: Keyframe, view: View, old: Keyframe, guess: Float64[ndarray, "4 4"]) -> Loop | None:
         """Return the loop of two keyframes if their surfaces fit and, if it moves the map, the rendering agrees."""
         registration = register(view.surface, View.of(old.frame).surface, guess)
-        if registration is None:
+        T_old_keyframe = None if registration is None else _aligned(old, keyframe, registration.T_target_source)
+        if T_old_keyframe is None:
             return None
-        T_world_camera = old.frame.T_world_camera @ registration.T_target_source
+        T_world_camera = old.frame.T_world_camera @ T_old_keyframe
         loop = Loop(old.anchor, keyframe.anchor, inverse(self._graph.poses[old.anchor]) @ T_world_camera)
         if self._is_noise(loop) or self._is_verified(keyframe, T_world_camera):
             return loop
@@ -187,9 +199,25 @@ class LoopCloser:
         return verify(render, keyframe.frame, T_world_camera).is_accepted
 
     def _is_noise(self, loop: Loop) -> bool:
-        """True if the poses agree with a loop, so that it does not move the map."""
+        """True if the poses agree with a motion, so that it does not move the map."""
         error_m, error_deg = self._graph.residual(loop)
         return error_m < self._noise_m and error_deg < self._noise_deg
+
+
+def _relative(old: Keyframe, keyframe: Keyframe) -> Float64[ndarray, "4 4"]:
+    """Return T_old_keyframe by the poses in the map."""
+    T_old_keyframe: Float64[ndarray, "4 4"] = inverse(old.frame.T_world_camera) @ keyframe.frame.T_world_camera
+    return T_old_keyframe
+
+
+def _aligned(
+    old: Keyframe, keyframe: Keyframe, T_old_keyframe: Float64[ndarray, "4 4"]
+) -> Float64[ndarray, "4 4"] | None:
+    """Return the motion refined by both images; None if they show too little in common there."""
+    aligned = align_images(old.frame, keyframe.frame, T_old_keyframe, _ALIGNED_STD)
+    if aligned is None or aligned.overlap < _MIN_ALIGNED:
+        return None
+    return orthonormal(aligned.T_world_camera)
 
 
 def _distance(a: Frame, b: Frame) -> float:

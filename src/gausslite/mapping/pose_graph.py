@@ -1,9 +1,9 @@
 """Correct the poses of keyframes by a pose graph: odometry, alignment to the map, and loops, which may be false.
 
-Nodes are keyframes. Between successive ones there are two factors, the motion by the odometry and that of the poses
-refined against the map. A loop states the motion between two keyframes far apart in time. Loops are robust by graduated
-non-convexity (GNC, Yang et al. 2020): each solution decides anew which ones count, so that a loop which later ones
-contradict no longer corrects the map. GTSAM solves the graph (extra: slam).
+Nodes are keyframes. Between successive ones there are two factors, the motion by the odometry and that by their images,
+or, if these do not align, by the poses refined against the map. A loop states the motion between two keyframes far
+apart in time. Loops are robust by graduated non-convexity (GNC, Yang et al. 2020): each solution decides anew which
+ones count, so that a loop which later ones contradict no longer corrects the map. GTSAM solves the graph (extra: slam).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.pose import inverse, orthonormal, require_rigid, rotation_angle_deg, translation_m
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.state import State, get_array
 from gausslite.process import import_extra
 
@@ -29,8 +30,12 @@ _DRIFT_M, _DRIFT_DEG = 0.03, 1.0
 _LEAST_STD_M, _LEAST_STD_DEG = 0.002, 0.1
 _MAP_STD_M, _MAP_STD_DEG = 0.01, 0.3
 """Error of the motion between two successive poses that are refined against the map."""
-_LOOP_STD_M, _LOOP_STD_DEG = 0.01, 0.5
+_IMAGE_STD_M, _IMAGE_STD_DEG, _IMAGE_SHARE = 0.004, 0.1, 0.7
+"""Error of a motion by alignment of two images; in a home, 1.3 mm and 0.04 degrees (root mean square). The defects of a
+camera from which the prior was estimated also disturb the alignment: at least this share of the prior."""
 _START_STD = 1e-4
+_MAX_STDS = 3.0
+_STAYS_M, _STAYS_DEG = 0.002, 0.05
 _INLIER_PROBABILITY = 0.99
 _MIN_WEIGHT = 0.5
 
@@ -54,10 +59,11 @@ class GraphSolution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """Motion from one keyframe to the next: by the odometry and by the poses in the map."""
+    """Motion from one keyframe to the next: by the odometry, and by their images or else by the poses in the map."""
 
     odometry: Float64[ndarray, "4 4"]
-    in_map: Float64[ndarray, "4 4"]
+    measured: Float64[ndarray, "4 4"]
+    by_images: bool
 
 
 def require_graph_solver() -> Any:
@@ -68,7 +74,12 @@ def require_graph_solver() -> Any:
 class PoseGraph:
     """Keyframes by number, in the order of time, and the loops between them. Not thread-safe."""
 
-    def __init__(self) -> None:
+    def __init__(self, prior: PoseExposurePrior) -> None:
+        """Prior: of the error of single poses."""
+        self._image_noise = _noise(
+            max(_IMAGE_STD_M, _IMAGE_SHARE * prior.translation_m),
+            max(_IMAGE_STD_DEG, _IMAGE_SHARE * prior.rotation_deg),
+        )
         self._T_world_keyframe: list[Float64[ndarray, "4 4"]] = []
         self._T_world_prior = np.eye(4)
         self._steps: list[_Step] = []
@@ -93,13 +104,30 @@ class PoseGraph:
         """Which loops count in the present poses."""
         return self._accepted
 
-    def add(self, T_world_prior: Float64[ndarray, "4 4"], T_world_keyframe: Float64[ndarray, "4 4"]) -> None:
-        """Add the next keyframe, with its pose before refinement, as earlier loops correct it, and its refined pose."""
+    def add(
+        self,
+        T_world_prior: Float64[ndarray, "4 4"],
+        T_world_keyframe: Float64[ndarray, "4 4"],
+        T_last_keyframe: Float64[ndarray, "4 4"] | None = None,
+    ) -> None:
+        """Add the next keyframe, with its pose before refinement, as earlier loops correct it, and its refined pose.
+
+        T_last_keyframe: its pose in the last keyframe's camera by both images; None if they do not align. It is not
+        used if the odometry contradicts it.
+        """
         if self._T_world_keyframe:
             odometry = inverse(self._T_world_prior) @ T_world_prior
-            self._steps.append(_Step(odometry, inverse(self._T_world_keyframe[-1]) @ T_world_keyframe))
+            in_map = inverse(self._T_world_keyframe[-1]) @ T_world_keyframe
+            if T_last_keyframe is not None and _is_likely(T_last_keyframe, odometry):
+                self._steps.append(_Step(odometry, T_last_keyframe, by_images=True))
+            else:
+                self._steps.append(_Step(odometry, in_map, by_images=False))
         self._T_world_prior = T_world_prior
         self._T_world_keyframe.append(T_world_keyframe)
+
+    def set_pose(self, number: int, T_world_keyframe: Float64[ndarray, "4 4"]) -> None:
+        """Replace the present pose of a keyframe, which has been refined since; the factors stay."""
+        self._T_world_keyframe[number] = T_world_keyframe
 
     def add_loop(self, loop: Loop) -> None:
         """Add a loop, which counts until the next solution; beyond 1000, the oldest ones are dropped."""
@@ -111,6 +139,13 @@ class PoseGraph:
         T = inverse(self._T_world_keyframe[loop.earlier]) @ self._T_world_keyframe[loop.later]
         return translation_m(T, loop.T_earlier_later), rotation_angle_deg(T, loop.T_earlier_later)
 
+    @property
+    def newest_step(self) -> Loop | None:
+        """The newest keyframe's motion by its image and that of the one before; None if there is none."""
+        if not self._steps or not self._steps[-1].by_images:
+            return None
+        return Loop(len(self) - 2, len(self) - 1, self._steps[-1].measured)
+
     def solve(self) -> GraphSolution:
         """Return the poses that agree best with all factors. The newest 2000 keyframes may move."""
         gtsam = require_graph_solver()
@@ -121,7 +156,7 @@ class PoseGraph:
         graph, values = self._chain(gtsam, first)
         chain = list(range(graph.size()))
         for loop in self._loops:
-            graph.add(_between(gtsam, (loop.earlier, loop.later), loop.T_earlier_later, _LOOP_NOISE))
+            graph.add(_between(gtsam, (loop.earlier, loop.later), loop.T_earlier_later, self._image_noise))
         parameters = gtsam.GncLMParams()
         parameters.setKnownInliers(chain)
         optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
@@ -133,14 +168,15 @@ class PoseGraph:
         return GraphSolution(poses, optimizer.getWeights()[len(chain) :] > _MIN_WEIGHT)
 
     def apply(self, solution: GraphSolution) -> Float64[ndarray, "k 4 4"]:
-        """Move the keyframes to a solution; return the motion of each in world axes, T_corrected_earlier."""
-        motions = np.array(
-            [
-                orthonormal(T @ inverse(earlier))
-                for T, earlier in zip(solution.T_world_keyframe, self._T_world_keyframe, strict=True)
-            ]
-        )
-        self._T_world_keyframe = list(solution.T_world_keyframe)
+        """Move the keyframes to a solution; return the motion of each in world axes, T_corrected_earlier.
+
+        Keyframes that are within 2 mm and 0.05 degrees of the solution stay, so that their part of the map is not sent.
+        """
+        motions = np.tile(np.eye(4), (len(self), 1, 1))
+        for number, (T, earlier) in enumerate(zip(solution.T_world_keyframe, self._T_world_keyframe, strict=True)):
+            if translation_m(T, earlier) > _STAYS_M or rotation_angle_deg(T, earlier) > _STAYS_DEG:
+                motions[number] = orthonormal(T @ inverse(earlier))
+                self._T_world_keyframe[number] = T
         self._T_world_prior = motions[-1] @ self._T_world_prior
         self._accepted = solution.accepted
         return motions
@@ -153,7 +189,8 @@ class PoseGraph:
         start = gtsam.noiseModel.Isotropic.Sigma(6, _START_STD)
         graph.add(gtsam.PriorFactorPose3(first, values.atPose3(first), start))
         for number, step in enumerate(self._steps[first:], first):
-            for T, noise in ((step.odometry, _odometry_noise(step.odometry)), (step.in_map, _MAP_NOISE)):
+            measured_noise = self._image_noise if step.by_images else _MAP_NOISE
+            for T, noise in ((step.odometry, _odometry_noise(step.odometry)), (step.measured, measured_noise)):
                 graph.add(_between(gtsam, (number, number + 1), T, noise))
         return graph, values
 
@@ -163,7 +200,8 @@ class PoseGraph:
             "T_world_keyframe": np.array(self._T_world_keyframe).reshape(-1, 4, 4),
             "T_world_prior": self._T_world_prior,
             "odometry_steps": np.array([step.odometry for step in self._steps]).reshape(-1, 4, 4),
-            "map_steps": np.array([step.in_map for step in self._steps]).reshape(-1, 4, 4),
+            "measured_steps": np.array([step.measured for step in self._steps]).reshape(-1, 4, 4),
+            "steps_by_images": np.array([step.by_images for step in self._steps], np.bool_),
             "loops": np.array([(loop.earlier, loop.later) for loop in self._loops], np.int64).reshape(-1, 2),
             "T_earlier_later": np.array([loop.T_earlier_later for loop in self._loops]).reshape(-1, 4, 4),
             "accepted": self._accepted,
@@ -174,14 +212,15 @@ class PoseGraph:
         poses = _rigid(state, "T_world_keyframe", None)
         self._T_world_prior = get_array(state, "T_world_prior", (4, 4), np.float64).copy()
         count = max(len(poses) - 1, 0)
-        odometry, in_map = (_rigid(state, name, count) for name in ("odometry_steps", "map_steps"))
+        odometry, measured_steps = (_rigid(state, name, count) for name in ("odometry_steps", "measured_steps"))
+        by_images = get_array(state, "steps_by_images", (count,), np.bool_).tolist()
         loops = get_array(state, "loops", (None, 2), np.int64)
         if not ((loops >= 0) & (loops < len(poses))).all():
             raise MapFileError(f"state loops: expected keyframes from 0 to {len(poses) - 1}, got others")
         measured = _rigid(state, "T_earlier_later", len(loops))
         self._accepted = get_array(state, "accepted", (len(loops),), np.bool_).copy()
         self._T_world_keyframe = poses
-        self._steps = [_Step(*step) for step in zip(odometry, in_map, strict=True)]
+        self._steps = [_Step(*step) for step in zip(odometry, measured_steps, by_images, strict=True)]
         self._loops = [Loop(int(i), int(j), T) for (i, j), T in zip(loops, measured, strict=True)]
 
 
@@ -197,13 +236,19 @@ def _noise(translation_std_m: float, rotation_std_deg: float) -> Float64[ndarray
     return np.array([np.radians(rotation_std_deg)] * 3 + [translation_std_m] * 3)
 
 
-_MAP_NOISE, _LOOP_NOISE = _noise(_MAP_STD_M, _MAP_STD_DEG), _noise(_LOOP_STD_M, _LOOP_STD_DEG)
+_MAP_NOISE = _noise(_MAP_STD_M, _MAP_STD_DEG)
 
 
 def _odometry_noise(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
     """Return the standard deviations of a motion by the odometry."""
     walked = float(np.linalg.norm(T[:3, 3])) + np.radians(rotation_angle_deg(np.eye(4), T))
     return _noise(_LEAST_STD_M + _DRIFT_M * walked**0.5, _LEAST_STD_DEG + _DRIFT_DEG * walked**0.5)
+
+
+def _is_likely(T: Float64[ndarray, "4 4"], odometry: Float64[ndarray, "4 4"]) -> bool:
+    """Return True if a measured motion is within three standard deviations of the odometry's."""
+    max_rad, max_m = (_MAX_STDS * float(std) for std in _odometry_noise(odometry)[[0, 3]])
+    return translation_m(T, odometry) < max_m and bool(np.radians(rotation_angle_deg(T, odometry)) < max_rad)
 
 
 def _between(

@@ -9,6 +9,7 @@ import pytest
 
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.pose import inverse, transform_of
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.mapping.pose_graph import Loop, PoseGraph
 
 pytest.importorskip("gtsam")
@@ -27,7 +28,7 @@ def circle() -> list[np.ndarray]:
 
 
 def drifting_graph(true: list[np.ndarray]) -> PoseGraph:
-    graph, T = PoseGraph(), true[0]
+    graph, T = PoseGraph(PoseExposurePrior()), true[0]
     graph.add(T, T)
     for before, after in itertools.pairwise(true):
         T = T @ inverse(before) @ after @ DRIFT
@@ -83,7 +84,7 @@ def test_a_loop_that_later_ones_contradict_is_taken_back() -> None:
 
 def test_a_restored_graph_continues_with_the_same_bits() -> None:
     true = circle()
-    graph, copy = drifting_graph(true[:30]), PoseGraph()
+    graph, copy = drifting_graph(true[:30]), PoseGraph(PoseExposurePrior())
     graph.add_loop(true_loop(true, 4, 24))
     graph.apply(graph.solve())
     copy.restore(graph.state())
@@ -97,4 +98,25 @@ def test_a_loop_with_an_unknown_keyframe_is_refused() -> None:
     graph = drifting_graph(circle())
     graph.add_loop(Loop(0, COUNT, np.eye(4)))
     with pytest.raises(MapFileError, match="loops"):
-        PoseGraph().restore(graph.state())
+        PoseGraph(PoseExposurePrior()).restore(graph.state())
+
+
+def test_images_of_successive_keyframes_remove_drift_without_a_loop() -> None:
+    true = circle()
+    graph, T = PoseGraph(PoseExposurePrior()), true[0]
+    graph.add(T, T)
+    for before, after in itertools.pairwise(true):
+        T = T @ inverse(before) @ after @ DRIFT
+        graph.add(T, T, inverse(before) @ after)
+    before_m = error_m(graph, true)
+    graph.apply(graph.solve())
+    assert error_m(graph, true) < 0.2 * before_m
+
+
+def test_a_motion_by_images_that_the_odometry_contradicts_is_not_used() -> None:
+    graph = PoseGraph(PoseExposurePrior())
+    graph.add(np.eye(4), np.eye(4))
+    T = transform_of(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    graph.add(T, T, transform_of(np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    assert graph.newest_step is None
+    np.testing.assert_allclose(graph.solve().T_world_keyframe[1], T, atol=1e-6)
