@@ -67,12 +67,11 @@ def _show_files(options: argparse.Namespace) -> Iterator[str]:
 
 def _follow(options: argparse.Namespace) -> AbstractContextManager[str]:
     # imported late, because files need no gRPC
-    from gausslite.wire.clients import query_status
+    from gausslite.wire.channel import is_agent
     from gausslite_view.pages import live_page
 
     tls = build(TlsFiles, options).read()
-    is_agent = query_status(options.place, tls).is_agent
-    return live_page(options.port, options.place, is_agent, tls, options.max_shown)
+    return live_page(options.port, options.place, is_agent(options.place, tls), tls, options.max_shown)
 
 
 def _is_path(place: str) -> bool:

@@ -24,10 +24,11 @@ STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableEr
 
 
 class StoredCount(NamedTuple):
-    """The numbers of voxels of a message that were stored, and that were stale."""
+    """The numbers of voxels of a message that were stored, and that were stale; owner: as in SubsetOutcome."""
 
     accepted: int
     stale: int
+    owner: str = ""
 
     @classmethod
     def of(cls, put: PutOutcome) -> StoredCount:
@@ -80,7 +81,7 @@ class Contributions:
             return outcome
         is_accepted = stored.accepted > 0 or stored.stale == 0
         outcome.status = pb.SUBSET_STATUS_ACCEPTED if is_accepted else pb.SUBSET_STATUS_STALE
-        outcome.accepted_voxels, outcome.stale_voxels = stored
+        outcome.accepted_voxels, outcome.stale_voxels, outcome.owner = stored
         counted = TrafficCounters(subsets_accepted=int(is_accepted), subsets_stale=int(not is_accepted))
         self.record_traffic(session.agent_id, traffic.plus(counted))
         return outcome

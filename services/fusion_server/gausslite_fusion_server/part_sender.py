@@ -107,27 +107,29 @@ class PartSender:
         """Send the parts; those whose owner changes are cut and sent again, for 10 s at most."""
         loop = asyncio.get_running_loop()
         end_s, waiting, accepted, stale = loop.time() + WAIT_S, [subset], 0, 0
+        largest, largest_owner = 0, ""
         while True:
             changed, owners = self._host.changes.subscribe(), self._host.owners
             parts = [item for part in waiting for item in owners.split(part)]
             results = await _all([self._store_part(owner, session_id, part) for owner, part in parts])
             unavailable = None
             waiting = []
-            for (_, part), result in zip(parts, results, strict=True):
+            for (owner, part), result in zip(parts, results, strict=True):
                 if isinstance(result, UnavailableError):
                     unavailable = result
                     waiting.append(part)
                 elif isinstance(result, BaseException):
                     raise result
                 else:
-                    accepted, stale = accepted + result[0], stale + result[1]
+                    accepted, stale = accepted + result.accepted, stale + result.stale
+                    largest, largest_owner = max((largest, largest_owner), (len(part.voxels), owner or ""))
             if unavailable is None:
-                return StoredCount(accepted, stale)
+                return StoredCount(accepted, stale, "" if largest_owner == self._host.server else largest_owner)
             if loop.time() > end_s:
                 raise unavailable
             await _wait_at_most(changed, _RETRY_S if owners is self._host.owners else 0.0)
 
-    async def _store_part(self, owner: str | None, session_id: str, part: StoredSubset) -> tuple[int, int]:
+    async def _store_part(self, owner: str | None, session_id: str, part: StoredSubset) -> StoredCount:
         if owner is None:
             raise UnavailableError("fusion server: nobody owns some of these voxels; try again in a moment")
         if owner == self._host.server:
@@ -136,7 +138,7 @@ class PartSender:
         return await self._peers.send_part(owner, session_id, part)
 
 
-async def _all(calls: Sequence[Coroutine[Any, Any, tuple[int, int]]]) -> list[tuple[int, int] | BaseException]:
+async def _all(calls: Sequence[Coroutine[Any, Any, StoredCount]]) -> list[StoredCount | BaseException]:
     """Return the result or the error of each call."""
     if len(calls) > 1:
         return await asyncio.gather(*calls, return_exceptions=True)

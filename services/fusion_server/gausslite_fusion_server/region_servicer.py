@@ -19,6 +19,7 @@ from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.map_changes import BLOCK_BYTES, read_deadline
 from gausslite.wire.server import Service
 from gausslite.wire.status import code_and_reason
+from gausslite_fusion_server.contributions import StoredCount
 from gausslite_fusion_server.messages import select_map
 from gausslite_fusion_server.region_host import RegionHost
 from gausslite_fusion_server.servicer import FusionServicer
@@ -45,8 +46,8 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
             lambda server: region_pb_grpc.add_RegionServiceServicer_to_server(self, server),
         )
 
-    async def store_part(self, session_id: str, part: StoredSubset) -> tuple[int, int]:
-        """Store a part of a message; returns the numbers of accepted and stale voxels. Raises GaussLiteError."""
+    async def store_part(self, session_id: str, part: StoredSubset) -> StoredCount:
+        """Store a part of a message. Raises GaussLiteError."""
         try:
             if not self._host.owned.have(part.voxels.keys):
                 self.foreign += 1
@@ -91,7 +92,7 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
             voxels = StoredVoxels.from_row(part.voxels)
             _require_codes_of(self._host.settings.grid, voxels)
             subset = StoredSubset(part.agent_id, part.message_seq, part.update_seq, voxels)
-            outcome.accepted_voxels, outcome.stale_voxels = await self.store_part(part.session_id, subset)
+            outcome.accepted_voxels, outcome.stale_voxels, _ = await self.store_part(part.session_id, subset)
         except GaussLiteError as error:
             outcome.reason, outcome.message = code_and_reason(error)[1], str(error)
         except Exception as error:

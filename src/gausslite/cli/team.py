@@ -7,6 +7,8 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from google.protobuf.json_format import MessageToDict
+
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.command_parser import CommandParser, bounded
@@ -16,8 +18,8 @@ from gausslite.config.values import read_path
 from gausslite.domain.checks import require_identifier
 from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.process import TASK_NOT_FOUND
-from gausslite.wire.channel import require_callable
-from gausslite.wire.clients import AgentClient, Export, FusionClient, query_status
+from gausslite.wire.channel import is_agent, require_callable
+from gausslite.wire.clients import AgentClient, Export, FusionClient
 from gausslite.wire.security import TlsFiles
 
 
@@ -201,13 +203,18 @@ def configure_status(parser: CommandParser) -> None:
 
 def run_status(options: argparse.Namespace) -> int:
     """Print the status. Returns 3 if an agent has not seen its task. Raises UnavailableError, InvalidInputError."""
-    status = query_status(options.address, build(TlsFiles, options).read())
+    tls = build(TlsFiles, options).read()
+    of_agent = is_agent(options.address, tls)
+    with (AgentClient if of_agent else FusionClient)(options.address, tls=tls) as client:
+        # 64-bit integers are texts, and messages without content are absent
+        values = MessageToDict(
+            client.status(), preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+        )
     if options.json:
-        print(json.dumps(status.values))
+        print(json.dumps(values))
     else:
-        print("\n".join((_agent_lines if status.is_agent else _fusion_lines)(status.values)))
-    values = status.values
-    has_searched = status.is_agent and "graph" in values and int(values["frames_mapped"]) > 0
+        print("\n".join((_agent_lines if of_agent else _fusion_lines)(values)))
+    has_searched = of_agent and "graph" in values and int(values["frames_mapped"]) > 0
     return TASK_NOT_FOUND if has_searched and values["roi_share"] == 0 else 0
 
 

@@ -435,6 +435,7 @@ class SubsetOutcome(_message.Message):
     MESSAGE_FIELD_NUMBER: _builtins.int
     ACCEPTED_VOXELS_FIELD_NUMBER: _builtins.int
     STALE_VOXELS_FIELD_NUMBER: _builtins.int
+    OWNER_FIELD_NUMBER: _builtins.int
     sequence: _builtins.int
     status: Global___SubsetStatus.ValueType
     reason: _builtins.str
@@ -442,6 +443,10 @@ class SubsetOutcome(_message.Message):
     message: _builtins.str
     accepted_voxels: _builtins.int
     stale_voxels: _builtins.int
+    owner: _builtins.str
+    """Where several servers share the mission: the address of another one that owns most of the voxels. Any server takes
+    any message; the owner takes it with less work.
+    """
     def __init__(
         self,
         *,
@@ -451,10 +456,11 @@ class SubsetOutcome(_message.Message):
         message: _builtins.str = ...,
         accepted_voxels: _builtins.int = ...,
         stale_voxels: _builtins.int = ...,
+        owner: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["accepted_voxels", b"accepted_voxels", "message", b"message", "reason", b"reason", "sequence", b"sequence", "stale_voxels", b"stale_voxels", "status", b"status"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["accepted_voxels", b"accepted_voxels", "message", b"message", "owner", b"owner", "reason", b"reason", "sequence", b"sequence", "stale_voxels", b"stale_voxels", "status", b"status"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

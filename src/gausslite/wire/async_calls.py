@@ -74,10 +74,13 @@ def is_stored(outcome: pb.SubsetOutcome) -> bool:
 
 
 class UpdateStream:
-    """One agent's stream. The methods raise grpc.aio.AioRpcError if the server ends it."""
+    """One agent's stream. The methods raise grpc.aio.AioRpcError if the server ends it.
+
+    owner: of the latest subset, as in SubsetOutcome.
+    """
 
     def __init__(self, stub: pb_grpc.FusionServiceAsyncStub, session_id: str) -> None:
-        self._stub, self._session_id = stub, session_id
+        self._stub, self.session_id, self.owner = stub, session_id, ""
         # without an iterator, the caller writes
         self._call = stub.ContributeSubsets()  # type: ignore[call-arg]
         self._sequence = 0
@@ -91,6 +94,7 @@ class UpdateStream:
             raise CodecError(f"subset {self._sequence}: expected an acknowledgement, got the end of the stream")
         if response.outcomes[0].status != pb.SUBSET_STATUS_ACCEPTED:
             raise CodecError(f"subset {self._sequence}: {response.outcomes[0].message or 'not accepted'}")
+        self.owner = response.outcomes[0].owner
 
     async def resend(self, subsets: Sequence[bytes]) -> int:
         """Send messages of the past again, in this order; returns how many got an outcome before the stream ended."""
@@ -121,7 +125,7 @@ class UpdateStream:
             pass
 
     def _request(self, subset: bytes, sequence: int) -> pb.ContributeSubsetsRequest:
-        return pb.ContributeSubsetsRequest(session_id=self._session_id, sequence=sequence, subset=subset)
+        return pb.ContributeSubsetsRequest(session_id=self.session_id, sequence=sequence, subset=subset)
 
 
 class UpdateStreams:

@@ -154,7 +154,7 @@ class ServiceChannel:
         require_callable(f"{type(self).__name__} address", address)
         self.address = address
         self._closed = False
-        self._deadline_s = deadline_s
+        self._deadline_s, self._tls = deadline_s, tls
         methods = [
             {"service": service, "method": name} for service, names in _RETRIED_METHODS.items() for name in names
         ]
@@ -254,6 +254,18 @@ def require_serving(address: str, tls: Tls | None) -> None:
 def serves(address: str, service: str, tls: Tls | None) -> bool:
     """Return whether the service of this full name serves at the address. Raises UnavailableError without an answer."""
     return _status(address, service, tls) == int(_SERVING)
+
+
+def is_agent(address: str, tls: Tls | None) -> bool:
+    """Return True for an agent's address, False for a fusion server's.
+
+    Raises UnavailableError, InvalidInputError if it is neither.
+    """
+    require_callable("address", address)
+    for name in ("Agent", "Fusion"):
+        if serves(address, f"gausslite.v1.{name}Service", tls):
+            return name == "Agent"
+    raise InvalidInputError(f"{address}: expected an agent or a fusion server, got another service")
 
 
 def _status(address: str, service: str, tls: Tls | None) -> int:

@@ -6,19 +6,18 @@ Clients are thread-safe. Streams are iterators; closing one cancels the call.
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import google_crc32c
-from google.protobuf.json_format import MessageToDict
-from google.protobuf.message import Message
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from gausslite.codec.subset_codec import CodecLimits
 from gausslite.domain.camera import Camera, Lens
-from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError
+from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.relevance import PointedObject, PointM
@@ -35,7 +34,7 @@ from gausslite.v1 import (
     parser_service_pb2_grpc,
 )
 from gausslite.wire import convert, convert_task
-from gausslite.wire.channel import DEADLINE_S, MAX_MESSAGE_BYTES, ServiceChannel, require_callable, serves
+from gausslite.wire.channel import DEADLINE_S, MAX_MESSAGE_BYTES, ServiceChannel, require_serving
 from gausslite.wire.convert import decode_colour, decode_depth, digests_from_messages
 from gausslite.wire.convert_task import report_to_message, team_object_from_message
 from gausslite.wire.security import Tls
@@ -43,6 +42,8 @@ from gausslite.wire.views import CameraView, StoredKeyframe, camera_view_from_me
 
 MAX_END_S = 90_000.0
 """Longer than any agent takes to end a mission: its drain-timeout is at most a day."""
+_FOLLOW_INTERVAL_S, _UNREACHABLE_S = 5.0, 60.0
+"""Shortest times until a client looks for the owner of its subsets again."""
 # larger than the default, because a server may send larger blocks
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
 
@@ -198,6 +199,8 @@ class FusionClient(ServiceChannel):
         self.mission_id = mission_id
         self._token = secrets.token_hex(16) if token is None else token
         self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
+        self._owner: FusionClient | None = None
+        self._next_follow_s = 0.0
 
     def join(
         self,
@@ -252,8 +255,50 @@ class FusionClient(ServiceChannel):
     def contribute(
         self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
     ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
-        """Send these subsets; yields the acknowledgements until all have arrived or `deadline_s` has passed."""
-        return self._exchange(self._stub.ContributeSubsets, requests, deadline_s)
+        """Send these subsets; yields the acknowledgements until all have arrived or `deadline_s` has passed.
+
+        Where several servers share the mission, later subsets go to the owner of these, if it can be reached.
+        """
+        if self._owner is not None:
+            try:
+                yield from self._send(self._owner, requests, deadline_s)
+                return
+            except UnavailableError:
+                # any server takes the same subsets, and again
+                self._leave_owner()
+        yield from self._send(self, requests, deadline_s)
+
+    def _send(
+        self, server: FusionClient, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
+    ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
+        owner = ""
+        for response in server._exchange(server._stub.ContributeSubsets, requests, deadline_s):
+            owner = response.outcomes[-1].owner if response.outcomes else owner
+            yield response
+        self._follow(owner)
+
+    def _follow(self, owner: str) -> None:
+        now_s = time.monotonic()
+        if not owner or now_s < self._next_follow_s or self._closed:
+            return
+        self._leave_owner()
+        try:
+            require_serving(owner, self._tls)
+            self._owner = FusionClient(owner, self._deadline_s, self.mission_id, self._tls)
+            self._next_follow_s = now_s + _FOLLOW_INTERVAL_S
+        except GaussLiteError:
+            # servers may reach each other where robots do not
+            self._next_follow_s = now_s + _UNREACHABLE_S
+
+    def _leave_owner(self) -> None:
+        owner, self._owner = self._owner, None
+        if owner is not None:
+            owner.close()
+
+    def close(self) -> None:
+        """Close the channels and cancel their calls."""
+        super().close()
+        self._leave_owner()
 
     def contribute_keyframes(self, session_id: str, keyframes: Iterable[Frame]) -> int:
         """Send keyframes for the refinement; returns the number stored. Raises QuotaError, SessionUnknownError."""
@@ -394,40 +439,3 @@ class FusionClient(ServiceChannel):
         """Leave the mission; with `forget` the server deletes the agent's updates. Returns the fused revision."""
         request = fusion_service_pb2.LeaveSessionRequest(session_id=session_id, forget=forget)
         return int(self._call(self._stub.LeaveSession, request).fused_revision)
-
-
-_AGENT = agent_service_pb2.DESCRIPTOR.services_by_name["AgentService"].full_name
-_FUSION = fusion_service_pb2.DESCRIPTOR.services_by_name["FusionService"].full_name
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceStatus:
-    """Status of an agent or a fusion server: the fields of its message by name, as in protobuf's JSON.
-
-    So 64-bit integers are texts, and messages without content are absent.
-    """
-
-    is_agent: bool
-    values: dict[str, Any]
-
-
-def query_status(address: str, tls: Tls | None) -> ServiceStatus:
-    """Return the status of the agent or of the fusion server.
-
-    Raises UnavailableError, InvalidInputError if it is neither.
-    """
-    require_callable("address", address)
-    if serves(address, _AGENT, tls):
-        with AgentClient(address, tls=tls) as agent:
-            return ServiceStatus(True, _to_values(agent.status()))
-    if serves(address, _FUSION, tls):
-        with FusionClient(address, tls=tls) as fusion:
-            return ServiceStatus(False, _to_values(fusion.status()))
-    raise InvalidInputError(f"{address}: expected an agent or a fusion server, got another service")
-
-
-def _to_values(message: Message) -> dict[str, Any]:
-    values: dict[str, Any] = MessageToDict(
-        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
-    )
-    return values

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
@@ -96,17 +96,20 @@ class AgentLoad:
     async def _send(self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]]) -> tuple[list[float], int]:
         times_s: list[float] = []
         async with AsyncExitStack() as stack:
-            connected = [await stack.enter_async_context(UpdateStreams(address)) for address in self._addresses]
+            connected = {
+                address: await stack.enter_async_context(UpdateStreams(address)) for address in self._addresses
+            }
+            servers = list(connected.values())
             begin_s = time.monotonic() + 0.5
             begins_s = [begin_s + number / len(sessions) / RATE_HZ for number in range(len(sessions))]
             tasks = [
                 asyncio.ensure_future(
-                    _send_agent(connected[number % len(connected)].open(session), own, own_begin_s, times_s)
+                    _send_agent(connected, servers[number % len(servers)].open(session), own, own_begin_s, times_s)
                 )
                 for number, (session, own, own_begin_s) in enumerate(zip(sessions, messages, begins_s, strict=True))
             ]
             refused: list[str] = []
-            others = [asyncio.ensure_future(_send_others(connected[0], sessions, begin_s, refused))]
+            others = [asyncio.ensure_future(_send_others(servers[0], sessions, begin_s, refused))]
             duration_s = len(messages[0]) / RATE_HZ
             _, late = await asyncio.wait(tasks, timeout=duration_s + _SETTLE_S)
             for task in (*late, *others):
@@ -119,13 +122,25 @@ def _name(number: int) -> str:
     return f"load-{number}"
 
 
-async def _send_agent(stream: UpdateStream, messages: Sequence[bytes], begin_s: float, times_s: list[float]) -> None:
-    """Send one message each period; a time counts from when the message was due, also if the one before was late."""
+async def _send_agent(
+    servers: Mapping[str, UpdateStreams],
+    stream: UpdateStream,
+    messages: Sequence[bytes],
+    begin_s: float,
+    times_s: list[float],
+) -> None:
+    """Send one message each period; a time counts from when the message was due, also if the one before was late.
+
+    As FusionClient does, an agent goes to the server that owns what it sends.
+    """
     for index, data in enumerate(messages):
         due_s = begin_s + index / RATE_HZ
         await asyncio.sleep(max(0.0, due_s - time.monotonic()))
         await stream.send(data)
         times_s.append(time.monotonic() - due_s)
+        if stream.owner in servers:
+            await stream.close()
+            stream = servers[stream.owner].open(stream.session_id)
     await stream.close()
 
 

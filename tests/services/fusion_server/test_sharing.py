@@ -34,9 +34,17 @@ from gausslite.domain.errors import (
 )
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelBatch, crop_to_box, empty_batch, group_by_voxel
+from gausslite.domain.voxels import (
+    AxisAlignedBox,
+    RoiSubset,
+    VoxelBatch,
+    crop_to_box,
+    empty_batch,
+    group_by_voxel,
+    select_keys,
+)
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.regions import ALL_SLOTS, wanted_slots
+from gausslite.fusion.regions import ALL_SLOTS, slots_of, wanted_slots
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
@@ -139,6 +147,29 @@ def test_shuffled_and_repeated_messages_to_three_servers_give_the_offline_vote_b
     assert [agent.agent_id for agent in total.agents] == list(AGENTS)
     assert all(agent.joined for agent in total.agents)
     assert sum(agent.subsets_accepted + agent.subsets_stale for agent in total.agents) == len(messages)
+
+
+def test_an_agent_sends_to_the_owner_of_its_voxels_and_back_to_its_server_when_that_ends(
+    postgres: PostgresServer, folder: Path
+) -> None:
+    with sharing_servers(postgres.new_database(), folder, 2) as (first, second):
+        session = first.client.join("ant", GRID).session_id
+        wide = scattered("ant", 1, 1, 400)
+        keys = wide.batch.keys[np.isin(slots_of(wide.batch.keys), sorted(second.share.host.owned.slots))]
+        subsets = [replace(wide, update_seq=seq, batch=select_keys(wide.batch, keys[seq::9])) for seq in range(1, 9)]
+
+        def send(subset: RoiSubset) -> str:
+            [answer] = first.client.contribute([request(session, subset)], 30.0)
+            assert answer.outcomes[0].status == pb.SUBSET_STATUS_ACCEPTED
+            return answer.outcomes[0].owner
+
+        assert [send(subset) for subset in subsets[:4]] == [second.address, "", "", ""]
+        assert [server.share.counts().received for server in (first, second)] == [1, 3]
+        assert first.share.counts().sent == 1
+        second.stop()
+        assert [send(subset) for subset in subsets[4:]] == [""] * 4
+        assert first.share.counts().received == 5
+        assert first.client.export(Export()) == offline({"ant": subsets})
 
 
 def test_a_watcher_of_one_server_sees_the_changes_of_all(servers: list[SharingServer]) -> None:
