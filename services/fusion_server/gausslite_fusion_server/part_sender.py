@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Sequence
+from collections import Counter
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 from gausslite.codec.stored_voxels import StoredSubset
@@ -19,6 +21,8 @@ from gausslite_fusion_server.region_host import WAIT_S, RegionHost
 from gausslite_fusion_server.region_servicer import RegionServicer
 
 _GROUP_BYTES = 2 << 20
+_OWNER_BYTES = 16 << 20
+"""Of all agents, on their way to one owner."""
 _RETRY_S = 0.05
 
 
@@ -36,6 +40,7 @@ class PartSender:
         self._decoded: dict[PendingUpdate, asyncio.Future[StoredSubset]] = {}
         self._is_decoding = False
         self._highest: dict[str, tuple[str, int]] = {}
+        self._waiting_bytes: Counter[str | None] = Counter()
         self.received = self.sent = 0
         """Messages accepted from agents, and parts sent to other servers."""
         self.acknowledgements = Acknowledgements()
@@ -46,8 +51,9 @@ class PartSender:
         self.acknowledgements.add(session.agent_id, answered)
         try:
             subset = await self._decode(session, message)
-            self.received += 1
-            stored = await self._store(session.session_id, subset)
+            with self._room_for(subset):
+                self.received += 1
+                stored = await self._store(session.session_id, subset)
         finally:
             answered.set_result(None)
         highest = self.highest_acknowledged(session)
@@ -102,6 +108,22 @@ class PartSender:
         # the call may have been cancelled
         if not decoded.done():
             end(decoded)
+
+    @contextmanager
+    def _room_for(self, subset: StoredSubset) -> Iterator[None]:
+        """Count what waits for its owners. Raises UnavailableError if one of them has too much to store already."""
+        parts = self._host.owners.split(subset)
+        sizes = {owner: part.voxels.voxels.nbytes + part.voxels.gaussians.nbytes for owner, part in parts}
+        for owner, size in sizes.items():
+            waiting = self._waiting_bytes[owner]
+            if waiting and waiting + size > _OWNER_BYTES:
+                name = owner or "a server that takes over"
+                raise UnavailableError(f"fusion server: {waiting >> 20} MiB wait for {name}; try again in a moment")
+        self._waiting_bytes.update(sizes)
+        try:
+            yield
+        finally:
+            self._waiting_bytes.subtract(sizes)
 
     async def _store(self, session_id: str, subset: StoredSubset) -> StoredCount:
         """Send the parts; those whose owner changes are cut and sent again, for 10 s at most."""

@@ -200,7 +200,7 @@ class FusionClient(ServiceChannel):
         self._token = secrets.token_hex(16) if token is None else token
         self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
         self._owner: FusionClient | None = None
-        self._next_follow_s = 0.0
+        self._next_owner, self._next_follow_s = "", 0.0
 
     def join(
         self,
@@ -242,6 +242,12 @@ class FusionClient(ServiceChannel):
 
     def keep_session(self, session_id: str) -> fusion_service_pb2.KeepSessionResponse:
         """Renew the lease; returns what identifies the updates that the server has. Raises SessionUnknownError."""
+        if self._owner is not None:
+            try:
+                # it knows the latest subsets
+                return self._owner.keep_session(session_id)
+            except UnavailableError:
+                self._leave_owner()
         request = fusion_service_pb2.KeepSessionRequest(session_id=session_id)
         response: fusion_service_pb2.KeepSessionResponse = self._call(self._stub.KeepSession, request)
         return response
@@ -259,6 +265,7 @@ class FusionClient(ServiceChannel):
 
         Where several servers share the mission, later subsets go to the owner of these, if it can be reached.
         """
+        self._follow(self._next_owner)
         if self._owner is not None:
             try:
                 yield from self._send(self._owner, requests, deadline_s)
@@ -271,11 +278,9 @@ class FusionClient(ServiceChannel):
     def _send(
         self, server: FusionClient, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
     ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
-        owner = ""
         for response in server._exchange(server._stub.ContributeSubsets, requests, deadline_s):
-            owner = response.outcomes[-1].owner if response.outcomes else owner
+            self._next_owner = response.outcomes[-1].owner if response.outcomes else self._next_owner
             yield response
-        self._follow(owner)
 
     def _follow(self, owner: str) -> None:
         now_s = time.monotonic()

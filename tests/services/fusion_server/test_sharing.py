@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
+import signal
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -50,6 +52,7 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
 from gausslite.v1.region_service_pb2 import RemoveAgentRequest, StorePartsRequest, SubsetPart
 from gausslite.v1.region_service_pb2_grpc import RegionServiceStub
+from gausslite.wire.async_calls import UpdateStreams
 from gausslite.wire.channel import open_channel
 from gausslite.wire.clients import Export
 from gausslite.wire.convert import MapUpdate, frame_to_message
@@ -166,8 +169,10 @@ def test_an_agent_sends_to_the_owner_of_its_voxels_and_back_to_its_server_when_t
         assert [send(subset) for subset in subsets[:4]] == [second.address, "", "", ""]
         assert [server.share.counts().received for server in (first, second)] == [1, 3]
         assert first.share.counts().sent == 1
+        assert first.client.keep_session(session).highest_update_seq == 4
         second.stop()
         assert [send(subset) for subset in subsets[4:]] == [""] * 4
+        assert first.client.keep_session(session).highest_update_seq == 8
         assert first.share.counts().received == 5
         assert first.client.export(Export()) == offline({"ant": subsets})
 
@@ -312,6 +317,44 @@ def test_a_killed_owner_is_replaced_and_acknowledged_messages_are_in_the_map(
                 assert answer.outcomes[0].status == pb.SUBSET_STATUS_ACCEPTED
             assert own.client.export(Export()) == offline({"ant": subsets})
             assert own.share.host.owned.slots == ALL_SLOTS
+
+
+def test_a_server_refuses_what_an_owner_that_has_stopped_cannot_take(postgres: PostgresServer, folder: Path) -> None:
+    url, peer, address = postgres.new_database(), f"unix:{folder}/stopped.sock", f"unix:{folder}/own.sock"
+    with sharing_server(url, address) as own:
+        arguments = ["--store", url, "--set", f"peer-address={peer}", "--listen", peer, "--voxel-size", "0.1"]
+        with subprocess.Popen([*COMMAND, *arguments], stderr=subprocess.DEVNULL) as process:
+            wait_until(lambda: own.share.host.owners.are_complete and peer in own.share.host.owners.server_of.values())
+            owned, refusals = sorted(own.share.host.owned.slots), list[str]()
+            names = [f"ant-{number}" for number in range(20)]
+            sessions = [own.client.join(name, GRID).session_id for name in names]
+            large = scattered("ant", 1, 1, 40_000).batch
+            foreign = select_keys(large, large.keys[~np.isin(slots_of(large.keys), owned)])
+            near = select_keys(large, large.keys[np.isin(slots_of(large.keys), owned)])
+
+            async def send() -> list[bool]:
+                async with UpdateStreams(address) as streams:
+
+                    async def is_stored(name: str, session: str) -> bool:
+                        try:
+                            await streams.open(session).send(encode_subset(RoiSubset(name, "", 1, 1, foreign), GRID))
+                        except grpc.aio.AioRpcError as error:
+                            refusals.append(str(error.details()))
+                            return False
+                        return True
+
+                    calls = [asyncio.ensure_future(is_stored(*pair)) for pair in zip(names, sessions, strict=True)]
+                    await asyncio.wait(calls, return_when=asyncio.FIRST_COMPLETED)
+                    # the regions that have an owner that works are served
+                    await streams.open(sessions[0]).send(encode_subset(RoiSubset(names[0], "", 2, 2, near), GRID))
+                    process.send_signal(signal.SIGCONT)
+                    return await asyncio.gather(*calls)
+
+            process.send_signal(signal.SIGSTOP)
+            stored = asyncio.run(send())
+            process.kill()
+            assert 0 < sum(stored) < len(names)
+            assert all(f"MiB wait for {peer}" in refusal for refusal in refusals)
 
 
 def is_acknowledged(server: SharingServer, message: pb.ContributeSubsetsRequest) -> bool:
