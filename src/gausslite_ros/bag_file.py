@@ -111,6 +111,7 @@ def _parse_options(spec: str, query: str) -> BagOptions:
 
 _TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 _ALIASES = {"tf/msg/tfMessage": _TF_MESSAGE}
+_ZSTD = b"\x28\xb5\x2f\xfd"
 _SERIALISATIONS = ("ros1", "cdr")
 _STAMP_ROS1, _STAMP_ROS2 = struct.Struct("<4xII"), (struct.Struct(">4xiI"), struct.Struct("<4xiI"))
 
@@ -221,6 +222,11 @@ class BagFile:
                     yield number, connection, time_ns, data
 
     def _deserialise(self, connection: Connection, data: bytes) -> Any:
+        if data.startswith(_ZSTD):
+            raise DatasetError(
+                f"{self._path}: {connection.topic}: the recorder compressed each message; expected the folder with its "
+                "metadata.yaml, which says so"
+            )
         store, message_type = self._store_of(connection), _type_of(connection)
         if _is_ros1(connection):
             return store.deserialize_ros1(data, message_type)
@@ -241,7 +247,7 @@ class BagFile:
             raise
         except Exception as error:
             location = f"{self._path}: {topic}" if topic else str(self._path)
-            reason = " ".join(str(error).split())[:160] or type(error).__name__
+            reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
             advice = "" if topic else f"; {repair_of(self._path)}"
             raise DatasetError(f"{location}: expected a readable bag; {reason}{advice}") from None
 

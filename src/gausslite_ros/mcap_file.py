@@ -83,6 +83,7 @@ class McapFile:
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._channels: dict[int, Connection] = {}
         self._places: list[_Place] = []
+        self._lacks_schemas = False
         self._cut_at: int | None = None
         self._last_chunk: tuple[int, bytes] = (-1, b"")
         self._size = path.stat().st_size
@@ -143,7 +144,7 @@ class McapFile:
             raise DatasetError(f"{path}: expected messages, got a file that was cut short after {self._cut_at} bytes")
 
     def _read_summary(self) -> bool:
-        """Read channels and chunks from the end of the file; False if they are not all there."""
+        """Read channels, their schemas and chunks from the end of the file; False if they are not all there."""
         self._file.seek(max(self._size - _FOOTER_BYTES, 0))
         footer = self._file.read()
         if not footer.endswith(_MAGIC) or footer[0] != _FOOTER:
@@ -161,7 +162,7 @@ class McapFile:
                 channels = frozenset(channel for channel, _ in struct.iter_unpack("<HQ", indexes)) if indexes else None
                 record_at = chunk_at + _RECORD.size
                 self._places.append(_Place(start_ns, end_ns, record_at, length - _RECORD.size, _CHUNK, channels))
-        return bool(self._places) and bool(self._channels)
+        return bool(self._places) and bool(self._channels) and not self._lacks_schemas
 
     def _scan(self) -> None:
         """Read channels and the places of messages from all records, until one is not whole."""
@@ -207,7 +208,10 @@ class McapFile:
         if code == _SCHEMA:
             self._schemas[number] = fields.text(), fields.text(), fields.text()
             return
-        name, encoding, text = self._schemas.get(fields.number("H"), ("unknown", "", ""))
+        schema = fields.number("H")
+        # 0: a channel without a schema
+        self._lacks_schemas |= schema != 0 and schema not in self._schemas
+        name, encoding, text = self._schemas.get(schema, ("unknown", "", ""))
         is_msg = encoding in ("ros1msg", "ros2msg")
         definition = MessageDefinition(
             MessageDefinitionFormat.MSG if is_msg else MessageDefinitionFormat.NONE, text if is_msg else ""

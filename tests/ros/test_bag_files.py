@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 from pathlib import Path
 
 import pytest
@@ -19,8 +20,10 @@ from small_bag import (
     mcap,
     mcap_parts,
     message,
+    record,
     require_small_bag,
     schema,
+    text,
     time_of,
     write_small_bag,
 )
@@ -30,6 +33,7 @@ from gausslite_ros.bag_file import BagAddress
 from gausslite_ros.bag_source import BagSource
 
 pytest.importorskip("rosbags", reason="bags need the extra ros")
+MAGIC = b"\x89MCAP0\r\n"
 ALL_NS = START_NS, time_of(FRAMES)
 
 
@@ -67,6 +71,31 @@ def test_chunks_out_of_order_and_compressed_are_read_in_order(tmp_path: Path) ->
     ]
     (tmp_path / "b.mcap").write_bytes(mcap("ros2", chunks))
     require_small_bag(frames_of(tmp_path / "b.mcap"))
+
+
+def test_a_summary_without_schemas_is_completed_from_the_chunks(tmp_path: Path) -> None:
+    channels, messages = mcap_parts(write_small_bag(tmp_path / "a.mcap"))
+    times_ns = messages[0][0], messages[-1][0]
+    whole = mcap("ros2", [chunk([*channels, *(data for _, data in messages)], times_ns)])
+    start = whole.index(record(6, b"")[:1], len(MAGIC))
+    end = whole.rindex(record(15, bytes(4)))
+    index = struct.pack("<QQQQ", *times_ns, start, end - start) + text(b"") + bytes(8) + text("") + bytes(16)
+    summary = b"".join([*channels[1::2], record(8, index)])
+    footer = record(2, struct.pack("<QQI", end + 13, 0, 0))
+    (tmp_path / "b.mcap").write_bytes(whole[:end] + record(15, bytes(4)) + summary + footer + MAGIC)
+    require_small_bag(frames_of(tmp_path / "b.mcap"))
+
+
+def test_messages_that_the_recorder_compressed_need_its_metadata(tmp_path: Path) -> None:
+    channels, messages = mcap_parts(write_small_bag(tmp_path / "a.mcap"))
+    head = len(message(0, 0, b""))
+    parts = [
+        message(int.from_bytes(data[9:11], "little"), time_ns, zstandard.compress(data[head:]))
+        for time_ns, data in messages
+    ]
+    (tmp_path / "b.mcap").write_bytes(mcap("ros2", [*channels, *parts]))
+    with pytest.raises(DatasetError, match=r"the recorder compressed each message; expected .* metadata.yaml"):
+        frames_of(tmp_path / "b.mcap")
 
 
 @pytest.mark.parametrize("in_chunk", [True, False])
