@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,12 @@ from numpy import ndarray
 
 from gausslite.datasets.camera_files import FolderCamera, read_camera_file
 from gausslite.datasets.folder import FIRST_VIEW_UP, Origin, PoseTrack
-from gausslite.datasets.source import excluded_frames_note, require_matches, require_position
+from gausslite.datasets.source import (
+    excluded_frames_note,
+    repeated_times_note,
+    require_matches,
+    require_position,
+)
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
@@ -33,7 +39,7 @@ from gausslite_ros.topics import (
     is_aligned,
     stream_transforms,
 )
-from gausslite_ros.transforms import TransformTree, seconds, track_of, transforms_of
+from gausslite_ros.transforms import TransformTree, is_pose, seconds, track_of, transforms_of
 
 _TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 _ODOMETRY = "nav_msgs/msg/Odometry"
@@ -162,11 +168,13 @@ def _topic_poses(bag: BagFile, tree: TransformTree, camera: str, options: BagOpt
     poses = {}
     body = options.body
     for message in bag.messages(topic):
-        poses[stamp_ns(message.header)] = _pose(message)
+        translation_m, quat_xyzw = _pose(message)
+        if is_pose(translation_m, quat_xyzw):
+            poses[stamp_ns(message.header)] = translation_m, quat_xyzw
         if not body:
             body = frame_name(getattr(message, "child_frame_id", ""))
     if not poses:
-        raise DatasetError(f"{bag.path}: {topic}: expected poses, got no message")
+        raise DatasetError(f"{bag.path}: {topic}: expected finite poses, got none")
     # a pose without the name of its frame is taken for the camera's own
     body = body or camera
     if body != camera:
@@ -187,6 +195,7 @@ def _no_poses(bag: BagFile, tree: TransformTree, camera: str) -> str:
     topics = [topic for topic, kind in bag.types.items() if kind == _TF_MESSAGE]
     above = tree.ancestors(camera)
     links = f"tf has only {' → '.join(above)}" if len(above) > 1 else f"tf does not have {camera!r}"
+    links += f" ({tree.left_out})" if tree.left_out else ""
     return (
         f"expected poses: tf between a world frame and {camera!r}, or an odometry topic, got none: {links}, in "
         f"{' and '.join(topics) or 'no topic'} with {', '.join(tree.frames) or 'no frames'}; tf_static stands at the "
@@ -218,7 +227,8 @@ def open_bag(spec: str, up_axis: UpAxis | None, require_poses: bool) -> BagSourc
 class BagSource:
     """The frames of a bag's colour topic, each with the nearest depth image and the camera's pose at its stamp.
 
-    Depth images that are not aligned to colour are registered to it. Colour images without depth or pose are excluded.
+    Depth images that are not aligned to colour are registered to it. Colour images without depth or pose are excluded,
+    and those with the stamp of the one before.
     Frame numbers are the positions of the colour images by their stamps, from 0. World frames of ROS have z up.
     Raises DatasetError, PoseError, InvalidInputError.
     """
@@ -242,7 +252,10 @@ class BagSource:
         stated_units = 1 / unit_m if unit_m else self._cameras.colour.units_per_metre
         units_per_metre = stated_units or depth_units_per_metre(self._bag, self._depth.name)
         self._converter = FrameConverter(self._cameras, self._colour.name, self._depth.name, units_per_metre)
-        matches, self._recorded = self._associate(colours, depths), len(colours)
+        self._recorded = len(colours)
+        self._repeated = sum(a.stamp_ns == b.stamp_ns for a, b in pairwise(colours))
+        self._left_out = tree.left_out
+        matches = self._associate(colours, depths)
         tolerance = f"{1000 * self._options.tolerance_s:g} ms"
         times_s = {"colour": seconds(colour.stamp_ns for colour in colours).tolist()}
         times_s["depth"] = seconds(depth.stamp_ns for depth in depths).tolist()
@@ -314,10 +327,11 @@ class BagSource:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages on colour images without depth or pose, on parts that are cut, and on an origin that is not zero."""
+        """Messages on images and transforms that are left out, on parts that are cut, on an origin that is not zero."""
         reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
-        note = excluded_frames_note(self._recorded - len(self), self._recorded, reason)
-        return tuple(filter(None, (note, *self._bag.notes, self._origin.note)))
+        unmatched = excluded_frames_note(self._recorded - self._repeated - len(self), self._recorded, reason)
+        repeated = repeated_times_note(self._repeated, self._recorded)
+        return tuple(filter(None, (repeated, unmatched, self._left_out, *self._bag.notes, self._origin.note)))
 
     def __len__(self) -> int:
         return len(self._matches)
@@ -397,6 +411,8 @@ class BagSource:
         depth_ns = np.array([depth.stamp_ns for depth in depths], np.int64)
         matches = []
         for number, colour in enumerate(colours):
+            if number and colour.stamp_ns == colours[number - 1].stamp_ns:
+                continue
             nearest = int(np.abs(depth_ns - colour.stamp_ns).argmin())
             lag_s = abs(int(depth_ns[nearest]) - colour.stamp_ns) / 10**9
             T = None if self._poses is None else self._poses.at(colour.stamp_ns / 10**9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.folder import PoseTrack, is_lost
+from gausslite.datasets.folder import PoseTrack
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import inverse
 from gausslite_ros.messages import TransformMessage, frame_name, quaternion_of, stamp_ns, translation_of
@@ -48,6 +48,11 @@ def transforms_of(messages: Iterable[TransformMessage], static: bool) -> list[Tr
     ]
 
 
+def is_pose(translation_m: Sequence[float], quat_xyzw: Sequence[float]) -> bool:
+    """True for finite numbers and a rotation: a driver without a pose writes NaN or only zeros."""
+    return bool(np.isfinite((*translation_m, *quat_xyzw)).all()) and any(quat_xyzw)
+
+
 def seconds(times_ns: Iterable[int]) -> Float64[ndarray, " n"]:
     """Return the nearest float64 of each time in seconds, as if its decimal text were read."""
     return np.array([time_ns / 10**9 for time_ns in times_ns])
@@ -57,14 +62,18 @@ class TransformTree:
     """Frames with the pose of each in its parent frame, static or over time.
 
     Between two stamps at most MAX_GAP_S apart, a pose is interpolated (lerp and slerp). A transform of both kinds is
-    static. Transforms without a finite number are left out.
+    static. Those that are no pose are left out: with NaN, infinity, or a quaternion of zeros.
     """
 
     def __init__(self, transforms: Iterable[Transform]) -> None:
         grouped: dict[tuple[str, str], list[Transform]] = {}
+        self._left_out: dict[tuple[str, str], int] = {}
         for transform in transforms:
-            if not is_lost(np.array((*transform.translation_m, *transform.quat_xyzw))):
-                grouped.setdefault((transform.child, transform.parent), []).append(transform)
+            link = transform.child, transform.parent
+            if is_pose(transform.translation_m, transform.quat_xyzw):
+                grouped.setdefault(link, []).append(transform)
+            else:
+                self._left_out[link] = self._left_out.get(link, 0) + 1
         self._tracks: dict[str, dict[str, PoseTrack]] = {}
         self._static: set[tuple[str, str]] = set()
         self._known_chains: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
@@ -79,6 +88,13 @@ class TransformTree:
     def frames(self) -> list[str]:
         """All frames, sorted."""
         return sorted(set(self._tracks).union(*self._tracks.values()))
+
+    @property
+    def left_out(self) -> str:
+        """Message on transforms that are no pose; empty without any."""
+        links = [f"{count} {parent} → {child}" for (child, parent), count in sorted(self._left_out.items())]
+        named = ", ".join(links[:_MAX_LISTED])
+        return f"tf: left out transforms with NaN, infinity or a quaternion of zeros: {named}" if links else ""
 
     def ancestors(self, frame: str) -> list[str]:
         """Return the frame and its parents up to the root. Raises DatasetError for a frame with two parents."""

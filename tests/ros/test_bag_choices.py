@@ -292,3 +292,29 @@ def test_tf_far_from_the_origin_is_mapped_from_a_stated_origin(tmp_path: Path) -
     source = BagSource(address)
     assert source.world_frame == "b from 5430000 0 0"
     np.testing.assert_allclose(source.frame(2).T_world_camera[:3, 3], (-620 + 0.02, 0, 0), atol=1e-8)
+
+
+@pytest.mark.parametrize("numbers", [(np.nan,) * 4, (0.0,) * 4], ids=["NaN", "zeros"])
+def test_a_transform_that_is_no_pose_is_left_out_with_a_message(
+    tmp_path: Path, numbers: tuple[float, float, float, float]
+) -> None:
+    def add(bag: Writer) -> None:
+        bad = link(time_of(3) + 5, "odom", "base_link", 0.03)
+        bad["transforms"][0]["transform"]["rotation"] = dict(zip("xyzw", numbers, strict=True))
+        bag.write("/tf", TF, time_of(3) + 5, bad)
+
+    path = write_small_bag(tmp_path / "a.mcap", extra=add)
+    require_small_bag(frames_of(path))
+    assert BagSource(BagAddress(path)).notes == (
+        "tf: left out transforms with NaN, infinity or a quaternion of zeros: 1 odom → base_link",
+    )
+
+
+def test_the_first_of_images_with_one_stamp_counts(tmp_path: Path) -> None:
+    def twice(bag: Writer, i: int) -> None:
+        for delay_ns in (0, 1):
+            bag.write(COLOUR, IMAGE, time_of(i) + delay_ns, image(i, "rgb8", rgb_of(i)))
+
+    source = BagSource(BagAddress(write_small_bag(tmp_path / "a.mcap", colour=twice)))
+    assert source.indices() == list(range(0, 2 * FRAMES, 2))
+    assert source.notes == ("8 of 16 colour images are skipped: they have the time of the image before",)

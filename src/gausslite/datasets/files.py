@@ -152,7 +152,8 @@ def decode_image(location: str, data: bytes, flags: int) -> NDArray[Any]:
     and checksums are checked before memory is taken. Raises DatasetError with the location.
     """
     if not data.startswith((_PNG_MAGIC, _JPEG_MAGIC)):
-        raise DatasetError(f"{location}: expected a PNG or JPEG image, got another format")
+        got = f"another format, which begins with {data[:16]!r}" if data else "an empty file"
+        raise DatasetError(f"{location}: expected a PNG or JPEG image, got {got}")
     size_px = image_size(data)
     if size_px is not None:
         require_pixel_count(location, *size_px)
@@ -202,6 +203,9 @@ def _size(image: NDArray[Any]) -> str:
 
 
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_GZIP = b"\x1f\x8b"
+_NOT_A_NUMBER = re.compile(r"[-+]?(?:nan\(.*\)|1\.#(?:QNAN|SNAN|IND)\w*)|NA", re.IGNORECASE)
+"""NaN as the C library of Windows and tables of R write it."""
 _SEPARATORS = re.compile(r"[\s,;\"']+")
 
 
@@ -212,6 +216,8 @@ def read_text(path: Path) -> str:
     """
     try:
         data = path.read_bytes()
+        if data.startswith(_GZIP):
+            raise DatasetError(f"{path}: expected a text file, got one that gzip compressed; unpack it")
         if data.startswith(_UTF_16):
             return data.decode("utf-16")
         try:
@@ -244,9 +250,9 @@ def read_rows(path: Path) -> list[tuple[str, list[str]]]:
 
 
 def is_number(text: str) -> bool:
-    """Return True for text that `float` reads."""
+    """Return True for a number, which may be NaN or infinite."""
     try:
-        float(text)
+        _number(text)
     except ValueError:
         return False
     return True
@@ -257,6 +263,10 @@ def parse_numbers(location: str, fields: list[str], count: int, meaning: str) ->
     if len(fields) != count:
         raise DatasetError(f"{location}: expected {count} numbers ({meaning}), got {len(fields)}")
     try:
-        return [float(field) for field in fields]
+        return [_number(field) for field in fields]
     except ValueError as error:
         raise DatasetError(f"{location}: expected {count} numbers ({meaning}); {error}") from None
+
+
+def _number(text: str) -> float:
+    return float("nan" if _NOT_A_NUMBER.fullmatch(text) else text)

@@ -28,9 +28,9 @@ FIRST_VIEW_UP = (0.0, -1.0, 0.0)
 """Upward direction of a world that a level first view defines."""
 
 
-def is_lost(numbers: Float64[ndarray, "..."]) -> bool:
-    """True if a tracker wrote no pose: no finite number, or only zeros."""
-    return not np.isfinite(numbers).any() or not numbers.any()
+def is_lost(translation_m: Float64[ndarray, "3"], rotation: Float64[ndarray, "..."]) -> bool:
+    """True if a tracker wrote no pose: no finite number, or a quaternion or matrix of zeros."""
+    return not (np.isfinite(translation_m).any() or np.isfinite(rotation).any()) or not rotation.any()
 
 
 def nearest_rigid(location: str, matrix: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
@@ -321,7 +321,8 @@ class NumberedFolderSource(FolderSource, ABC):
 
     def _is_lost(self, number: int) -> bool:
         try:
-            return is_lost(self._read_matrix(number)[:3])
+            T = self._read_matrix(number)
+            return is_lost(T[:3, 3], T[:3, :3])
         except (DatasetError, PoseError):
             return False  # `frame` reports a damaged pose if it is used
 
@@ -332,7 +333,8 @@ class NumberedFolderSource(FolderSource, ABC):
 
     def _has_pose(self, number: int) -> bool:
         try:
-            return not is_lost(self._read_matrix(number)[:3])
+            T = self._read_matrix(number)
+            return not is_lost(T[:3, 3], T[:3, :3])
         except (DatasetError, PoseError):
             return False
 

@@ -27,6 +27,7 @@ _LAYOUTS = (
     "or Record3D (metadata, rgbd/0.jpg)"
 )
 _SIMULATED = "sim:"
+_COMPRESSED = (".zip", ".gz", ".tgz", ".tar", ".bz2", ".xz", ".7z", ".zst", ".zstd", ".lz4")
 
 
 def open_source(
@@ -71,7 +72,9 @@ def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
         return bag
     folder = Path(spec).expanduser()
     if not folder.is_dir() and not _recognised(folder):
-        found = "a file" if folder.is_file() else "nothing there"
+        found = "nothing there"
+        if folder.is_file():
+            found = "a compressed file; unpack it first" if folder.suffix.lower() in _COMPRESSED else "a file"
         raise DatasetError(
             f"{spec}: expected a folder with a sequence, a ROS bag, an .r3d file, or sim:home; got {found}"
         )

@@ -322,7 +322,10 @@ class Record3dSource(FolderSource):
         return not self._require_poses or self._has_pose(number)
 
     def _has_pose(self, number: int) -> bool:
-        return number < len(self._metadata.poses) and not is_lost(self._metadata.poses[number])
+        if number >= len(self._metadata.poses):
+            return False
+        row = self._metadata.poses[number]
+        return not is_lost(row[4:], row[:4])
 
     def _read_pose(self, number: int) -> Float64[ndarray, "4 4"]:
         if not self._has_pose(number):

@@ -133,6 +133,11 @@ def excluded_frames_note(count: int, recorded: int, reason: str) -> str:
     return f"{count} of {recorded} colour images are skipped: {reason}" if count else ""
 
 
+def repeated_times_note(count: int, recorded: int) -> str:
+    """Return the message on recorded frames with the time of an earlier one; empty if there are none."""
+    return excluded_frames_note(count, recorded, "they have the time of the image before")
+
+
 def require_frames(folder: Path, count: int, expected: str) -> None:
     """Raise DatasetError if the sequence has no frames."""
     if count == 0:

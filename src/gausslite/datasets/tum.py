@@ -22,7 +22,12 @@ from gausslite.datasets.files import (
     read_rows,
 )
 from gausslite.datasets.folder import FIRST_VIEW_UP, FolderSource, Origin, PoseTrack, is_lost, pose_from_quaternion
-from gausslite.datasets.source import excluded_frames_note, require_matches, require_position
+from gausslite.datasets.source import (
+    excluded_frames_note,
+    repeated_times_note,
+    require_matches,
+    require_position,
+)
 from gausslite.domain.camera import FileIntrinsics, Lens, LensModel
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
@@ -30,6 +35,7 @@ from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 
 _UNITS = DepthUnits(per_metre=5000.0)
 _POSES = "groundtruth.txt"
+_LISTS = ("rgb.txt", "depth.txt", _POSES)
 _SEPARATOR = re.compile(r"[\s,;\"']+")
 """Separates a time from the rest of its row."""
 _MAX_DEPTH_LAG_S = 0.020
@@ -37,6 +43,8 @@ _MAX_POSE_GAP_S = 0.100
 _MAX_TIME_S = 9e9
 """Larger times, of the year 2255, do not fit into 64 bits as nanoseconds."""
 _MAX_POSE_LAG_S = 0.010
+_PUBLISHED_SIZE_PX = (640, 480)
+_SERIES = re.compile(r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)")
 _INTRINSICS = {
     "1": FileIntrinsics(517.3, 516.5, 318.6, 255.3),
     "2": FileIntrinsics(520.9, 521.0, 325.1, 249.7),
@@ -64,8 +72,8 @@ class TumSource(FolderSource):
 
     A colour image is associated with the nearest depth image within 20 ms. Its pose is interpolated (lerp and slerp)
     between two poses at most 0.1 s apart; if there are none, a pose within 10 ms is used. Colour images without depth
-    or pose are excluded. Poses without a finite number count as missing. Frame numbers are the rows of rgb.txt
-    from 0. Raises DatasetError, PoseError.
+    or pose are excluded, and those with the time of the one before. Poses without a finite number or with a quaternion
+    of zeros count as missing. Frame numbers are the rows of rgb.txt from 0. Raises DatasetError, PoseError.
     """
 
     _layout_has_registered_depth = True
@@ -73,7 +81,7 @@ class TumSource(FolderSource):
 
     def __init__(self, folder: Path, up_axis: UpAxis | None = None, require_poses: bool = True) -> None:
         super().__init__(folder)
-        matches, self._recorded = _associate(folder, require_poses)
+        matches, self._recorded, self._repeated = _associate(folder, require_poses)
         self._origin = Origin.near(np.array([match.T_world_camera[:3, 3] for match in matches]))
         moved = self._origin.moved
         self._matches = [replace(match, T_world_camera=moved(match.T_world_camera)) for match in matches]
@@ -89,9 +97,10 @@ class TumSource(FolderSource):
 
     @property
     def excluded_frames(self) -> str:
-        """Message on the colour images without depth or pose at their time."""
+        """Message on the colour images that repeat a time, or without depth or pose at their time."""
         reason = "without a pose at their time or depth within 20 ms"
-        return excluded_frames_note(self._recorded - len(self), self._recorded, reason)
+        unmatched = excluded_frames_note(self._recorded - self._repeated - len(self), self._recorded, reason)
+        return "; ".join(filter(None, (repeated_times_note(self._repeated, self._recorded), unmatched)))
 
     def __len__(self) -> int:
         return len(self._matches)
@@ -122,33 +131,40 @@ class TumSource(FolderSource):
         return Trajectory(np.array([match.time_s for match in self._matches]), poses)
 
 
-def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int]:
-    """Return the colour images with depth and a pose, and the number of all colour images.
+def _associate(folder: Path, require_poses: bool) -> tuple[list[_Match], int, int]:
+    """Return the colour images with depth and a pose, the number of all colour images, and of repeated times.
 
-    Images without a pose get the identity if poses are not required.
+    Images without a pose get the identity if poses are not required. Of images with the same time, the first counts:
+    depth and pose of the others are unknown.
     """
     colour_times, colour_names = _read_stamps(folder / "rgb.txt")
     depth_times, depth_names = _read_stamps(folder / "depth.txt")
     poses = folder / _POSES
     trajectory = _read_poses(poses, require_poses) if require_poses or poses.is_file() else None
     matches = []
-    for number, (time_s, name) in enumerate(zip(colour_times, colour_names, strict=True)):
+    is_new = np.append(True, np.diff(colour_times) > 0)
+    for number in np.flatnonzero(is_new).tolist():
+        time_s, name = float(colour_times[number]), colour_names[number]
         nearest = int(np.abs(depth_times - time_s).argmin())
-        T_world_camera = None if trajectory is None else trajectory.at(float(time_s))
+        T_world_camera = None if trajectory is None else trajectory.at(time_s)
         if T_world_camera is None and not require_poses:
             T_world_camera = np.eye(4)
         if abs(depth_times[nearest] - time_s) <= _MAX_DEPTH_LAG_S and T_world_camera is not None:
             depth = folder / depth_names[nearest]
-            matches.append(_Match(number, float(time_s), folder / name, depth, T_world_camera))
+            matches.append(_Match(number, time_s, folder / name, depth, T_world_camera))
     expected = "a colour image with depth within 20 ms (rgb.txt, depth.txt) and poses around it (groundtruth.txt)"
     times_s = {"colour": colour_times.tolist(), "depth": depth_times.tolist()}
     times_s |= {} if trajectory is None else {"poses": trajectory.times_s.tolist()}
     require_matches(folder, len(matches), expected, times_s)
-    return matches, len(colour_names)
+    return matches, len(colour_names), int(np.count_nonzero(~is_new))
 
 
 def _read_stamps(path: Path) -> tuple[Float64[ndarray, " n"], list[str]]:
     """Return ascending times in seconds and the image path of each; a header of words is left out."""
+    if not path.is_file():
+        others = sorted(file.name for file in path.parent.glob("*.txt*") if file.name not in _LISTS)
+        found = f"; the folder has {', '.join(others[:8])}: name the list of images {path.name}" if others else ""
+        raise DatasetError(f"{path}: expected a text file, got none{found}")
     times, names = [], []
     rows = [(location, _SEPARATOR.split(text.strip("\"'"), maxsplit=1)) for location, text in read_lines(path)]
     for location, fields in rows[1:] if rows and not is_number(rows[0][1][0]) else rows:
@@ -171,7 +187,7 @@ def _file_name(folder: Path, text: str) -> str | None:
 
     A name with blanks must exist, because it may be several fields.
     """
-    name = text.strip(" \t\"'")
+    name = text.strip(" \t\"',;")
     if "\\" in name and not (folder / name).is_file():
         name = name.replace("\\", "/")
     return name if name and (len(name.split()) == 1 or (folder / name).is_file()) else None
@@ -185,7 +201,7 @@ def _read_poses(path: Path, required: bool) -> PoseTrack | None:
     rows = read_rows(path)
     meaning = "time tx ty tz qx qy qz qw"
     table = np.array([parse_numbers(location, fields, 8, meaning) for location, fields in rows])
-    known = np.array([not is_lost(row[1:]) for row in table], np.bool_)
+    known = np.array([not is_lost(row[1:4], row[4:]) for row in table], np.bool_)
     if np.count_nonzero(known) < 2:
         if not required:
             return None
@@ -202,18 +218,20 @@ def _read_poses(path: Path, required: bool) -> PoseTrack | None:
 def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera:
     """Return the camera of a file in the folder, else the published one of fr1, fr2 or fr3 by the folder's name.
 
-    A link's own name counts, and that of its target. Raises DatasetError.
+    A link's own name counts, and that of its target. The published camera is scaled to images of its aspect ratio.
+    Raises DatasetError.
     """
-    names = f"{folder.absolute().name} {folder.resolve().name}"
-    group = re.search(r"(?:freiburg|fr)([123])", names)
+    group = _SERIES.search(f"{folder.absolute().name} {folder.resolve().name}")
     published = None
-    if group is not None:
-        camera = _INTRINSICS[group.group(1)].camera(str(folder), width_px, height_px)
-        published = FolderCamera(camera, lens=_LENSES.get(group.group(1)))
+    if group is not None and width_px * _PUBLISHED_SIZE_PX[1] == height_px * _PUBLISHED_SIZE_PX[0]:
+        camera = _INTRINSICS[group.group(1)].camera(str(folder), *_PUBLISHED_SIZE_PX).resized(width_px, height_px)
+        note = f"the published camera of fr{group.group(1)} is scaled from 640x480 to {width_px}x{height_px}"
+        is_scaled = (width_px, height_px) != _PUBLISHED_SIZE_PX
+        published = FolderCamera(camera, lens=_LENSES.get(group.group(1)), note=note if is_scaled else "")
     found = read_folder_camera(folder, width_px, height_px, published)
     if found is None:
         raise DatasetError(
-            f"{folder}: the camera is unknown: expected a folder named after fr1, fr2 or fr3 (or freiburg1 ...), "
-            f"or the file {INTRINSICS_FILE} or {CAMERA_FILE}"
+            f"{folder}: the camera is unknown: expected the file {INTRINSICS_FILE} or {CAMERA_FILE}, or a folder "
+            "named after fr1, fr2 or fr3 (or freiburg1 ...) with images of 4:3"
         )
     return found

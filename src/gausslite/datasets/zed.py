@@ -70,7 +70,7 @@ class ZedSource(NumberedFolderSource):
         if number not in self._pose_rows:
             return np.full((4, 4), np.nan)
         location, row = self._pose_rows[number]
-        if is_lost(row):
+        if is_lost(row[:3], row[3:]):
             return np.full((4, 4), np.nan)
         return pose_from_quaternion(location, row[:3], row[3:])
 

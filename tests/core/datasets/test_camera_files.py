@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_sequences import write_seven_scenes, write_tum
+from tiny_sequences import WIDTH, write_colour, write_seven_scenes, write_tum
 
 from gausslite.cli.source_options import open_recorded
 from gausslite.datasets.camera_files import lens_of, read_folder_camera
@@ -110,7 +110,8 @@ def test_the_published_camera_is_used_rather_than_a_file_above(tmp_path: Path) -
     folder = write_tum(tmp_path / "fr1_desk")
     write_json(tmp_path / "cam_params.json")
     source = open_source(str(folder))
-    assert (source.camera.fx_px, source.notes) == (517.3, ())
+    assert source.camera.fx_px == pytest.approx(517.3 * WIDTH / 640)
+    assert source.notes == ("the published camera of fr1 is scaled from 640x480 to 16x12",)
     assert source.lens is not None
 
 
@@ -119,5 +120,14 @@ def test_a_links_own_name_or_its_targets_chooses_the_published_camera(tmp_path: 
     (tmp_path / "fr2_desk").symlink_to("plain")
     write_tum(tmp_path / "freiburg3_office")
     (tmp_path / "current").symlink_to("freiburg3_office")
-    assert open_source(str(tmp_path / "fr2_desk")).camera.fx_px == 520.9
-    assert open_source(str(tmp_path / "current")).camera.fx_px == 535.4
+    assert open_source(str(tmp_path / "fr2_desk")).camera.fx_px == pytest.approx(520.9 * WIDTH / 640)
+    assert open_source(str(tmp_path / "current")).camera.fx_px == pytest.approx(535.4 * WIDTH / 640)
+
+
+@pytest.mark.parametrize(("name", "width"), [("walk_fr2025", 16), ("safr1", 16), ("fr1_desk", 12)])
+def test_the_published_camera_is_for_its_series_and_aspect_ratio(tmp_path: Path, name: str, width: int) -> None:
+    folder = write_tum(tmp_path / name)
+    for image in (folder / "rgb").iterdir():
+        write_colour(image, width)
+    with pytest.raises(DatasetError, match=f"{name}: the camera is unknown"):
+        open_source(str(folder))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import zipfile
 import zlib
@@ -87,6 +88,25 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
         "fr1: expected a colour image with depth within 20 ms",
     ),
     ("tum", lambda f: f.rename(f.with_name("odd")), DatasetError, "odd: the camera is unknown"),
+    (
+        "tum",
+        lambda f: (f / "rgb.txt").rename(f / "color.txt"),
+        DatasetError,
+        "rgb.txt: .* got none; the folder has color.txt: name the list of images rgb.txt",
+    ),
+    ("tum", lambda f: (f / "rgb/1.png").write_bytes(b""), DatasetError, "1.png: .* got an empty file"),
+    (
+        "tum",
+        lambda f: (f / "rgb/1.png").write_text("version https://git-lfs.github.com/spec/v1"),
+        DatasetError,
+        "1.png: .* which begins with b'version https://'",
+    ),
+    (
+        "tum",
+        lambda f: (f / "rgb.txt").write_bytes(gzip.compress(b"1 a")),
+        DatasetError,
+        "rgb.txt: .* gzip compressed; unpack it",
+    ),
     ("seven", lambda f: cut(f / "frame-000004.color.png"), DatasetError, "frame-000004.color.png: expected a whole"),
     ("seven", lambda f: (f / "frame-000004.depth.png").unlink(), DatasetError, "000004.depth.png: expected an image"),
     ("seven", lambda f: write_colour(f / "frame-000004.depth.png"), DatasetError, "expected a 16-bit image"),
@@ -182,6 +202,12 @@ def test_a_place_without_a_sequence_is_named(tmp_path: Path, make: Damage, messa
         open_source(str(tmp_path / "place"))
 
 
+def test_a_compressed_recording_is_named(tmp_path: Path) -> None:
+    (tmp_path / "desk.tar.gz").write_bytes(gzip.compress(b""))
+    with pytest.raises(DatasetError, match=r"desk.tar.gz: .* got a compressed file; unpack it first"):
+        open_source(str(tmp_path / "desk.tar.gz"))
+
+
 def test_a_depth_image_without_returns_is_no_error(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "seq")
     write_depth(folder / "frame-000004.depth.png", 0)
@@ -207,13 +233,18 @@ def test_frames_without_a_pose_are_excluded(tmp_path: Path, lost: str) -> None:
         assert source.excluded_frames == "1 of 3 colour images are skipped: without a pose"
 
 
-def test_lost_tracking_is_a_gap_in_the_trajectory(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "numbers",
+    ["nan " * 7, "1 2 3 0 0 0 0", "-nan(ind) " * 7, "1.#QNAN " * 7, "NA " * 7],
+    ids=["NaN", "a quaternion of zeros", "NaN of Windows", "NaN of old Windows", "NaN of R"],
+)
+def test_lost_tracking_is_a_gap_in_the_trajectory(tmp_path: Path, numbers: str) -> None:
     folder = write_tum(tmp_path / "fr1", frames=30)
     whole = open_source(str(folder))
     assert len(whole) == 30
     assert whole.excluded_frames == ""
     rows = (folder / "groundtruth.txt").read_text().splitlines()
-    lost = [" ".join([row.split()[0], *["nan"] * 7]) if 10.3 < float(row.split()[0]) < 10.5 else row for row in rows]
+    lost = [f"{row.split()[0]} {numbers}" if 10.3 < float(row.split()[0]) < 10.5 else row for row in rows]
     (folder / "groundtruth.txt").write_text("\n".join(lost))
     source = open_source(str(folder))
     times = [source.frame(i).capture_time_ns * 1e-9 for i in range(len(source))]

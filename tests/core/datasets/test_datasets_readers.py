@@ -56,6 +56,15 @@ def test_tum_interpolates_rotations_on_the_sphere(tmp_path: Path) -> None:
     assert T[0, 3] == pytest.approx(0.5)
 
 
+def test_tum_takes_the_first_of_images_with_one_time(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr1", frames=4)
+    rows = (folder / "rgb.txt").read_text().replace("10.066667 ", "10.033333 ")
+    (folder / "rgb.txt").write_text(rows)
+    source = open_source(str(folder))
+    assert source.indices() == [0, 1, 3]
+    assert source.excluded_frames == "1 of 4 colour images are skipped: they have the time of the image before"
+
+
 def test_seven_scenes_reads_numbers_depth_and_principal_point(tmp_path: Path) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq")))
     assert list(source.indices()) == [0, 4, 8]

@@ -25,6 +25,7 @@ CHANGES: dict[str, Change] = {
     "tabs": lambda text: text.replace(" ", "\t").encode(),
     "quotes": lambda text: "\n".join('"' + '","'.join(line.split()) + '"' for line in text.splitlines()).encode(),
     "a header": lambda text: b"stamp a b c d e f g\n" + text.encode(),
+    "empty columns": lambda text: text.replace("\n", ",\n").encode() + b",",
     "empty rows": lambda text: text.encode() + b"\n   \n\n",
 }
 
