@@ -7,7 +7,6 @@ motion is equal. The scene's own directions cancel, because both images show the
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ _MAX_PAIRS, _MIN_PAIRS = 16, 4
 _MAX_TURN_RAD, _MAX_DISTANCE_M = math.radians(25.0), 0.8
 _MAX_SPEED_SHARE = 0.7
 """Speed of the slower frame relative to the fast one."""
-_TIMES_S = tuple(0.002 * step for step in range(21))
+_STEP_S, _COARSE_STEPS, _MAX_STEPS = 0.002, 4, 20
 _TYPICAL_EXPOSURE_S = 0.01
 _MIN_BLUR_PX = 1.0
 _MAX_RELATIVE_STD = 0.15
@@ -112,20 +111,23 @@ def _pair_time(slow: Frame, fast: Frame, slow_twist: Twist, fast_twist: Twist) -
     mask = cv2.erode((warped.alpha > 0).astype(np.uint8), margin, borderValue=0) > 0
     if np.count_nonzero(mask) < _MIN_PIXELS:
         return
-    points = _points(fast)
+    reach_px = _MASK_MARGIN_PX // 2  # of the filters around the mask
+    rows, columns = (slice(at.min() - reach_px, at.max() + reach_px + 1) for at in np.nonzero(mask))
+    window = rows, columns
+    mask, points = mask[window], _points(fast)[window]
     T_slow_fast = inverse(slow.T_world_camera) @ fast.T_world_camera
     points_in_slow = points @ T_slow_fast[:3, :3].T + T_slow_fast[:3, 3]
     fast_motion = _image_motion(points, fast.camera, fast_twist)
     slow_motion = _image_motion(points_in_slow, slow.camera, slow_twist)
     speed_px_s = np.maximum(np.linalg.norm(fast_motion, axis=2), 1e-6)
-    direction = fast_motion / speed_px_s[..., None]
+    direction = (fast_motion / speed_px_s[..., None])[mask]
     slow_image = warped.rgb @ _LUMINANCE
     fast_image = fast.rgb @ (_LUMINANCE / np.float32(255.0))
 
     def excess(exposure_s: float) -> float:
         """Return by how much the slower frame is still sharper along the motion; 0 at the right time."""
-        blurred_slow = _blur(slow_image, fast_motion * np.float32(exposure_s))
-        blurred_fast = _blur(fast_image, slow_motion * np.float32(exposure_s))
+        blurred_slow = _blur(slow_image, window, fast_motion * np.float32(exposure_s))
+        blurred_fast = _blur(fast_image, window, slow_motion * np.float32(exposure_s))
         return _sharpness_along(blurred_slow, direction, mask) - _sharpness_along(blurred_fast, direction, mask)
 
     found = _first_zero(excess)
@@ -138,15 +140,25 @@ def _first_zero(excess: Callable[[float], float]) -> tuple[float, float] | None:
 
     A pair whose fast frame is at least as sharp counts as 0 s: without it, the others would feign blur.
     """
-    values = [excess(_TIMES_S[0])]
-    if values[0] <= 0:
-        return 0.0, max(values[0] - excess(_TYPICAL_EXPOSURE_S), 0.0) / _TYPICAL_EXPOSURE_S
-    for low_s, high_s in itertools.pairwise(_TIMES_S):
-        values.append(excess(high_s))
-        before, after = values[-2:]
+    first = excess(0.0)
+    if first <= 0:
+        return 0.0, max(first - excess(_TYPICAL_EXPOSURE_S), 0.0) / _TYPICAL_EXPOSURE_S
+    low, before = 0, first
+    for high in range(_COARSE_STEPS, _MAX_STEPS + 1, _COARSE_STEPS):
+        after = excess(high * _STEP_S)
         if after <= 0:
-            return low_s + (high_s - low_s) * before / (before - after), (before - after) / (high_s - low_s)
-    return None
+            break
+        low, before = high, after
+    else:
+        return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        value = excess(middle * _STEP_S)
+        if value > 0:
+            low, before = middle, value
+        else:
+            high, after = middle, value
+    return _STEP_S * (low + before / (before - after)), (before - after) / _STEP_S
 
 
 def _points(frame: Frame) -> Float64[ndarray, "h w 3"]:
@@ -161,27 +173,32 @@ def _points(frame: Frame) -> Float64[ndarray, "h w 3"]:
 def _image_motion(points: Float64[ndarray, "h w 3"], camera: Camera, twist: Twist) -> Float32[ndarray, "h w 2"]:
     """Return the image velocity of points in the camera's axes, in pixels per second."""
     z_m = np.maximum(points[..., 2], 1e-2)
-    rate = -(np.cross(twist.angular_rad_s, points) + twist.linear_m_s) / z_m[..., None]
+    (x, y, z), (wx, wy, wz) = np.moveaxis(points, 2, 0), twist.angular_rad_s
+    turned = np.stack([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x], axis=2)
+    rate = -(turned + twist.linear_m_s) / z_m[..., None]
     motion_px_s = camera.pixels_per_s(points[..., 0] / z_m, points[..., 1] / z_m, rate)
     return np.stack(motion_px_s, axis=2).astype(np.float32)
 
 
-def _blur(image: Image, motion_px: Float32[ndarray, "h w 2"]) -> Image:
-    """Return the mean of the image over a motion of this length around each pixel."""
-    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
-    total = np.zeros_like(image)
-    for share in (np.arange(_BLUR_SAMPLES, dtype=np.float32) + 0.5) / _BLUR_SAMPLES - 0.5:
-        at = columns + share * motion_px[..., 0], rows + share * motion_px[..., 1]
-        total += cv2.remap(image, *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+def _blur(image: Image, window: tuple[slice, slice], motion_px: Float32[ndarray, "m n 2"]) -> Float32[ndarray, "m n"]:
+    """Return a window of the mean of the image over a motion of this length around each pixel."""
+    rows, columns = (at.astype(np.float32) for at in np.ogrid[window])
+    # the middle one of the samples is the image itself
+    total: Float32[ndarray, "m n"] = image[window].copy()
+    for sample in range(1, _BLUR_SAMPLES // 2 + 1):
+        offset_px = motion_px * np.float32(sample / _BLUR_SAMPLES)
+        for at in (np.add, np.subtract):
+            lookup = at(columns, offset_px[..., 0]), at(rows, offset_px[..., 1])
+            total += cv2.remap(image, *lookup, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return total / np.float32(_BLUR_SAMPLES)
 
 
-def _sharpness_along(image: Image, direction: Float32[ndarray, "h w 2"], mask: Bool[ndarray, "h w"]) -> float:
+def _sharpness_along(image: Image, direction: Float32[ndarray, "n 2"], mask: Bool[ndarray, "h w"]) -> float:
     """Return the logarithm of the gradient energy along a direction relative to that across it."""
     smooth = cv2.GaussianBlur(image, (0, 0), _SMOOTHING_PX)
     dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3)[mask]
     dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)[mask]
-    x, y = direction[mask].T
+    x, y = direction.T
     along, across = dx * x + dy * y, dy * x - dx * y
     return math.log((float(along @ along) + 1e-12) / (float(across @ across) + 1e-12))
 
