@@ -7,8 +7,6 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from google.protobuf.json_format import MessageToDict
-
 from gausslite.cli.progress import progress_bar
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.command_parser import CommandParser, bounded
@@ -20,6 +18,7 @@ from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.process import TASK_NOT_FOUND
 from gausslite.wire.channel import is_agent, require_callable
 from gausslite.wire.clients import AgentClient, Export, FusionClient
+from gausslite.wire.convert import message_values
 from gausslite.wire.security import TlsFiles
 
 
@@ -206,10 +205,7 @@ def run_status(options: argparse.Namespace) -> int:
     tls = build(TlsFiles, options).read()
     of_agent = is_agent(options.address, tls)
     with (AgentClient if of_agent else FusionClient)(options.address, tls=tls) as client:
-        # 64-bit integers are texts, and messages without content are absent
-        values = MessageToDict(
-            client.status(), preserving_proto_field_name=True, always_print_fields_with_no_presence=True
-        )
+        values = message_values(client.status())
     if options.json:
         print(json.dumps(values))
     else:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message import DecodeError, Message
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
@@ -358,3 +360,11 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
         grid=grid,
         winners=winners,
     )
+
+
+def message_values(message: Message) -> dict[str, Any]:
+    """Return a message as JSON has it: 64-bit integers are texts, and messages without content are absent."""
+    values: dict[str, Any] = MessageToDict(
+        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+    )
+    return values
