@@ -107,7 +107,10 @@ def robust_std(residual: Float64[ndarray, " n"]) -> float:
 
 def robust_weights(residual: Float64[ndarray, " n"], min_std: float = _MIN_STD) -> Float64[ndarray, " n"]:
     """Return the weights of Geman-McClure, scaled by the robust standard deviation, divided by the variance."""
-    residual_std = max(robust_std(residual), min_std)
+    return _weights_at(residual, max(robust_std(residual), min_std))
+
+
+def _weights_at(residual: Float64[ndarray, " n"], residual_std: float) -> Float64[ndarray, " n"]:
     scaled = residual / residual_std
     weights: Float64[ndarray, " n"] = np.square(1.0 / (1.0 + np.square(scaled / _OUTLIER_STDS))) / residual_std**2
     return weights
@@ -404,13 +407,14 @@ class _Model:
         jacobian, residual = luminance_residuals(self.luminance[i][visible.index], photograph, visible, frame.camera)
         # far from the solution, gain and offset dominate the residuals of all points together
         spread = residual if self.normals is None else residual - np.median(residual)
-        equations = NormalEquations.of(jacobian, residual, self.share * robust_weights(spread, min_std))
+        spread_std = max(robust_std(spread), min_std)
+        equations = NormalEquations.of(jacobian, residual, self.share * _weights_at(spread, spread_std))
         if self.normals is not None:
             normals = self.normals[visible.index] @ T_camera_rendered[:3, :3].T
             plane_jacobian, plane_residual = _plane_residuals(normals, frame, visible)
             weights = self.share * robust_weights(plane_residual, _MIN_PLANE_STD_M)
             equations = equations.plus(NormalEquations.of(plane_jacobian, plane_residual, weights))
-        return _Step(equations, overlap, max(robust_std(spread), min_std))
+        return _Step(equations, overlap, spread_std)
 
 
 def _plane_residuals(

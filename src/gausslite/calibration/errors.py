@@ -137,9 +137,10 @@ def _pairs(source: Source) -> Iterator[tuple[Rendering, Frame]]:
     for position in sorted({round(position) for position in np.linspace(0, count - 1, _MAX_PAIRS)}):
         direction = 1 if position < count // 2 else -1
         gap = min(2 * last_gap, count // 2)
+        first: Frame | None = None
         while gap >= 1:
             try:
-                first = source.frame(position, size)
+                first = first or source.frame(position, size)
                 second = source.frame(position + direction * gap, size)
             except (DatasetError, PoseError):
                 break

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -100,11 +100,12 @@ class PairError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingPairs:
-    """Pairs of positions with their recorded frames, and the poses of the whole source."""
+    """Pairs of positions with their recorded frames, and the poses of the whole source; the errors are kept."""
 
     trajectory: Trajectory
     pairs: Sequence[tuple[int, int]]
     frames: Mapping[int, Frame]
+    _errors: dict[CameraCorrection, PairError] = field(default_factory=dict)
 
     @classmethod
     def read(cls, source: Source, size: tuple[int, int]) -> MovingPairs:
@@ -132,6 +133,11 @@ class MovingPairs:
 
         The camera of the corrected images does not depend on the correction, so that residuals can be compared.
         """
+        if correction not in self._errors:
+            self._errors[correction] = self._error(correction)
+        return self._errors[correction]
+
+    def _error(self, correction: CameraCorrection) -> PairError:
         corrected = {
             i: correct_frame(frame, correction, frame.camera, self.trajectory.twist(i))
             for i, frame in self.frames.items()

@@ -52,6 +52,12 @@ def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twi
     Pixels that the recorded image does not show repeat its border and have no depth. The twist is that of the camera
     at the frame's stamp. Motion blur stays; the frame's motion states it.
     """
+    T_world_camera = frame.T_world_camera @ twist.motion(correction.time_offset_s)
+    motion = CameraMotion(twist, exposure_s=correction.exposure_s) if correction.exposure_s else None
+    has_lens = correction.lens is not None and not correction.lens.is_identity
+    if not has_lens and correction.readout_s == 0.0 and ideal == frame.camera:
+        # each pixel looks up itself
+        return replace(frame, T_world_camera=T_world_camera, motion=motion)
     depth_m = np.zeros_like(frame.depth_m)
     columns, rows = recorded_pixels(frame.camera, correction, ideal, twist, depth_m)
     if correction.readout_s != 0.0 and np.any(twist.linear_m_s):
@@ -63,8 +69,8 @@ def correct_frame(frame: Frame, correction: CameraCorrection, ideal: Camera, twi
         rgb=cv2.remap(frame.rgb, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE),
         depth_m=cv2.remap(frame.depth_m, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT),
         camera=ideal,
-        T_world_camera=frame.T_world_camera @ twist.motion(correction.time_offset_s),
-        motion=CameraMotion(twist, exposure_s=correction.exposure_s) if correction.exposure_s else None,
+        T_world_camera=T_world_camera,
+        motion=motion,
     )
 
 

@@ -245,9 +245,9 @@ def snapped_to_edges(
     window = tuple(slice(max(0, int(at[0]) - margin_px), int(at[-1]) + margin_px + 1) for at in (rows, columns))
     part = mask[window]
     lab = cv2.cvtColor(np.ascontiguousarray(rgb[window]), cv2.COLOR_RGB2LAB).astype(np.float32) / np.float32(255)
-    share = _guided_filter(lab, part.astype(np.float32), settings)
     kernel = np.ones(_edge_window(settings), np.uint8)
     near_outline = cv2.dilate(part.astype(np.uint8), kernel) > cv2.erode(part.astype(np.uint8), kernel)
+    share = _guided_filter(lab, part.astype(np.float32), near_outline, settings)
     snapped = mask.copy()
     snapped[window] = np.where(near_outline, share > 0.5, part)
     return snapped
@@ -258,20 +258,30 @@ def _edge_window(settings: SurfaceSettings) -> tuple[int, int]:
 
 
 def _guided_filter(
-    guide: Float32[ndarray, "h w 3"], values: Float32[ndarray, "h w"], settings: SurfaceSettings
+    guide: Float32[ndarray, "h w 3"],
+    values: Float32[ndarray, "h w"],
+    wanted: Bool[ndarray, "h w"],
+    settings: SurfaceSettings,
 ) -> Float32[ndarray, "h w"]:
-    """Return the values as locally linear functions of the guide's three channels, fitted in each window."""
+    """Return the values as locally linear functions of the guide's three channels, fitted in each window.
+
+    Only the wanted pixels are filled.
+    """
     window = _edge_window(settings)
     guide_mean, value_mean = cv2.blur(guide, window), cv2.blur(values, window)
     products = cv2.blur(guide * values[..., None], window) - guide_mean * value_mean[..., None]
-    outer = (guide[..., :, None] * guide[..., None, :]).reshape(*values.shape, 9)
-    variance = np.dstack([cv2.blur(np.ascontiguousarray(outer[..., i]), window) for i in range(9)])
-    variance = variance.reshape(*values.shape, 3, 3) - guide_mean[..., :, None] * guide_mean[..., None, :]
-    slope = np.linalg.solve(
-        variance + np.float32(settings.edge_epsilon) * np.eye(3, dtype=np.float32), products[..., None]
+    # the wanted pixels depend on the fits in the windows around them
+    fitted = cv2.dilate(wanted.astype(np.uint8), np.ones(window, np.uint8)) > 0
+    variance = np.empty((np.count_nonzero(fitted), 3, 3), np.float32)
+    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        mean = cv2.blur(guide[..., i] * guide[..., j], window)[fitted]
+        variance[:, i, j] = variance[:, j, i] = mean - guide_mean[fitted, i] * guide_mean[fitted, j]
+    slope = np.zeros_like(guide)
+    slope[fitted] = np.linalg.solve(
+        variance + np.float32(settings.edge_epsilon) * np.eye(3, dtype=np.float32), products[fitted][..., None]
     )[..., 0]
     offset = value_mean - (slope * guide_mean).sum(axis=-1)
-    slope_mean = cv2.blur(np.ascontiguousarray(slope), window)
+    slope_mean = cv2.blur(slope, window)
     filtered: Float32[ndarray, "h w"] = (slope_mean * guide).sum(axis=-1) + cv2.blur(offset, window)
     return filtered
 
