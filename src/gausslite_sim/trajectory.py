@@ -72,9 +72,13 @@ def _spline(keys: Float64[ndarray, "k 3"], share: Float64[ndarray, " n"]) -> Flo
 
 def _look_at(eye_m: Float64[ndarray, "3"], target_m: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
     forward = (target_m - eye_m) / np.linalg.norm(target_m - eye_m)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
+    x, y, z = forward.tolist()
+    right = np.array([y, -x, 0.0])
     right /= np.linalg.norm(right)
+    # products in the order of np.cross, which takes ten times longer for single vectors
+    right_x, right_y, right_z = right.tolist()
+    down = (y * right_z - z * right_y, z * right_x - x * right_z, x * right_y - y * right_x)
     T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 0], T[:3, 1], T[:3, 2] = right, down, forward
     T[:3, 3] = eye_m
     return T
