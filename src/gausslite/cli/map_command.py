@@ -34,7 +34,7 @@ from gausslite.domain.objects import ObjectLandmark, found_text
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.evaluation.compare import MapScores, score_training_views
+from gausslite.evaluation.compare import TrainingFit, score_training_views
 from gausslite.evaluation.metrics import trajectory_error
 from gausslite.evaluation.pictures import render_preview
 from gausslite.evaluation.views import view_map
@@ -238,7 +238,7 @@ class _Run:
         self._gaussians = Gaussians.empty()
         self._report: dict[str, object] = {}
         self._notes: tuple[str, ...] = ()
-        self._training_scores: MapScores | None = None
+        self._training_scores: TrainingFit | None = None
         self._save_error: StorageError | None = None
 
     def map_frames(self, estimators: EstimatorFactory, resumed_after: int) -> MissionResult:

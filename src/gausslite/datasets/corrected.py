@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -189,11 +190,16 @@ def _pixels(x: ndarray, y: ndarray, camera: Camera, lens: Lens | None) -> tuple[
 
 def _interpolated(grid: Float64[ndarray, "m n"], width: int, height: int) -> Float32[ndarray, "h w"]:
     """Return a value for every pixel, bilinear between the grid's pixels."""
-    rows = np.arange(height, dtype=np.float32) / np.float32(_GRID_PX)
-    columns = np.arange(width, dtype=np.float32) / np.float32(_GRID_PX)
-    at_columns, at_rows = np.meshgrid(columns, rows)
+    at_columns, at_rows = _grid_coordinates(width, height)
     values: Float32[ndarray, "h w"] = cv2.remap(grid.astype(np.float32), at_columns, at_rows, cv2.INTER_LINEAR)
     return values
+
+
+@lru_cache(maxsize=4)
+def _grid_coordinates(width: int, height: int) -> list[Float32[ndarray, "h w"]]:
+    """Return column and row of every pixel in the grid."""
+    sides = (np.arange(side, dtype=np.float32) / np.float32(_GRID_PX) for side in (width, height))
+    return list(np.meshgrid(*sides))
 
 
 _SPEED_QUANTILE = 0.9

@@ -52,7 +52,7 @@ class RgbdImage:
 def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:
     """Return an 8-bit RGB image. Raises DatasetError with the file name."""
     bgr = _decode(path, cv2.IMREAD_COLOR)
-    rgb: UInt8[ndarray, "h w 3"] = np.ascontiguousarray(bgr[..., ::-1])
+    rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
     return rgb
 
 
@@ -82,7 +82,9 @@ def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DatasetError(f"{path}: expected a 16-bit image of one channel, got {raw.dtype} of shape {raw.shape}")
     depth_m = raw.astype(np.float32) / np.float32(units.per_metre)
-    depth_m[np.isin(raw, units.invalid)] = 0.0
+    for value in units.invalid:
+        if value != 0:
+            depth_m[raw == value] = 0.0
     return depth_m
 
 

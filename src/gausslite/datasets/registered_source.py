@@ -110,11 +110,13 @@ def _splat(
     spread = np.minimum(_OVERLAP * depth_m / z_m, _MAX_SPREAD)
     width_px, height_px = (spread * np.float32(zoom) for zoom in colour_camera.magnification(depth_camera))
     left, top = column_px - 0.5 * width_px, row_px - 0.5 * height_px
+    columns = [_pixels_covered(left, width_px, step, width) for step in range(_steps(width_px))]
+    measured = z_m < np.inf
     for row_step in range(_steps(height_px)):
         row, in_row = _pixels_covered(top, height_px, row_step, height)
-        for column_step in range(_steps(width_px)):
-            column, in_column = _pixels_covered(left, width_px, column_step, width)
-            covered = np.flatnonzero(in_row & in_column & (z_m < np.inf))
+        in_row &= measured
+        for column, in_column in columns:
+            covered = np.flatnonzero(in_row & in_column)
             flat = row.take(covered).astype(np.int64) * width + column.take(covered).astype(np.int64)
             np.minimum.at(nearest.reshape(-1), flat, z_m.take(covered))
 

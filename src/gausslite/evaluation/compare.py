@@ -100,16 +100,33 @@ def evaluate(gaussians: Gaussians, views: Sequence[HeldOutView], rasterizer: Ras
     return average([score_view(viewer.render_frame(view.frame), view) for view in views])
 
 
+@dataclass(frozen=True, slots=True)
+class TrainingFit:
+    """Mean PSNR in dB over views that a map was trained on; that of the region is None if no view shows it."""
+
+    roi_psnr: float | None
+    full_psnr: float
+    n_views: int
+
+
 def score_training_views(
     viewer: MapViewer, keyframes: Sequence[tuple[Frame, Bool[ndarray, "h w"]]], count: int = 5
-) -> MapScores:
-    """Return the mean scores over the keyframes with the largest region in each part of a run, at most `count`.
+) -> TrainingFit:
+    """Return the PSNR over the keyframes with the largest region in each part of a run, at most `count`.
 
-    The map was trained on them, so they only show whether it fits what the camera saw.
+    The map was trained on them, so it only shows whether the map fits what the camera saw.
     """
     pixels = [int(np.count_nonzero(roi)) for _, roi in keyframes]
-    chosen = [HeldOutView(*keyframes[i]) for i in sorted(largest_roi_per_segment(pixels, count))]
-    return average([score_view(viewer.render_frame(view.frame), view) for view in chosen])
+    in_region, in_images = [], []
+    for i in sorted(largest_roi_per_segment(pixels, count)):
+        view = HeldOutView(*keyframes[i])
+        rgb = viewer.render_frame(view.frame).rgb
+        in_images.append(min(psnr(rgb, view.frame.rgb), MAX_PSNR_DB))
+        if view.shows_region:
+            in_region.append(min(psnr(rgb, view.frame.rgb, view.roi), MAX_PSNR_DB))
+    if not in_images:
+        raise InvalidInputError("keyframes: expected at least one, got none")
+    return TrainingFit(fmean(in_region) if in_region else None, fmean(in_images), len(in_images))
 
 
 def score_view(rendering: Rendering, view: HeldOutView, lpips: Lpips | None = None) -> ViewScore:

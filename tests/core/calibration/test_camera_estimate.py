@@ -37,7 +37,7 @@ def test_lens_and_readout_of_a_turning_camera_are_estimated() -> None:
 
 
 def test_the_exposure_time_is_estimated_from_blur() -> None:
-    spec = "sim:home-1?frames=90&size=320x240&exposure=0&speed=60&blur=10ms"
+    spec = "sim:home-1?frames=90&size=240x180&exposure=0&speed=60&blur=10ms"
     exposure_s, evidence = estimate_exposure_time(open_source(spec), CameraCorrection())
     assert exposure_s == pytest.approx(0.01, abs=0.001)
     assert "pairs of a fast and a slower frame" in evidence
