@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera, Lens
 from gausslite_sim.home_catalogue import plan_home
+from gausslite_sim.home_plan import HomePlan
 from gausslite_sim.ray_camera import RayCamera
 from gausslite_sim.recorded_view import RecordingCamera, render_recorded_view
 from gausslite_sim.scene import HomeScene
@@ -19,13 +22,18 @@ CAMERA = Camera(68.0, 68.0, 40.0, 30.0, 80, 60)
 FRAMES, FRAME, INTERVAL_S = 60, 20, 0.05
 
 
+@functools.cache
+def home() -> HomePlan:
+    return plan_home(0, 0)
+
+
 @pytest.fixture(scope="module")
 def scene() -> HomeScene:
-    return HomeScene(plan_home(0, 0))
+    return HomeScene(home())
 
 
 def poses_at(seconds: np.ndarray) -> np.ndarray:
-    return plan_home(0, 0).trajectories[1](FRAMES, FRAME + seconds / INTERVAL_S)
+    return home().trajectories[1](FRAMES, FRAME + seconds / INTERVAL_S)
 
 
 def test_each_row_shows_the_scene_from_the_pose_at_its_time(scene: HomeScene) -> None:

@@ -202,11 +202,10 @@ def estimate_from_frames(frames: Sequence[Frame]) -> RegistrationEstimate:
     depth_camera, reference_m = frames[0].camera, float(np.median(depths_m))
     gradients: list[ColourGradients] = []
 
-    def points_of(count: int) -> _EdgePoints:
-        return _EdgePoints.of([edge.thinned(max(1, len(depths_m) // count)) for edge in edges])
-
-    grid_points, coarse_points = points_of(_GRID_POINTS), points_of(_COARSE_POINTS)
-    all_points = _EdgePoints.of(edges)
+    grid_points, coarse_points, all_points = (
+        _EdgePoints.of([edge.thinned(max(1, len(depths_m) // count)) for edge in edges])
+        for count in (_GRID_POINTS, _COARSE_POINTS, len(depths_m))
+    )
 
     def score(candidate: Float64[ndarray, "6"], points: _EdgePoints = all_points) -> float:
         return _score(_registration_of(candidate, depth_camera, reference_m), points, gradients)
