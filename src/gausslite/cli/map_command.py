@@ -334,10 +334,12 @@ class _Run:
             (self._corrupt.count, "corrupt"),
         )
         skipped = ", ".join(f"{count} {reason}" for count, reason in counts if count)
+        active = report["active_gaussians"]
+        in_region = f" ({active:,} in the task's region)" if active or self._inputs.schedule.graphs() else ""
         print(
             f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
-            f"{len(self._gaussians):,} Gaussians ({report['active_gaussians']:,} in the task's region) → "
-            f"{self._options.out / 'map.ply'}; {PREVIEW} in the same folder shows it"
+            f"{len(self._gaussians):,} Gaussians{in_region} → {self._options.out / 'map.ply'}; {PREVIEW} in the same "
+            "folder shows it"
         )
         if totals.late:
             print(f"  {totals.late} of {totals.frames} frames missed the deadline of --rate {self._options.rate:g}")

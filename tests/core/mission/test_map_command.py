@@ -143,10 +143,13 @@ def test_a_map_is_written_although_its_state_cannot_be(tmp_path: Path, capsys: p
 def test_without_task_and_region_mapping_is_uniform(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
     assert map_command(sequence, tmp_path / "out") == 0
-    assert "mapping everything equally (--policy uniform)" in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert "mapping everything equally (--policy uniform)" in printed.err
+    assert "in the task's region" not in printed.out
     assert report_of(tmp_path / "out")["policy"] == "uniform"
     assert map_command(sequence, tmp_path / "region", "--set", "target-at=0,0,2,0.4") == 0
     assert report_of(tmp_path / "region")["policy"] == "task"
+    assert "in the task's region" in capsys.readouterr().out
 
 
 def test_nouns_that_the_detector_cannot_find_are_named_before_mapping(
