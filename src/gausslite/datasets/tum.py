@@ -231,7 +231,7 @@ def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera
     found = read_folder_camera(folder, width_px, height_px, published)
     if found is None:
         raise DatasetError(
-            f"{folder}: the camera is unknown: expected the file {INTRINSICS_FILE} or {CAMERA_FILE}, or a folder "
-            "named after fr1, fr2 or fr3 (or freiburg1 ...) with images of 4:3"
+            f"{folder}: the camera is unknown: expected the file {INTRINSICS_FILE} (three rows: fx 0 cx, 0 fy cy, "
+            f"0 0 1) or {CAMERA_FILE}, or a folder named after fr1, fr2 or fr3 (or freiburg1 ...) with images of 4:3"
         )
     return found
