@@ -74,7 +74,10 @@ def balls_for_small_objects(regions: Mapping[str, VoxelRegion]) -> dict[str, Reg
 def choose_regions(regions: Mapping[str, Region], names: Sequence[str]) -> list[Region]:
     """Return the regions with these names, or all if names is empty. Raises InvalidInputError."""
     if not regions:
-        raise InvalidInputError("objects: expected regions to choose from, with --roi FILE.npz; the sequence has none")
+        raise InvalidInputError(
+            "objects: expected regions to choose from, with --roi FILE.npz; the sequence has none; "
+            "--set target-at=X,Y,Z,RADIUS states a place instead"
+        )
     unknown = [name for name in names if name not in regions]
     if unknown:
         known = ", ".join(sorted(regions))

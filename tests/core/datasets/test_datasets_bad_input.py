@@ -14,8 +14,8 @@ import pytest
 from tiny_sequences import IDENTITY_ROWS, write_colour, write_depth, write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.regions import load_voxel_regions
-from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
+from gausslite.datasets.regions import choose_regions, load_voxel_regions
+from gausslite.domain.errors import DatasetError, GaussLiteError, InvalidInputError, PoseError
 
 WRITERS = {"tum": write_tum, "seven": write_seven_scenes, "replica": write_replica}
 FOLDERS = {"tum": "fr1", "seven": "seq", "replica": "office0"}
@@ -349,3 +349,8 @@ def test_regions_that_need_too_much_memory_are_refused(tmp_path: Path) -> None:
 def test_a_missing_regions_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"regions.npz: expected a file of regions"):
         load_voxel_regions(tmp_path / "regions.npz")
+
+
+def test_names_without_regions_are_answered_with_another_way() -> None:
+    with pytest.raises(InvalidInputError, match=r"the sequence has none; --set target-at=X,Y,Z,RADIUS states a place"):
+        choose_regions({}, ["keyboard"])
