@@ -14,6 +14,7 @@ from gausslite.codec.run_files import KeyframeView, write_keyframe_views
 from gausslite.evaluation.views import view_map
 from gausslite.mission.prior import SavedMap
 from gausslite_bench.cli.places import PlaceScore, mirrored
+from gausslite_bench.loop_trials import LoopTrials
 
 POSE = (0.5, 0.5, 30.0)
 
@@ -42,3 +43,15 @@ def test_another_place_is_refused(run: Path, capsys: pytest.CaptureFixture[str])
     assert main(["bench", "places", str(run), source, "--elsewhere", "--threads", "1", "--json"]) == 0
     score = json.loads(capsys.readouterr().out)
     assert (score["frames"], score["right"], score["wrong"]) == (2, 0, 0)
+
+
+def test_a_loop_counts_in_its_place_and_not_in_a_look_alike(run: Path) -> None:
+    for package in ("gtsam", "kiss_matcher"):
+        pytest.importorskip(package, reason="loops come with the extra slam")
+    camera = MapCamera(room(3))
+    trials = LoopTrials(SavedMap.read(run), [camera.frame(looking(*POSE))], threads=1)
+    frame = camera.frame(looking(0.55, 0.55, 30.0))
+    there = trials.score([frame], elsewhere=False)
+    assert (there.frames, there.near, there.right, there.wrong) == (1, 1, 1, 0)
+    elsewhere = trials.score([frame, mirrored(frame)], elsewhere=True)
+    assert (elsewhere.frames, elsewhere.right, elsewhere.wrong) == (2, 0, 0), "also not for the same view 8 m away"

@@ -31,7 +31,7 @@ from gausslite.places.verification import verify
 from gausslite.process import print_message
 from gausslite.render.rasterizer import Rasterizer, Rendering, Subset
 
-_MIN_GAP = 8
+MIN_GAP = 8
 """Keyframes between two passes; what lies closer together in time is aligned by the refinement of views."""
 _MAX_DISTANCE = 1.5
 """Of a candidate by position: metres plus radians."""
@@ -41,7 +41,7 @@ _ALIGNED_STD = np.array([0.03] * 3 + [np.radians(0.7)] * 3)
 """Error of a registered motion before images refine it: translation (m) and rotation (rad)."""
 _MIN_ALIGNED = 0.5
 """Share of the points in both images whose depth must agree."""
-_NOISE_M, _NOISE_DEG, _NOISE_STDS = 0.006, 0.15, 2.0
+_NOISE_M, _NOISE_DEG, _NOISE_STDS = 0.006, 0.15, 2.0 * 2.0**0.5
 """A motion that the poses contradict by less than these, or by less than this many standard deviations of a pose's
 error, moves nothing until another one does."""
 
@@ -113,8 +113,10 @@ class LoopCloser:
         self._times_ns.append(keyframe.frame.capture_time_ns)
         view = View.of(keyframe.frame)
         self._descriptors.append(view.descriptor)
-        loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - _MIN_GAP])
-        is_noise = all(motion is None or self._is_noise(motion) for motion in (loop, self._graph.newest_step))
+        loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - MIN_GAP])
+        # until a loop shows a drift, images err more than the odometry from one keyframe to the next
+        step = self._graph.newest_step if self._corrections else None
+        is_noise = all(motion is None or self._is_noise(motion) for motion in (loop, step))
         if loop is not None:
             self._graph.add_loop(loop)
         return None if is_noise else self._solve(loop)
@@ -190,7 +192,7 @@ class LoopCloser:
     def _is_verified(self, keyframe: Keyframe, T_world_camera: Float64[ndarray, "4 4"]) -> bool:
         """True if what earlier keyframes have mapped, rendered from this pose, agrees with the keyframe's image."""
         table = self._table
-        earlier = (table.anchor <= keyframe.anchor - _MIN_GAP) & (table.anchor != NO_ANCHOR)
+        earlier = (table.anchor <= keyframe.anchor - MIN_GAP) & (table.anchor != NO_ANCHOR)
         subset = Subset(None, np.flatnonzero(earlier).astype(np.uint32))
 
         def render(camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None) -> Rendering:

@@ -28,8 +28,8 @@ _MAX_LOOPS = 1000
 _DRIFT_M, _DRIFT_DEG = 0.03, 1.0
 """Standard deviations of the odometry after 1 m walked or 1 rad turned. They grow with the square root."""
 _LEAST_STD_M, _LEAST_STD_DEG = 0.002, 0.1
-_MAP_STD_M, _MAP_STD_DEG = 0.01, 0.3
-"""Error of the motion between two successive poses that are refined against the map."""
+_MAP_SHARE = 1.0 / 3.0
+"""Error of the motion between two successive poses that are refined against the map, as a share of the odometry's."""
 _IMAGE_STD_M, _IMAGE_STD_DEG, _IMAGE_SHARE = 0.004, 0.1, 0.7
 """Error of a motion by alignment of two images; in a home, 1.3 mm and 0.04 degrees (root mean square). The defects of a
 camera from which the prior was estimated also disturb the alignment: at least this share of the prior."""
@@ -189,8 +189,9 @@ class PoseGraph:
         start = gtsam.noiseModel.Isotropic.Sigma(6, _START_STD)
         graph.add(gtsam.PriorFactorPose3(first, values.atPose3(first), start))
         for number, step in enumerate(self._steps[first:], first):
-            measured_noise = self._image_noise if step.by_images else _MAP_NOISE
-            for T, noise in ((step.odometry, _odometry_noise(step.odometry)), (step.measured, measured_noise)):
+            odometry_noise = _odometry_noise(step.odometry)
+            measured_noise = self._image_noise if step.by_images else _MAP_SHARE * odometry_noise
+            for T, noise in ((step.odometry, odometry_noise), (step.measured, measured_noise)):
                 graph.add(_between(gtsam, (number, number + 1), T, noise))
         return graph, values
 
@@ -234,9 +235,6 @@ def _rigid(state: State, name: str, count: int | None) -> list[Float64[ndarray, 
 def _noise(translation_std_m: float, rotation_std_deg: float) -> Float64[ndarray, "6"]:
     """Return standard deviations in GTSAM's order: rotation (rad), then translation (m)."""
     return np.array([np.radians(rotation_std_deg)] * 3 + [translation_std_m] * 3)
-
-
-_MAP_NOISE = _noise(_MAP_STD_M, _MAP_STD_DEG)
 
 
 def _odometry_noise(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:

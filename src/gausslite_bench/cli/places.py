@@ -1,4 +1,4 @@
-"""`gausslite bench places`: how many frames are localised in a saved map, rightly or wrongly, and how fast."""
+"""`gausslite bench places`: how many frames are localised in a saved map or close a loop there, rightly or wrongly."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from gausslite.mission.prior import SavedMap
 from gausslite.mission.results import as_text
 from gausslite.mission.settings import SourceSettings
 from gausslite.places.localisation import PlaceMap
+from gausslite_bench.loop_trials import LoopScore, LoopTrials
 
 _WRONG_M, _WRONG_DEG = 0.25, 10.0
 
@@ -35,6 +36,12 @@ class PlacesOptions:
     place: Path = option(MISSING, "folder of the run whose map is the place", metavar="RUN")
     elsewhere: bool = option(False, "SOURCE shows another place: every localised frame is wrong")
     mirror: bool = option(False, "mirror the images, which makes a look-alike of the place (implies elsewhere)")
+    loops: str = option(
+        "",
+        "the run's recording: present each frame as a new keyframe that may close a loop of the run; with elsewhere or "
+        "mirror, 8 m away",
+        metavar="RECORDING",
+    )
     threads: int | None = option(None, "the rasterizer's threads (default: one per core)", low=1)
     json: bool = option(False, "print JSON for scripts")
 
@@ -84,7 +91,7 @@ def configure_places(parser: CommandParser) -> None:
     """Add the options of `bench places`."""
     Program.of(
         *(PlacesOptions, SourceSettings),
-        flags="frames size elsewhere mirror threads json",
+        flags="frames size elsewhere mirror loops threads json",
         positional="place source",
         omit=("test-every", "camera-correction", "register-depth"),
     ).add_to(parser)
@@ -98,8 +105,15 @@ def run_places(options: argparse.Namespace) -> int:
     frames = (source.frame(position, size) for position in positions)
     if options.mirror:
         frames = (mirrored(frame) for frame in frames)
-    places = saved.places(view_map(saved.gaussians, threads=options.threads))
-    score = PlaceScore.of(places, frames, options.elsewhere or options.mirror)
+    elsewhere = options.elsewhere or options.mirror
+    score: PlaceScore | LoopScore
+    if options.loops:
+        recording = open_source(options.loops, options.up)
+        recorded = [recording.frame(view.index, size) for view in saved.keyframes]
+        score = LoopTrials(saved, recorded, options.threads).score(frames, elsewhere)
+    else:
+        places = saved.places(view_map(saved.gaussians, threads=options.threads))
+        score = PlaceScore.of(places, frames, elsewhere)
     print(as_text(asdict(score)) if options.json else score.line())
     return 0
 
