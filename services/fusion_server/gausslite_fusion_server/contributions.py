@@ -13,7 +13,7 @@ from gausslite.domain.errors import (
     StorageError,
     UnavailableError,
 )
-from gausslite.fusion.store import PutOutcome, SessionRecord
+from gausslite.fusion.store_values import PutOutcome, SessionRecord
 from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.security import Caller, RejectionLog

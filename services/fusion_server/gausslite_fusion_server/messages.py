@@ -18,7 +18,7 @@ from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.refinement import LayerView
-from gausslite.fusion.store import SessionRecord
+from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame

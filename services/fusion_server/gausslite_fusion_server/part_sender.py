@@ -12,7 +12,7 @@ from typing import Any
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.store import SessionRecord
+from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import Acknowledgements
 from gausslite.fusion.updates import PendingUpdate, UpdateQueue, decode_own
 from gausslite_fusion_server.contributions import StoredCount

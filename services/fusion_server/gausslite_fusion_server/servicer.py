@@ -22,7 +22,7 @@ from gausslite.domain.errors import (
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.refinement import MapRenderer
-from gausslite.fusion.store import MissionConfig, PutOutcome, SessionRecord
+from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.convert import (

@@ -18,7 +18,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchE
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, merge_batches
 from gausslite.fusion.regions import Owners
-from gausslite.fusion.store import SessionRecord
+from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc

@@ -18,7 +18,7 @@ from gausslite.mission.results import MAP_FILE, prepare_file
 from gausslite.process import TASK_NOT_FOUND
 from gausslite.wire.channel import is_agent, require_callable
 from gausslite.wire.clients import AgentClient, Export, FusionClient
-from gausslite.wire.convert import message_values
+from gausslite.wire.convert import message_to_values
 from gausslite.wire.security import TlsFiles
 
 
@@ -205,7 +205,7 @@ def run_status(options: argparse.Namespace) -> int:
     tls = build(TlsFiles, options).read()
     of_agent = is_agent(options.address, tls)
     with (AgentClient if of_agent else FusionClient)(options.address, tls=tls) as client:
-        values = message_values(client.status())
+        values = message_to_values(client.status())
     if options.json:
         print(json.dumps(values))
     else:

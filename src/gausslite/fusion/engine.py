@@ -33,14 +33,8 @@ from gausslite.fusion.keyframes import (
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.mission_data import MissionData
 from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
-from gausslite.fusion.store import (
-    FusionStore,
-    MissionConfig,
-    PutOutcome,
-    SessionRecord,
-    SharedRows,
-    require_storable,
-)
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, SharedRows, require_storable
 from gausslite.fusion.traffic import (
     Acknowledgements,
     MissionStatus,

@@ -12,7 +12,7 @@ from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.keyframes import KeyframeLimits
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store_values import MissionConfig
 
 DEFAULT_LEASE_S = 60.0
 """Longer than a robot needs to notice a lost server and to reconnect, see wire/channel.py."""

@@ -20,7 +20,8 @@ from gausslite.domain.errors import (
 )
 from gausslite.fusion.agent_data import is_earlier_map
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.store import FusionStore, MissionConfig, SessionRecord, SharedRows, reconcile
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import MissionConfig, SessionRecord, SharedRows, reconcile
 
 _log = logging.getLogger(__name__)
 RECORD = "ban"

@@ -15,7 +15,8 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import TeamObjects
-from gausslite.fusion.store import FusionStore, SharedRows
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import SharedRows
 from gausslite.fusion.traffic import AgentContribution, MissionStatus, TrafficLog
 from gausslite.fusion.unknown_frames import Find, UnknownFrames
 from gausslite.fusion.updates import UpdateChecks

@@ -23,7 +23,7 @@ _PARAMETERS: dict[str, Any] = {
     "tcp_user_timeout": 25_000,
 }
 _SESSION_SETTINGS = """
-SET statement_timeout = '120s';
+SET statement_timeout = '120s'; SET search_path = gausslite;
 SET tcp_keepalives_idle = 10; SET tcp_keepalives_interval = 5; SET tcp_keepalives_count = 3;
 SELECT set_config('synchronous_commit', 'on', false) WHERE current_setting('synchronous_commit') = 'off';
 """

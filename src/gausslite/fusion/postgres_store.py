@@ -10,30 +10,17 @@ import itertools
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from threading import RLock
 from typing import Any, Protocol, runtime_checkable
 
 import psycopg
-from jaxtyping import Int64
-from numpy import ndarray
 
-from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError
-from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
 from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots, slots_of
-from gausslite.fusion.store import (
-    AgentTotals,
-    MissionConfig,
-    PutOutcome,
-    SessionRecord,
-    StoredScores,
-    VoxelScoreTable,
-    require_storable,
-)
+from gausslite.fusion.store import Execute, FusionStore
 from gausslite.fusion.store_migration import rows_of_voxels
-from gausslite.fusion.store_rows import SLOT_BITS, UpdateLog, data_checksum, read_batches, require_intact
+from gausslite.fusion.store_rows import SLOT_BITS, LogChange, data_checksum, require_intact
+from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import PROBE_RECORD, TRAFFIC_RECORD
 
 SCHEMA_VERSION = 3
@@ -87,7 +74,7 @@ class SlotHolder(Protocol):
         ...
 
 
-class PostgresStore:
+class PostgresStore(FusionStore):
     """A FusionStore in the schema `gausslite` of a database: one transaction per call.
 
     Without `owned`, for one server: an advisory lock, which ends with the connection, keeps other servers out. With
@@ -101,12 +88,13 @@ class PostgresStore:
     in use by another server, is damaged, or has another schema.
     """
 
+    _config_key = "number"
+
     def __init__(self, url: str, owned: OwnedSlots | None = None, holder: SlotHolder | None = None) -> None:
         """holder: of the locks of the `owned` slots."""
+        super().__init__(slots_of)
         self._name = database_name(url)
         self._owned, self._holder = owned, holder
-        self._write_lock, self._index_lock = RLock(), RLock()
-        self._log = UpdateLog(slots_of)
         # identify the content of the database: this opening, and the number of transactions since
         self._opening, self._commits = "", 0
         with ExitStack() as opened:
@@ -118,146 +106,18 @@ class PostgresStore:
             self._reader.run(self._load)
             self._opened = opened.pop_all()
 
-    @property
-    def incarnation_id(self) -> str:
-        """The id made with the tables, and the database's timeline when the store was opened."""
-        return self._incarnation_id
-
-    def put(self, subset: RoiSubset) -> PutOutcome:
-        """Store one message in one transaction. Raises InvalidInputError, StorageError."""
-        return self.put_all([StoredSubset.exact(subset)])[0]
-
-    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
-        """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
-        for update in updates:
-            require_storable(update)
-        with self._write_lock:
-            change = self._log.plan(updates, self._read_rows)
-            if change.rows:
-
-                def write(db: Database) -> None:
-                    for slot, numbers in _by_slot(change.deleted):
-                        db.execute(_DELETE, (slot, numbers))
-                    for slot, rows in itertools.groupby(sorted(change.rows), key=lambda row: row[0] >> SLOT_BITS):
-                        db.execute(_INSERT, (slot, *map(list, zip(*rows, strict=True))))
-
-                self._write(write)
-                with self._index_lock:
-                    self._log.apply(change)
-        return change.outcomes
-
-    def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
-
-        def delete(db: Database) -> None:
-            for slot, numbers in _by_slot(self._log.rows_of(agent_id)):
-                db.execute(_DELETE, (slot, numbers))
-            for table in ("keyframes", "records") if self._owned is None or self._owned.is_home(agent_id) else ():
-                db.execute(f"DELETE FROM gausslite.{table} WHERE agent_id = %s", (agent_id,))  # noqa: S608 - constants
-
-        with self._write_lock:
-            self._write(delete)
-            with self._index_lock:
-                return self._log.remove_agent(agent_id)
-
-    def agents(self) -> tuple[str, ...]:
-        """Return the ids of the agents with updates, sorted."""
-        return self._log.index.agents
-
-    def totals(self, agent_id: str) -> AgentTotals:
-        """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
-        with self._index_lock:
-            return self._log.index.totals(agent_id)
-
-    def digests(self, agent_id: str) -> TileDigests:
-        """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
-        with self._index_lock:
-            return self._log.index.digests(agent_id)
-
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
-        """Return the agent's totals on these voxels, in their order."""
-        with self._index_lock:
-            return self._log.index.stored(agent_id, keys)
-
-    def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
-        """Return all agents' totals on these voxels, or on all."""
-        with self._index_lock:
-            return self._log.index.scores(keys)
-
-    def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
-        """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        return read_batches(self._log, self._index_lock, self._read_rows, keys, (agent_id,))[agent_id]
-
-    def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
-        """Return the batch of every agent, all read at one instant."""
-        return read_batches(self._log, self._index_lock, self._read_rows, keys)
-
-    def mission_config(self) -> MissionConfig | None:
-        """Return the mission's configuration; None before an agent has joined."""
-        rows = self._read("SELECT mission_id, world_frame, voxel_size_m FROM gausslite.mission_config")
-        return MissionConfig(*rows[0]) if rows else None
-
-    def set_mission_config(self, mission_config: MissionConfig) -> None:
-        """Store the mission's configuration."""
-        values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
-        self._write_row("mission_config", "number", ("mission_id", "world_frame", "voxel_size_m"), (1, *values))
-
-    def sessions(self) -> tuple[SessionRecord, ...]:
-        """Return the open sessions, sorted by session id; with owned slots, of the agents whose home is here."""
-        rows = self._read("SELECT session_id, agent_id FROM gausslite.sessions")
-        sessions = (SessionRecord(*row) for row in rows if self._owned is None or self._owned.is_home(row[1]))
-        return tuple(sorted(sessions, key=lambda session: session.session_id))
-
     def find_session(self, session_id: str) -> SessionRecord | None:
         """Return the open session of this id, whoever opened it."""
-        query = "SELECT session_id, agent_id FROM gausslite.sessions WHERE session_id = %s"
+        query = "SELECT session_id, agent_id FROM sessions WHERE session_id = ?"
         return next((SessionRecord(*row) for row in self._read(query, (session_id,))), None)
-
-    def save_session(self, session: SessionRecord) -> None:
-        """Store a session; it replaces any other session of the same agent."""
-        self._write_row("sessions", "agent_id", ("session_id",), (session.agent_id, session.session_id))
-
-    def end_session(self, session_id: str) -> None:
-        """Delete a session, if it exists. The agent's updates stay."""
-        self._write(lambda db: db.execute("DELETE FROM gausslite.sessions WHERE session_id = %s", (session_id,)))
-
-    def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
-        """Store an encoded keyframe; it replaces the agent's one of this frame index."""
-        row = agent_id, index, data_checksum(agent_id, index, data), data
-        self._write_row("keyframes", "agent_id, frame_index", ("checksum", "data"), row)
-
-    def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
-        """Delete these keyframes of an agent, if they exist."""
-        query = "DELETE FROM gausslite.keyframes WHERE agent_id = %s AND frame_index = ANY(%s::bigint[])"
-        values = agent_id, list(indices)
-        self._write(lambda db: db.execute(query, values))
-
-    def keyframe_sizes(self) -> dict[str, dict[int, int]]:
-        """Return the number of bytes of each agent's keyframes by frame index."""
-        sizes: dict[str, dict[int, int]] = {}
-        query = "SELECT agent_id, frame_index, octet_length(data) FROM gausslite.keyframes"
-        for agent_id, index, size in self._read(query):
-            sizes.setdefault(agent_id, {})[index] = size
-        return sizes
-
-    def keyframe(self, agent_id: str, index: int) -> bytes:
-        """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT data, checksum FROM gausslite.keyframes WHERE agent_id = %s AND frame_index = %s"
-        for data, checksum in self._read(query, (agent_id, index)):
-            if data_checksum(agent_id, index, data) != checksum:
-                raise self._damaged(f"keyframe {index} of agent {agent_id!r}")
-            return bytes(data)
-        return b""
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
         """Store a named record of an agent; it replaces the earlier one."""
-        agent_id = self._record_owner(agent_id, name)
-        row = name, agent_id, data_checksum(agent_id, name, data), data
-        self._write_row("records", "name, agent_id", ("checksum", "data"), row)
+        super().save_record(self._record_owner(agent_id, name), name, data)
 
     def find_record(self, agent_id: str, name: str) -> bytes:
         """Return a named record of an agent; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT data, checksum FROM gausslite.records WHERE name = %s AND agent_id = %s"
+        query = "SELECT data, checksum FROM records WHERE name = ? AND agent_id = ?"
         for data, checksum in self._read(query, (name, agent_id)):
             if data_checksum(agent_id, name, data) != checksum:
                 raise self._damaged(f"record {name!r} of agent {agent_id!r}")
@@ -265,15 +125,9 @@ class PostgresStore:
         return b""
 
     def records(self, name: str) -> dict[str, bytes]:
-        """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
-        rows = self._read("SELECT agent_id, data, checksum FROM gausslite.records WHERE name = %s", (name,))
-        for agent_id, data, checksum in rows:
-            if data_checksum(agent_id, name, data) != checksum:
-                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
-        found, own = {agent_id: data for agent_id, data, _ in rows}, self._record_owner("", name)
-        if own:
-            found = {"": found[own]} if own in found else {}
-        return found
+        """Return the record of this name of every agent that has one; a server's figures are its own."""
+        found, own = super().records(name), self._record_owner("", name)
+        return found if not own else {"": found[own]} if own in found else {}
 
     def close(self) -> None:
         """Close the own connections; without owned slots, this frees the database for another server."""
@@ -329,9 +183,28 @@ class PostgresStore:
         return _damaged(self._name, what)
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        return self._reader.run(lambda db: db.execute(query, values, binary=True).fetchall())
+        return self._reader.run(lambda db: db.execute(_translated(query), values, binary=True).fetchall())
 
-    def _write(self, work: Callable[[Database], object]) -> None:
+    def _is_home(self, agent_id: str) -> bool:
+        return self._owned is None or self._owned.is_home(agent_id)
+
+    def _write_change(self, change: LogChange) -> None:
+        def write(db: Database) -> None:
+            for slot, numbers in _by_slot(change.deleted):
+                db.execute(_DELETE, (slot, numbers))
+            for slot, rows in itertools.groupby(sorted(change.rows), key=lambda row: row[0] >> SLOT_BITS):
+                db.execute(_INSERT, (slot, *map(list, zip(*rows, strict=True))))
+
+        self._commit(write)
+
+    def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
+        for slot, own in _by_slot(numbers):
+            execute(_DELETE, (slot, own))
+
+    def _write(self, work: Callable[[Execute], object]) -> None:
+        self._commit(lambda db: work(lambda query, values: db.execute(_translated(query), values)))
+
+    def _commit(self, work: Callable[[Database], object]) -> None:
         """Do the work in one transaction, without waiting for the answer to each statement. Raises StorageError."""
         if self._holder is not None:
             self._holder.write(work)
@@ -346,14 +219,9 @@ class PostgresStore:
         with self._write_lock:
             self._writer.run(commit)
 
-    def _write_row(self, table: str, key: str, columns: Sequence[str], row: tuple[Any, ...]) -> None:
-        """Insert a row, or replace the columns of the one with its key."""
-        places, newer = ", ".join(["%s"] * len(row)), ", ".join(f"{name} = excluded.{name}" for name in columns)
-        query = f"""
-            INSERT INTO gausslite.{table} ({key}, {", ".join(columns)}) VALUES ({places})
-            ON CONFLICT ({key}) DO UPDATE SET {newer}
-        """  # noqa: S608 - the names are constants
-        self._write(lambda db: db.execute(query, row))
+
+def _translated(query: str) -> bytes:
+    return query.replace("?", "%s").encode()
 
 
 def _position(opening: str, commits: int) -> str:

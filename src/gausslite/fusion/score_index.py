@@ -21,7 +21,7 @@ from gausslite.codec.stored import RECORD, to_records
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch
-from gausslite.fusion.store import AgentTotals, StoredScores, VoxelScoreTable
+from gausslite.fusion.store_values import AgentTotals, StoredScores, VoxelScoreTable
 
 _FIRST_CAPACITY = 64
 _DTYPES = (np.int64, np.int64, np.uint64, np.uint32, np.int64)

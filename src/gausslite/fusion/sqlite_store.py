@@ -4,38 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import json
 import logging
 import os
 import secrets
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import RLock
 from typing import Any
 
-from jaxtyping import Int64
-from numpy import ndarray
-
-from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError
-from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import RoiSubset, VoxelBatch
-from gausslite.fusion.store import (
-    AgentTotals,
-    MissionConfig,
-    PutOutcome,
-    SessionRecord,
-    StoredScores,
-    VoxelScoreTable,
-    require_storable,
-)
+from gausslite.fusion.store import Execute, FusionStore
 from gausslite.fusion.store_migration import rows_of_voxels
-from gausslite.fusion.store_rows import UpdateLog, data_checksum, read_batches, require_intact
+from gausslite.fusion.store_rows import LogChange, require_intact
 
 _log = logging.getLogger(__name__)
+IN_MEMORY = Path(":memory:")
+"""Of a store that ends with its process."""
 SCHEMA_VERSION = 7
 _VOXEL_ROWS_VERSION = 6
 """Had one row a voxel; such a store is converted when a server opens it."""
@@ -147,16 +134,29 @@ def open_or_create(path: Path) -> sqlite3.Connection:
     return db
 
 
+def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
+    if path != IN_MEMORY:
+        opened.callback(StoreLock(path).release)
+        return open_or_create(path)
+    db = connect(path)
+    _create_tables(db)
+    return db
+
+
+def _create_tables(db: sqlite3.Connection) -> None:
+    header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
+    db.executescript(f"BEGIN IMMEDIATE; {header} {_UPDATES_SCHEMA} {_SCHEMA} COMMIT;")
+    renew_incarnation(db)
+
+
 def _create(path: Path) -> None:
     """Create an empty store, at once: a server that is killed meanwhile leaves no file under this name."""
     # the file behind a symbolic link, which may not exist yet
     path = path.resolve()
     new = path.with_name(path.name + "-new")
     new.unlink(missing_ok=True)
-    header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
     with contextlib.closing(connect(new)) as db, storage_errors(path):
-        db.executescript(f"BEGIN IMMEDIATE; {header} {_UPDATES_SCHEMA} {_SCHEMA} COMMIT;")
-        renew_incarnation(db)
+        _create_tables(db)
     new.replace(path)
 
 
@@ -221,7 +221,7 @@ SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM voxel_updates"
 _SELECT_ROWS = f"{SELECT_UPDATES} WHERE number IN (SELECT value FROM json_each(?))"  # noqa: S608
 
 
-class SqliteStore:
+class SqliteStore(FusionStore):
     """A FusionStore in a file: write-ahead log, synchronous=FULL, one transaction per call, one server at a time.
 
     The totals of all updates are in memory (ScoreIndex). Reads use a second connection and so do not wait for a commit.
@@ -230,155 +230,23 @@ class SqliteStore:
     has another schema.
     """
 
+    _config_key = "only"
+
     def __init__(self, path: Path, max_bytes: int | None = None) -> None:
-        self._path = path
-        self._write_lock, self._read_lock, self._index_lock = RLock(), RLock(), RLock()
-        self._log = UpdateLog()
+        super().__init__()
+        self._path, self._read_lock = path, RLock()
         with ExitStack() as opened:
-            lock = StoreLock(path)
-            opened.callback(lock.release)
-            self._writer = open_or_create(path)
-            opened.callback(self._writer.close)
-            self._reader = connect(path)
-            opened.callback(self._reader.close)
+            self._writer = self._reader = opened.enter_context(contextlib.closing(_open(path, opened)))
+            if path == IN_MEMORY:
+                # both use one connection
+                self._read_lock = self._write_lock
+            else:
+                self._reader = opened.enter_context(contextlib.closing(connect(path)))
             if max_bytes is not None:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
             self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
             self._opened = opened.pop_all()
-
-    @property
-    def incarnation_id(self) -> str:
-        """The id made with the file, by a restore or by a repair."""
-        return self._incarnation_id
-
-    def put(self, subset: RoiSubset) -> PutOutcome:
-        """Store one message in one transaction. Raises InvalidInputError, StorageError."""
-        return self.put_all([StoredSubset.exact(subset)])[0]
-
-    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
-        """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
-        for update in updates:
-            require_storable(update)
-        with self._write_lock:
-            change = self._log.plan(updates, self._read_rows)
-            if change.rows:
-                with self._transaction() as db:
-                    db.executemany(_DELETE, ((number,) for number in change.deleted))
-                    db.executemany(_INSERT, change.rows)
-                with self._index_lock:
-                    self._log.apply(change)
-        return change.outcomes
-
-    def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
-        with self._write_lock:
-            with self._transaction() as db:
-                db.executemany(_DELETE, ((number,) for number in self._log.rows_of(agent_id)))
-                for table in ("keyframes", "records"):
-                    db.execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - constant names
-            with self._index_lock:
-                return self._log.remove_agent(agent_id)
-
-    def agents(self) -> tuple[str, ...]:
-        """Return the ids of the agents with updates, sorted."""
-        return self._log.index.agents
-
-    def totals(self, agent_id: str) -> AgentTotals:
-        """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
-        with self._index_lock:
-            return self._log.index.totals(agent_id)
-
-    def digests(self, agent_id: str) -> TileDigests:
-        """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
-        with self._index_lock:
-            return self._log.index.digests(agent_id)
-
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
-        """Return the agent's totals on these voxels, in their order."""
-        with self._index_lock:
-            return self._log.index.stored(agent_id, keys)
-
-    def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
-        """Return all agents' totals on these voxels, or on all."""
-        with self._index_lock:
-            return self._log.index.scores(keys)
-
-    def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
-        """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        return read_batches(self._log, self._index_lock, self._read_rows, keys, (agent_id,))[agent_id]
-
-    def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
-        """Return the batch of every agent, all read at one instant."""
-        return read_batches(self._log, self._index_lock, self._read_rows, keys)
-
-    def mission_config(self) -> MissionConfig | None:
-        """Return the mission's configuration; None before an agent has joined."""
-        rows = self._read("SELECT mission_id, world_frame, voxel_size_m FROM mission_config")
-        return MissionConfig(*rows[0]) if rows else None
-
-    def set_mission_config(self, mission_config: MissionConfig) -> None:
-        """Store the mission's configuration."""
-        values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
-        with self._transaction() as db:
-            db.execute("INSERT OR REPLACE INTO mission_config VALUES (1, ?, ?, ?)", values)
-
-    def sessions(self) -> tuple[SessionRecord, ...]:
-        """Return all open sessions, sorted by session id."""
-        rows = self._read("SELECT session_id, agent_id FROM sessions")
-        return tuple(sorted((SessionRecord(*row) for row in rows), key=lambda session: session.session_id))
-
-    def save_session(self, session: SessionRecord) -> None:
-        """Store a session; it replaces any other session of the same agent."""
-        with self._transaction() as db:
-            db.execute("INSERT OR REPLACE INTO sessions VALUES (?, ?)", (session.session_id, session.agent_id))
-
-    def end_session(self, session_id: str) -> None:
-        """Delete a session, if it exists. The agent's updates stay."""
-        with self._transaction() as db:
-            db.execute("DELETE FROM sessions WHERE session_id = ?", (session_id,))
-
-    def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
-        """Store an encoded keyframe; it replaces the agent's one of this frame index."""
-        row = agent_id, index, data_checksum(agent_id, index, data), data
-        with self._transaction() as db:
-            db.execute("INSERT OR REPLACE INTO keyframes VALUES (?, ?, ?, ?)", row)
-
-    def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
-        """Delete these keyframes of an agent, if they exist."""
-        with self._transaction() as db:
-            rows = ((agent_id, index) for index in indices)
-            db.executemany("DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?", rows)
-
-    def keyframe_sizes(self) -> dict[str, dict[int, int]]:
-        """Return the number of bytes of each agent's keyframes by frame index."""
-        sizes: dict[str, dict[int, int]] = {}
-        for agent_id, index, size in self._read("SELECT agent_id, frame_index, length(data) FROM keyframes"):
-            sizes.setdefault(agent_id, {})[index] = size
-        return sizes
-
-    def keyframe(self, agent_id: str, index: int) -> bytes:
-        """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ?"
-        for data, checksum in self._read(query, (agent_id, index)):
-            if data_checksum(agent_id, index, data) != checksum:
-                raise _damaged(self._path, f"keyframe {index} of agent {agent_id!r}")
-            return bytes(data)
-        return b""
-
-    def save_record(self, agent_id: str, name: str, data: bytes) -> None:
-        """Store a named record of an agent; it replaces the earlier one."""
-        row = name, agent_id, data_checksum(agent_id, name, data), data
-        with self._transaction() as db:
-            db.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?)", row)
-
-    def records(self, name: str) -> dict[str, bytes]:
-        """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
-        rows = self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,))
-        for agent_id, data, checksum in rows:
-            if data_checksum(agent_id, name, data) != checksum:
-                raise _damaged(self._path, f"record {name!r} of agent {agent_id!r}")
-        return {agent_id: data for agent_id, data, _ in rows}
 
     def close(self) -> None:
         """Write the log into the file and close it."""
@@ -392,11 +260,27 @@ class SqliteStore:
             if check != "ok":
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
             rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
-            self._log.load(require_intact(rows, functools.partial(_damaged, self._path)))
+            self._log.load(require_intact(rows, self._damaged))
 
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         rows = self._read(_SELECT_ROWS, (json.dumps(numbers),))
-        return {row[0]: row[3] for row in require_intact(rows, functools.partial(_damaged, self._path))}
+        return {row[0]: row[3] for row in require_intact(rows, self._damaged)}
+
+    def _damaged(self, what: str) -> StorageError:
+        return _damaged(self._path, what)
+
+    def _write_change(self, change: LogChange) -> None:
+        with self._transaction() as db:
+            db.executemany(_DELETE, ((number,) for number in change.deleted))
+            db.executemany(_INSERT, change.rows)
+
+    def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
+        for number in numbers:
+            execute(_DELETE, (number,))
+
+    def _write(self, work: Callable[[Execute], object]) -> None:
+        with self._transaction() as db:
+            work(db.execute)
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._read_lock, storage_errors(self._path):

@@ -8,261 +8,224 @@ still arrive.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from threading import RLock
+from typing import Any
 
 import numpy as np
-from jaxtyping import Int32, Int64, UInt32, UInt64
+from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.checks import quote_name, require_identifier, require_name
-from gausslite.domain.errors import InvalidInputError, MismatchError
+from gausslite.domain.errors import StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
+from gausslite.fusion.store_rows import LogChange, SlotsOf, UpdateLog, data_checksum, read_batches
+from gausslite.fusion.store_values import (
+    AgentTotals,
+    MissionConfig,
+    PutOutcome,
+    SessionRecord,
+    StoredScores,
+    VoxelScoreTable,
+    require_storable,
+)
 
-_DEFAULT_MISSION_ID, _DEFAULT_WORLD_FRAME = "mission", "world"
-
-
-@dataclass(frozen=True, slots=True)
-class MissionConfig:
-    """Common to all voxel updates of one store; the first agent that joins fixes it. Names may be empty until then."""
-
-    mission_id: str
-    world_frame: str
-    voxel_size_m: float
-
-    def with_default_names(self) -> MissionConfig:
-        """Return the configuration with "mission" and "world" in place of empty names."""
-        mission_id, world_frame = self.mission_id or _DEFAULT_MISSION_ID, self.world_frame or _DEFAULT_WORLD_FRAME
-        return MissionConfig(mission_id, world_frame, self.voxel_size_m)
-
-    @property
-    def given_world_frame(self) -> str:
-        """The world frame's name; empty if it is the default, because maps of different frames share that name."""
-        return "" if self.world_frame == _DEFAULT_WORLD_FRAME else self.world_frame
+Execute = Callable[[str, tuple[Any, ...]], object]
+"""Executes a statement, with ? for each value, in the transaction that is open."""
 
 
-def reconcile(own: MissionConfig, requested: MissionConfig) -> MissionConfig:
-    """Return the configuration that satisfies both sides; an empty name accepts the other side's.
-
-    Raises InvalidInputError if a requested name is not permitted, MismatchError if the sides differ.
-    """
-    if requested.mission_id:
-        require_identifier("mission_id", requested.mission_id)
-    require_name("world_frame", requested.world_frame)
-    if requested.voxel_size_m != own.voxel_size_m:
-        raise MismatchError(
-            f"voxel size: this mission votes on {own.voxel_size_m:g} m, got {requested.voxel_size_m:g} m"
-        )
-    for field, expected, received in (
-        ("world frame", own.world_frame, requested.world_frame),
-        ("mission", own.mission_id, requested.mission_id),
-    ):
-        if expected and received and expected != received:
-            raise MismatchError(f"{field}: expected {quote_name(expected)} as agreed here, got {quote_name(received)}")
-    return MissionConfig(
-        own.mission_id or requested.mission_id, own.world_frame or requested.world_frame, own.voxel_size_m
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class SessionRecord:
-    """An agent's permission to contribute, from joining until it leaves or joins again."""
-
-    session_id: str
-    agent_id: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PutOutcome:
-    """The voxels of a message that were stored, and those that were stale; keys in ascending order."""
-
-    accepted: Int64[ndarray, " a"]
-    stale: Int64[ndarray, " s"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VoxelScoreTable:
-    """The totals of every update (tombstones included) without the Gaussians: the input of the vote.
-
-    agent_index holds indices into `agents`, which is sorted; rows are sorted by (agent, key).
-    """
-
-    agents: tuple[str, ...]
-    agent_index: Int32[ndarray, " w"]
-    keys: Int64[ndarray, " w"]
-    update_seqs: Int64[ndarray, " w"]
-    kappa_sums: UInt64[ndarray, " w"]
-    counts: UInt32[ndarray, " w"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredScores:
-    """The totals of an agent's updates of some voxels, and the store's row of each; -1 where it has no update."""
-
-    update_seqs: Int64[ndarray, " k"]
-    kappa_sums: UInt64[ndarray, " k"]
-    counts: UInt32[ndarray, " k"]
-    rows: Int64[ndarray, " k"]
-
-    @classmethod
-    def missing(cls, voxels: int) -> StoredScores:
-        """Return the totals of an agent without updates."""
-        none = np.full(voxels, -1, np.int64)
-        return cls(none, np.zeros(voxels, np.uint64), np.zeros(voxels, np.uint32), none)
-
-
-@dataclass(frozen=True, slots=True)
-class AgentTotals:
-    """Sums over an agent's updates: voxels with and without tombstones, Gaussians, Σkappa; the highest update_seq."""
-
-    voxels: int = 0
-    occupied_voxels: int = 0
-    gaussians: int = 0
-    kappa_sum: int = 0
-    highest_update_seq: int = 0
-
-    def replace_part(self, removed: StoredScores, added: StoredScores) -> AgentTotals:
-        """Return the totals after `added` replaced `removed`."""
-        return AgentTotals(
-            self.voxels + len(added.counts) - int(np.count_nonzero(removed.update_seqs >= 0)),
-            self.occupied_voxels + int(np.count_nonzero(added.counts)) - int(np.count_nonzero(removed.counts)),
-            self.gaussians + int(added.counts.sum(dtype=np.int64)) - int(removed.counts.sum(dtype=np.int64)),
-            self.kappa_sum + _exact_sum(added.kappa_sums) - _exact_sum(removed.kappa_sums),
-            max(self.highest_update_seq, int(added.update_seqs.max(initial=0))),
-        )
-
-
-def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
-    """Return a sum that cannot wrap around."""
-    return sum(values.tolist())
-
-
-@runtime_checkable
-class FusionStore(Protocol):
-    """Owns the voxel updates, the mission's configuration and the sessions. Thread-safe.
+class FusionStore(ABC):
+    """Owns the voxel updates, the mission's configuration and the sessions. Thread-safe. Its rows are in a database.
 
     incarnation_id changes when the content may be older than what was acknowledged: with a new store, after a restore
-    and after a repair. Then the agents compare digests and send what is missing.
+    and after a repair. Then the agents compare digests and send what is missing. The totals of all updates are in
+    memory (ScoreIndex).
 
     When a method of a durable store has returned, its effect survives a crash. All methods raise StorageError if the
-    storage refuses; the store stays usable for other calls.
+    storage refuses; the store stays usable for other calls. Statements here are those that SQLite and PostgreSQL have
+    in common.
     """
+
+    _config_key: str
+    """The column of mission_config that has the value 1 in its only row."""
+
+    def __init__(self, slots_of: SlotsOf = np.zeros_like) -> None:
+        self._write_lock, self._index_lock = RLock(), RLock()
+        self._log = UpdateLog(slots_of)
+        self._incarnation_id = ""
 
     @property
     def incarnation_id(self) -> str:
         """The id of this content; see the class."""
-        ...
+        return self._incarnation_id
 
     def put(self, subset: RoiSubset) -> PutOutcome:
-        """Store one message completely, or nothing of it on an error. Raises InvalidInputError."""
-        ...
+        """Store one message in one transaction. Raises InvalidInputError, StorageError."""
+        return self.put_all([StoredSubset.exact(subset)])[0]
 
     def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
-        """Store messages of different agents in one transaction: all, or none on an error. Raises InvalidInputError."""
-        ...
+        """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
+        for update in updates:
+            require_storable(update)
+        with self._write_lock:
+            change = self._log.plan(updates, self._read_rows)
+            if change.rows:
+                self._write_change(change)
+                with self._index_lock:
+                    self._log.apply(change)
+        return change.outcomes
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Delete an agent's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
-        ...
+
+        def delete(execute: Execute) -> None:
+            self._delete_rows(execute, self._log.rows_of(agent_id))
+            for table in ("keyframes", "records") if self._is_home(agent_id) else ():
+                execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - constant names
+
+        with self._write_lock:
+            self._write(delete)
+            with self._index_lock:
+                return self._log.remove_agent(agent_id)
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
-        ...
+        return self._log.index.agents
 
     def totals(self, agent_id: str) -> AgentTotals:
         """Return the sums over an agent's updates, in constant time; zero for an unknown agent."""
-        ...
+        with self._index_lock:
+            return self._log.index.totals(agent_id)
 
     def digests(self, agent_id: str) -> TileDigests:
         """Return the digests of an agent's updates (with tombstones); empty for an unknown agent."""
-        ...
+        with self._index_lock:
+            return self._log.index.digests(agent_id)
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
         """Return the agent's totals on these voxels, in their order."""
-        ...
+        with self._index_lock:
+            return self._log.index.stored(agent_id, keys)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
-        ...
+        with self._index_lock:
+            return self._log.index.scores(keys)
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        ...
+        return read_batches(self._log, self._index_lock, self._read_rows, keys, (agent_id,))[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
-        ...
+        return read_batches(self._log, self._index_lock, self._read_rows, keys)
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
-        ...
+        rows = self._read("SELECT mission_id, world_frame, voxel_size_m FROM mission_config")
+        return MissionConfig(*rows[0]) if rows else None
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
         """Store the mission's configuration."""
-        ...
+        values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
+        columns = "mission_id", "world_frame", "voxel_size_m"
+        self._write_row("mission_config", (self._config_key,), columns, (1, *values))
 
     def sessions(self) -> tuple[SessionRecord, ...]:
-        """Return all open sessions, sorted by session id."""
-        ...
+        """Return the open sessions of the agents whose home is here, sorted by session id."""
+        rows = self._read("SELECT session_id, agent_id FROM sessions")
+        return tuple(SessionRecord(*row) for row in sorted(rows) if self._is_home(row[1]))
 
     def save_session(self, session: SessionRecord) -> None:
         """Store a session; it replaces any other session of the same agent."""
-        ...
+        self._write_row("sessions", ("agent_id",), ("session_id",), (session.agent_id, session.session_id))
 
     def end_session(self, session_id: str) -> None:
         """Delete a session, if it exists. The agent's updates stay."""
-        ...
+        self._write(lambda execute: execute("DELETE FROM sessions WHERE session_id = ?", (session_id,)))
 
     def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
         """Store an encoded keyframe; it replaces the agent's one of this frame index."""
-        ...
+        row = agent_id, index, data_checksum(agent_id, index, data), data
+        self._write_row("keyframes", ("agent_id", "frame_index"), ("checksum", "data"), row)
 
     def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
         """Delete these keyframes of an agent, if they exist."""
-        ...
+
+        def delete(execute: Execute) -> None:
+            for index in indices:
+                execute("DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?", (agent_id, index))
+
+        self._write(delete)
 
     def keyframe_sizes(self) -> dict[str, dict[int, int]]:
         """Return the number of bytes of each agent's keyframes by frame index."""
-        ...
+        sizes: dict[str, dict[int, int]] = {}
+        for agent_id, index, size in self._read("SELECT agent_id, frame_index, length(data) FROM keyframes"):
+            sizes.setdefault(agent_id, {})[index] = size
+        return sizes
 
     def keyframe(self, agent_id: str, index: int) -> bytes:
-        """Return an encoded keyframe; empty if it does not exist."""
-        ...
+        """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
+        query = "SELECT data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ?"
+        for data, checksum in self._read(query, (agent_id, index)):
+            if data_checksum(agent_id, index, data) != checksum:
+                raise self._damaged(f"keyframe {index} of agent {agent_id!r}")
+            return bytes(data)
+        return b""
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
-        """Store a named record of an agent, such as its objects; it replaces the earlier one."""
-        ...
+        """Store a named record of an agent; it replaces the earlier one."""
+        row = name, agent_id, data_checksum(agent_id, name, data), data
+        self._write_row("records", ("name", "agent_id"), ("checksum", "data"), row)
 
     def records(self, name: str) -> dict[str, bytes]:
-        """Return the record of this name of every agent that has one."""
-        ...
+        """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
+        rows = self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,))
+        for agent_id, data, checksum in rows:
+            if data_checksum(agent_id, name, data) != checksum:
+                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
+        return {agent_id: data for agent_id, data, _ in rows}
 
+    @abstractmethod
     def close(self) -> None:
-        """Close the files; no other method may be called afterwards."""
-        ...
+        """Close the connections; no other method may be called afterwards."""
 
+    def _is_home(self, agent_id: str) -> bool:  # noqa: ARG002 - a store of one server has all
+        """Return whether this store has what is known of the agent beside its voxels."""
+        return True
 
-@runtime_checkable
-class SharedRows(Protocol):
-    """What several servers of one store know of an agent, whichever of them wrote it."""
+    @abstractmethod
+    def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        """Return the rows of a query, with ? for each value. Raises StorageError."""
 
-    def find_session(self, session_id: str) -> SessionRecord | None:
-        """Return the open session of this id. Raises StorageError."""
-        ...
+    @abstractmethod
+    def _write(self, work: Callable[[Execute], object]) -> None:
+        """Do the work in one transaction. Raises StorageError."""
 
-    def find_record(self, agent_id: str, name: str) -> bytes:
-        """Return a named record of an agent; empty if it does not exist. Raises StorageError."""
-        ...
+    @abstractmethod
+    def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
+        """Return the voxels of those of these rows that exist. Raises StorageError, also for damaged ones."""
 
+    @abstractmethod
+    def _write_change(self, change: LogChange) -> None:
+        """Delete and insert rows of updates in one transaction. Raises StorageError."""
 
-def require_storable(update: StoredSubset) -> None:
-    """Raise InvalidInputError if a number of the message does not fit the store's signed 64-bit columns."""
-    largest_sum = int(update.voxels.voxels["kappa_sums"].max(initial=0))
-    limit = int(np.iinfo(np.int64).max)
-    numbers = (("update_seq", update.update_seq), ("message_seq", update.message_seq), ("kappa_sum", largest_sum))
-    for name, value in numbers:
-        if value > limit:
-            raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")
+    @abstractmethod
+    def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
+        """Delete rows of updates."""
+
+    @abstractmethod
+    def _damaged(self, what: str) -> StorageError:
+        """Return the error of damaged content."""
+
+    def _write_row(self, table: str, key: Sequence[str], columns: Sequence[str], row: tuple[Any, ...]) -> None:
+        """Insert a row, or replace the columns of the one with its key."""
+        names, places = ", ".join((*key, *columns)), ", ".join(["?"] * len(row))
+        newer = ", ".join(f"{name} = excluded.{name}" for name in columns)
+        query = f"""
+            INSERT INTO {table} ({names}) VALUES ({places}) ON CONFLICT ({", ".join(key)}) DO UPDATE SET {newer}
+        """  # noqa: S608 - the names are constants
+        self._write(lambda execute: execute(query, row))

@@ -25,7 +25,7 @@ from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels, join_eleme
 from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels
-from gausslite.fusion.store import PutOutcome, StoredScores
+from gausslite.fusion.store_values import PutOutcome, StoredScores
 
 UpdateRow = tuple[int, str, int, bytes]
 """number, agent_id, checksum, voxels."""

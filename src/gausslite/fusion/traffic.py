@@ -14,7 +14,8 @@ from threading import Lock
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, StorageError, UnavailableError
 from gausslite.fusion.frames import FrameAlignment
-from gausslite.fusion.store import FusionStore, MissionConfig, PutOutcome
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import MissionConfig, PutOutcome
 
 _PROBE_BYTES = 256 << 10
 # no agent can have an empty id

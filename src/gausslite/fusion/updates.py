@@ -29,7 +29,8 @@ from gausslite.domain.errors import (
 )
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import Quotas
-from gausslite.fusion.store import FusionStore, PutOutcome, SharedRows
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import PutOutcome, SharedRows
 
 MAX_SEQ_STEP = 1 << 32
 """An honest agent counts its messages; a larger step would let one message use up all later numbers."""

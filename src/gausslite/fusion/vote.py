@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelScore, VoxelVotes, gather_rows, group_by_voxel
-from gausslite.fusion.store import VoxelScoreTable
+from gausslite.fusion.store_values import VoxelScoreTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,8 @@ from gausslite.domain.voxels import (
     select_voxels,
 )
 from gausslite.fusion.frames import FrameAlignments
-from gausslite.fusion.store import FusionStore, VoxelScoreTable
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import VoxelScoreTable
 
 SLICE_VOXELS = 128
 _Cells = dict[int, tuple[int, int]]

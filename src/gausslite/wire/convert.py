@@ -362,8 +362,8 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     )
 
 
-def message_values(message: Message) -> dict[str, Any]:
-    """Return a message as JSON has it: 64-bit integers are texts, and messages without content are absent."""
+def message_to_values(message: Message) -> dict[str, Any]:
+    """Return the fields by name, as in protobuf's JSON: 64-bit integers are texts, messages without content absent."""
     values: dict[str, Any] = MessageToDict(
         message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
     )

@@ -17,7 +17,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import MissionConfig, PutOutcome
+from gausslite.fusion.store_values import MissionConfig, PutOutcome
 from gausslite_bench.server.synthetic_updates import DELTA_VOXELS, GRID, delta_messages, voxels_batch
 
 _AGENTS = 8

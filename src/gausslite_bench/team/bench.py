@@ -18,7 +18,7 @@ from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineSettings, refine
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store_values import MissionConfig
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.render.choose import choose_rasterizer

@@ -15,7 +15,7 @@ from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.vote import FusedMap, fuse, rank_voxels
 
 GRID = VoxelGrid(0.10)

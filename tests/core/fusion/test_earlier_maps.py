@@ -17,7 +17,8 @@ from gausslite.fusion.frames import AlignmentSettings, AlignmentState
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore, MissionConfig
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import MissionConfig
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
 EARLIER = "ant:earlier"

@@ -31,7 +31,8 @@ from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore, MissionConfig
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import MissionConfig
 
 GRID = VoxelGrid(0.10)
 ANYTHING = MissionConfig("", "", 0.10)

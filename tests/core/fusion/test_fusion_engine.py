@@ -11,7 +11,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.store import MissionConfig, reconcile
+from gausslite.fusion.store_values import MissionConfig, reconcile
 from gausslite.fusion.traffic import TrafficCounters
 
 GRID = VoxelGrid(0.10)

@@ -25,7 +25,8 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, select_keys
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
-from gausslite.fusion.store import AgentTotals, FusionStore, MissionConfig, SessionRecord
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import AgentTotals, MissionConfig, SessionRecord
 
 KEYS = (11, 22, 33)
 

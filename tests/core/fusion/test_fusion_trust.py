@@ -29,7 +29,8 @@ from gausslite.fusion.membership import SessionRegistry
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore, MissionConfig
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.updates import MAX_SEQ_STEP, UpdateChecks
 
 ANYTHING = MissionConfig("", "", GRID.size_m)

@@ -20,7 +20,7 @@ from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import MissionConfig, VoxelScoreTable
+from gausslite.fusion.store_values import MissionConfig, VoxelScoreTable
 from gausslite.fusion.traffic import TrafficCounters, TrafficLog
 
 ANYTHING = MissionConfig("", "", GRID.size_m)

@@ -21,7 +21,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.objects import MAX_COMPARISONS, MergedObjects, find_objects, group_boxes, merge_objects
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store_values import MissionConfig
 
 GRAPH = TaskGraph("t", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),))
 ANYTHING = MissionConfig("", "", 0.10)

@@ -25,7 +25,8 @@ from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore, MissionConfig
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.unknown_frames import FrameSearch, find_frame, keyframe_samples
 
 pytest.importorskip("kiss_matcher")

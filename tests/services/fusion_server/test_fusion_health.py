@@ -22,7 +22,7 @@ from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.fusion import traffic
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import PutOutcome
+from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.traffic import Acknowledgements, StorageProbe
 from gausslite.wire import server
 from gausslite.wire.clients import FusionClient

@@ -14,7 +14,7 @@ from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.traffic import TrafficCounters
 
 pytest.importorskip("prometheus_client", reason="the extra metrics is not installed")

@@ -22,7 +22,7 @@ from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import MapRenderer
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store_values import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message

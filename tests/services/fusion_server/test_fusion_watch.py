@@ -16,7 +16,7 @@ from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineSettings
-from gausslite.fusion.store import MissionConfig
+from gausslite.fusion.store_values import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock
