@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from fusion_running import GRID, make_subset
+from support.postgres_running import PostgresServer
 
 from gausslite.cli.main import main
 from gausslite.codec.subset_codec import decode_subset, encode_subset
@@ -29,6 +30,20 @@ def test_nothing_acknowledged_is_lost_in_a_short_run(capsys: pytest.CaptureFixtu
     assert result["same_map"]
     assert result["same_watch"]
     assert 0 < result["fused_voxels"] <= result["voxels"]
+
+
+def test_servers_that_share_a_database_lose_nothing_in_a_short_run(
+    capsys: pytest.CaptureFixture[str], postgres: PostgresServer
+) -> None:
+    # the faults of this seed: a kill of a server, one of an agent, a partition between the servers
+    options = ["--servers", "2", "--kills", "3", "--agents", "2", "--seed", "1", "--json"]
+    assert main(["bench", "chaos", "--store", postgres.new_database(), *options]) == 0
+    result = json.loads(capsys.readouterr().out)
+    faults = result["faults"]
+    assert (faults["server kills"], faults["agent kills"], faults["partitions between servers"]) == (1, 1, 1)
+    assert result["comparisons"] == 2
+    assert (result["lost"], result["wrong"], result["extra_at_end"], result["server_errors"]) == (0, 0, 0, 0)
+    assert result["same_map"]
 
 
 def acknowledged_by(journal: Path, *messages: bytes) -> AgentAcknowledgements:

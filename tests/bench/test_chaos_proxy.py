@@ -32,7 +32,7 @@ def proxy(tmp_path: Path) -> Iterator[FaultProxy]:
         listener.bind(str(tmp_path / "echo"))
         listener.listen()
         threading.Thread(target=echo, args=(listener,), daemon=True).start()
-        faulty = FaultProxy(tmp_path, tmp_path / "echo", ["ant", "bee"])
+        faulty = FaultProxy(tmp_path, dict.fromkeys(["ant", "bee"], tmp_path / "echo"))
         yield faulty
         faulty.close()
         listener.shutdown(socket.SHUT_RDWR)

@@ -17,6 +17,7 @@ from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records
 from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import FusedMap, fuse
 from gausslite_bench.chaos.journal import JournalReader, RecordKind
 
@@ -115,7 +116,12 @@ def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> S
             if path.exists():
                 shutil.copy(path, folder)
         with closing(SqliteStore(Path(folder) / store.name)) as opened:
-            results = [_compare_agent(agent_id, agent, opened) for agent_id, agent in agents.items()]
+            return compare_opened(agents, opened)
+
+
+def compare_opened(agents: Mapping[str, AgentAcknowledgements], store: FusionStore) -> StoreComparison:
+    """Compare an open store with what was acknowledged before it was opened."""
+    results = [_compare_agent(agent_id, agent, store) for agent_id, agent in agents.items()]
     return StoreComparison(
         sum(result.voxels for result in results),
         sum(result.lost for result in results),
@@ -124,7 +130,7 @@ def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> S
     )
 
 
-def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: SqliteStore) -> StoreComparison:
+def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: FusionStore) -> StoreComparison:
     batch = store.batch(agent_id)
     seqs = store.stored(agent_id, batch.keys).update_seqs.tolist()
     held = {

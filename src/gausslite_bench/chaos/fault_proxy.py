@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -62,10 +62,11 @@ class _Link:
 
 
 class FaultProxy:
-    """Owns one listening socket per agent, and a thread. The methods are thread-safe."""
+    """Owns one listening socket per name, and a thread. The methods are thread-safe."""
 
-    def __init__(self, folder: Path, target: Path, agents: Sequence[str]) -> None:
-        self._links = {name: _Link(folder / f"{name}.sock", target) for name in agents}
+    def __init__(self, folder: Path, targets: Mapping[str, Path]) -> None:
+        """targets: the socket of the server behind each name."""
+        self._links = {name: _Link(folder / f"{name}.sock", target) for name, target in targets.items()}
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="fault-proxy", daemon=True)
         self._thread.start()

@@ -110,7 +110,7 @@ def run_chaos(settings: ChaosSettings, on_fault: Callable[[], object]) -> ChaosR
         agents = [f"agent-{number}" for number in range(settings.agents)]
         server = ServerProcess(_server_command(0.0), folder, "sqlite")
         opened.callback(server.kill)
-        proxy = FaultProxy(folder, Path(server.address.removeprefix("unix:")), agents)
+        proxy = FaultProxy(folder, dict.fromkeys(agents, Path(server.address.removeprefix("unix:"))))
         opened.callback(proxy.close)
         team = AgentTeam(folder, agents, proxy.address)
         opened.callback(team.close)

@@ -34,11 +34,15 @@ class ServerProcess:
     The server runs with its default options, but for those in the command.
     """
 
-    def __init__(self, command: str, folder: Path, store: str, shares: bool = False) -> None:
-        """store: sqlite, memory, or the address of a database, which the server may share with others."""
+    def __init__(self, command: str, folder: Path, store: str, shares: bool = False, peer: str = "") -> None:
+        """store: sqlite, memory, or the address of a database, which the server may share with others.
+
+        peer: where the others reach it, by default at its address.
+        """
         self._command, self._store = command, str(folder / "store.sqlite") if store == "sqlite" else store
         self.address = f"unix:{folder}/fusion.sock"
-        self._more = ["--set", f"peer-address={self.address}", "--metrics", "127.0.0.1:0"] if shares else []
+        peer = peer or (self.address if shares else "")
+        self._more = ["--set", f"peer-address={peer}", "--metrics", "127.0.0.1:0"] if peer else []
         self.log = folder / "fusion.log"
         self.start()
 
