@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Coroutine, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -20,7 +20,6 @@ from gausslite_fusion_server.peers import Peers
 from gausslite_fusion_server.region_host import WAIT_S, RegionHost
 from gausslite_fusion_server.region_servicer import RegionServicer
 
-_GROUP_BYTES = 2 << 20
 _OWNER_BYTES = 16 << 20
 """Of all agents, on their way to one owner."""
 _RETRY_S = 0.05
@@ -37,8 +36,7 @@ class PartSender:
         self._host, self._regions, self._peers, self._grid = host, regions, peers, grid
         self._queue = UpdateQueue()
         self._decoder = ThreadPoolExecutor(1, "decode")
-        self._decoded: dict[PendingUpdate, asyncio.Future[StoredSubset]] = {}
-        self._is_decoding = False
+        self._decoded: dict[PendingUpdate, Future[StoredSubset]] = {}
         self._highest: dict[str, tuple[str, int]] = {}
         self._waiting_bytes: Counter[str | None] = Counter()
         self.received = self.sent = 0
@@ -76,38 +74,29 @@ class PartSender:
 
     async def _decode(self, session: SessionRecord, message: bytes) -> StoredSubset:
         update = PendingUpdate(session.session_id, session.agent_id, message)
-        self._queue.add(update)
-        decoded: asyncio.Future[StoredSubset] = asyncio.get_running_loop().create_future()
-        self._decoded[update] = decoded
-        if not self._is_decoding:
-            self._is_decoding = True
-            self._decoder.submit(self._decode_waiting, asyncio.get_running_loop())
-        return await decoded
+        decoded = self._decoded[update] = Future()
+        # a call that is cancelled keeps its turn
+        decoded.set_running_or_notify_cancel()
+        try:
+            self._queue.add(update)
+        except UnavailableError:
+            del self._decoded[update]
+            raise
+        # one turn for each message, for the one that is next then
+        self._decoder.submit(self._decode_next)
+        return await asyncio.wrap_future(decoded)
 
-    def _decode_waiting(self, loop: asyncio.AbstractEventLoop) -> None:
-        while self._queue.has_waiting:
-            for update in self._queue.take(_GROUP_BYTES):
-                try:
-                    assert isinstance(update.message, bytes)
-                    subset = decode_own(update.message, update.agent_id, self._grid)
-                    loop.call_soon_threadsafe(self._end, update, _value(subset))
-                except Exception as error:
-                    # reaches the call; this thread decodes the messages of all agents
-                    loop.call_soon_threadsafe(self._end, update, _error(error))
-                finally:
-                    self._queue.put_back(update, is_done=True)
-        loop.call_soon_threadsafe(self._decode_again, loop)
-
-    def _decode_again(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._is_decoding = self._queue.has_waiting
-        if self._is_decoding:
-            self._decoder.submit(self._decode_waiting, loop)
-
-    def _end(self, update: PendingUpdate, end: Callable[[asyncio.Future[StoredSubset]], None]) -> None:
+    def _decode_next(self) -> None:
+        [update] = self._queue.take(1)
         decoded = self._decoded.pop(update)
-        # the call may have been cancelled
-        if not decoded.done():
-            end(decoded)
+        try:
+            assert isinstance(update.message, bytes)
+            decoded.set_result(decode_own(update.message, update.agent_id, self._grid))
+        except Exception as error:
+            # reaches the call; this thread decodes the messages of all agents
+            decoded.set_exception(error)
+        finally:
+            self._queue.put_back(update, is_done=True)
 
     @contextmanager
     def _room_for(self, subset: StoredSubset) -> Iterator[None]:
@@ -169,14 +158,6 @@ async def _all(calls: Sequence[Coroutine[Any, Any, StoredCount]]) -> list[Stored
         return [await calls[0]]
     except GaussLiteError as error:
         return [error]
-
-
-def _value(subset: StoredSubset) -> Callable[[asyncio.Future[StoredSubset]], None]:
-    return lambda decoded: decoded.set_result(subset)
-
-
-def _error(error: Exception) -> Callable[[asyncio.Future[StoredSubset]], None]:
-    return lambda decoded: decoded.set_exception(error)
 
 
 async def _wait_at_most(event: asyncio.Event, timeout_s: float) -> None:

@@ -166,7 +166,7 @@ class FusionEngine:
             session = self._mission.members.open_session(agent_id, token)
             if fresh_map:
                 self._mission.agents.begin_new_map(agent_id)
-                self._mission.members.save_token(agent_id, token)
+                self._mission.members.sessions.save_token(agent_id, token)
             self._mission.checks.record_join(agent_id)
             return JoinResult(
                 session,
@@ -181,7 +181,7 @@ class FusionEngine:
         fresh_map: as in `join`. Raises StorageError.
         """
         with self._committer.committing, self._lock:
-            self._mission.members.forget_elsewhere(agent_id)
+            self._mission.members.sessions.forget_elsewhere(agent_id)
             if fresh_map:
                 self._mission.agents.begin_new_map(agent_id)
             return self.highest_update_seq(agent_id)
@@ -190,7 +190,7 @@ class FusionEngine:
         """Delete the agent's voxels here, after another server has ended its session; returns their number."""
         with self._committer.committing, self._lock:
             voxels = self._store.totals(agent_id).voxels
-            self._mission.members.forget_elsewhere(agent_id)
+            self._mission.members.sessions.forget_elsewhere(agent_id)
             self._mission.agents.remove(agent_id)
             return voxels
 
@@ -203,7 +203,7 @@ class FusionEngine:
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
         with self._lock:
-            return self._mission.members.session(session_id)
+            return self._mission.members.sessions.get(session_id)
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Store an agent's voxel updates; they are durable on return, if the store is.
@@ -290,7 +290,7 @@ class FusionEngine:
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""
         with self._lock:
-            self._mission.objects.report(self._mission.members.session(session_id).agent_id, report)
+            self._mission.objects.report(self._mission.members.sessions.get(session_id).agent_id, report)
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
@@ -318,24 +318,24 @@ class FusionEngine:
         with self._committer.committing, self._lock:
             voxels = self._store.totals(agent_id).voxels
             self._mission.members.require_evictable(agent_id, ban)
-            self._mission.members.end_agent(agent_id)
+            self._mission.members.sessions.end_agent(agent_id)
             self._mission.agents.remove(agent_id)
             if ban:
-                self._mission.members.ban(agent_id)
+                self._mission.members.bans.add(agent_id)
             return voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
         with self._lock:
-            self._mission.members.unban(agent_id)
+            self._mission.members.bans.remove(agent_id)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._committer.committing, self._lock:
-            agent_id = self._mission.members.session(session_id).agent_id
+            agent_id = self._mission.members.sessions.get(session_id).agent_id
             if forget:
                 self._mission.agents.remove(agent_id)
-            self._mission.members.end_session(session_id)
+            self._mission.members.sessions.end(session_id)
             return self._mission.maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
@@ -402,7 +402,7 @@ class FusionEngine:
 
     def _check_update(self, update: PendingUpdate) -> None:
         """Raise GaussLiteError for a message that may not be stored; only its first part is checked."""
-        session = self._mission.members.session(update.session_id)
+        session = self._mission.members.sessions.get(update.session_id)
         if not update.outcomes:
             require_own(session.agent_id, update.agent_id, self.grid, self.grid)
             self._mission.checks.require_plausible(update.subset)

@@ -207,7 +207,7 @@ def _name_in_use(agent_id: str, remaining_s: float) -> NameInUseError:
 
 
 class Membership:
-    """Owns the mission's configuration, the sessions and the bans. Not thread-safe; FusionEngine holds a lock.
+    """Owns the mission's configuration, `sessions` and `bans`. Not thread-safe; FusionEngine holds a lock.
 
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
@@ -216,8 +216,8 @@ class Membership:
         self._store, self._settings = store, settings
         own, self._stored_config = settings.mission_config, store.mission_config()
         self._mission_config = reconcile(self._stored_config or own, own)
-        self._sessions = SessionRegistry(store, settings.lease_s, others=others)
-        self._bans = BanList(store)
+        self.sessions = SessionRegistry(store, settings.lease_s, others=others)
+        self.bans = BanList(store)
         self._most_agents = len(self._agents())
 
     @property
@@ -226,23 +226,9 @@ class Membership:
         return self._mission_config.with_default_names()
 
     @property
-    def banned(self) -> tuple[str, ...]:
-        """The names that operators have banned."""
-        return self._bans.agents
-
-    @property
-    def joined(self) -> frozenset[str]:
-        """The agents that have a session."""
-        return self._sessions.agents
-
-    @property
     def sources(self) -> frozenset[str]:
         """The agents with a session or with data, and the names of earlier maps."""
-        return self.joined | frozenset(self._store.agents())
-
-    def session(self, session_id: str) -> SessionRecord:
-        """Return the session of this id, see SessionRegistry.get."""
-        return self._sessions.get(session_id)
+        return self.sessions.agents | frozenset(self._store.agents())
 
     def admit(self, agent_id: str, requested: MissionConfig, token: str) -> list[str]:
         """Check that the agent may join, and agree on the mission's configuration.
@@ -251,8 +237,8 @@ class Membership:
         Raises InvalidInputError, MismatchError, NameInUseError, NotPermittedError, QuotaError, StorageError.
         """
         require_identifier("agent_id", agent_id)
-        self._bans.require_allowed(agent_id)
-        self._sessions.require_free(agent_id, token)
+        self.bans.require_allowed(agent_id)
+        self.sessions.require_free(agent_id, token)
         ended = self._make_room(agent_id)
         agreed = self._mission_config if self._is_agreed(agent_id) else self._settings.mission_config
         mission_config = reconcile(agreed, requested).with_default_names()
@@ -262,30 +248,14 @@ class Membership:
         self._mission_config = mission_config
         return ended
 
-    def remove_agent(self, agent_id: str) -> None:
-        """Delete the token of an agent, see SessionRegistry."""
-        self._sessions.remove_agent(agent_id)
-
     def open_session(self, agent_id: str, token: str) -> SessionRecord:
         """Return a new session of an admitted agent; its earlier one ends. Raises NameInUseError, StorageError."""
-        session, agents = self._sessions.open(agent_id, token), len(self._agents())
+        session, agents = self.sessions.open(agent_id, token), len(self._agents())
         # names that come and go fill no log
         if agents > self._most_agents:
             self._most_agents, limit = agents, self._settings.quotas.agents
             _log.info("agent %s has joined; %d of at most %d names are in use", quote_name(agent_id), agents, limit)
         return session
-
-    def save_token(self, agent_id: str, token: str) -> None:
-        """Store the token of the agent's session again, see SessionRegistry."""
-        self._sessions.save_token(agent_id, token)
-
-    def end_session(self, session_id: str) -> None:
-        """End a session, see SessionRegistry.end."""
-        self._sessions.end(session_id)
-
-    def forget_elsewhere(self, agent_id: str) -> None:
-        """Forget the agent's session of another server, see SessionRegistry."""
-        self._sessions.forget_elsewhere(agent_id)
 
     def require_evictable(self, agent_id: str, ban: bool) -> None:
         """Raise InvalidInputError for an unknown agent, or with `ban` for a name that no agent can have."""
@@ -297,21 +267,9 @@ class Membership:
                 f"agent_id: expected an agent of the mission ({expected}), got {quote_name(agent_id)}"
             )
 
-    def end_agent(self, agent_id: str) -> None:
-        """End the session of an agent, if it has one. Raises StorageError."""
-        self._sessions.end_agent(agent_id)
-
-    def ban(self, agent_id: str) -> None:
-        """Refuse later joins under this name. Raises StorageError."""
-        self._bans.add(agent_id)
-
-    def unban(self, agent_id: str) -> None:
-        """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
-        self._bans.remove(agent_id)
-
     def _is_agreed(self, agent_id: str) -> bool:
         """Return whether another live agent, or any data, fixes the mission's configuration."""
-        return bool(frozenset(self._store.agents()) or self._sessions.live_agents - {agent_id})
+        return bool(frozenset(self._store.agents()) or self.sessions.live_agents - {agent_id})
 
     def _make_room(self, agent_id: str) -> list[str]:
         """End the sessions of agents without updates whose lease has ended, if the mission is full; returns them.
@@ -321,7 +279,7 @@ class Membership:
         limit = self._settings.quotas.agents
         if agent_id in self._agents() or len(self._agents()) < limit:
             return []
-        ended = self._sessions.end_unused(kept=frozenset(self._store.agents()))
+        ended = self.sessions.end_unused(kept=frozenset(self._store.agents()))
         if len(self._agents()) >= limit:
             raise QuotaError(
                 f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it; names without "

@@ -65,7 +65,7 @@ class MissionData:
         # a refinement is of the whole map
         refined = load_refinement(store) if others is None else None
         maps = FusedMapLayers(votes, lock, grid, first_revision, settings.max_removed_voxels, refined)
-        of_agents = members, checks, traffic, keyframes, objects
+        of_agents = members.sessions, checks, traffic, keyframes, objects
         return cls(
             members=members,
             keyframes=keyframes,
@@ -91,14 +91,14 @@ class MissionData:
             keyframes=len(self.keyframes),
             refined=self.maps.is_refined,
             agents=tuple(self._contribution(store, agent_id) for agent_id in sorted(self.members.sources)),
-            banned_agents=self.members.banned,
+            banned_agents=self.members.bans.agents,
         )
 
     def _contribution(self, store: FusionStore, agent_id: str) -> AgentContribution:
         totals = store.totals(agent_id)
         return AgentContribution(
             agent_id,
-            joined=agent_id in self.members.joined,
+            joined=agent_id in self.members.sessions.agents,
             voxels=totals.occupied_voxels,
             gaussians=totals.gaussians,
             kappa_sum=totals.kappa_sum,

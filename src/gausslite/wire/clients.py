@@ -267,12 +267,16 @@ class FusionClient(ServiceChannel):
         """
         self._follow(self._next_owner)
         if self._owner is not None:
+            answered: set[int] = set()
             try:
-                yield from self._send(self._owner, requests, deadline_s)
+                for response in self._send(self._owner, requests, deadline_s):
+                    answered.update(outcome.sequence for outcome in response.outcomes)
+                    yield response
                 return
             except UnavailableError:
-                # any server takes the same subsets, and again
+                # any server takes the others
                 self._leave_owner()
+                requests = [request for request in requests if request.sequence not in answered]
         yield from self._send(self, requests, deadline_s)
 
     def _send(
