@@ -220,11 +220,12 @@ class MappingWorker:
         return self._submit(lambda: self._insert_team_voxels(received))
 
     def handover_batch(self) -> Future[VoxelBatch]:
-        """Return updates of the whole map, except voxels of an earlier task that were sent with a higher Σkappa.
+        """Return updates of the whole map, except guesses and voxels of an earlier task sent with a higher Σkappa.
 
-        Voxels of an earlier handover that the map has lost get tombstones. The future raises StorageError.
+        Guesses: see `GaussianMapper.shared_gaussians`. Voxels of an earlier handover that the map has lost get
+        tombstones. The future raises StorageError.
         """
-        return self._submit(lambda: self._voxels_to_send(self._mapper.gaussians()))
+        return self._submit(lambda: self._voxels_to_send(self._mapper.shared_gaussians()))
 
     def select_keyframes(self) -> Future[None]:
         """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""

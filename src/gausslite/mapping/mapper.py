@@ -29,7 +29,7 @@ from gausslite.domain.state import (
 )
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
-from gausslite.mapping.free_space import contradicted_rows, left_behind
+from gausslite.mapping.free_space import contradicted_rows, guessed_far, left_behind
 from gausslite.mapping.keyframes import (
     Keyframe,
     KeyframeStore,
@@ -310,6 +310,13 @@ class GaussianMapper:
         """Return a copy of the active Gaussians."""
         use_ema = self._settings.optimization.ema_updates > 0
         return self._table.to_gaussians(np.flatnonzero(self._table.active), use_ema)
+
+    def shared_gaussians(self) -> Gaussians:
+        """Return a copy of the map for others: without untrained Gaussians whose distance is a guess of 4 m or more."""
+        gaussians = self.gaussians()
+        untrained = np.flatnonzero(gaussians.kappa == 0)
+        guessed = guessed_far(gaussians.means_m[untrained], (keyframe.frame for keyframe in self._keyframes.kept))
+        return gaussians.take(np.delete(np.arange(len(gaussians)), untrained[guessed]))
 
     def keyframes(self) -> list[Keyframe]:
         """Return the keyframes kept of the whole mission and those that train the map, by capture time (Sec. III-E)."""

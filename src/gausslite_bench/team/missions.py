@@ -31,7 +31,7 @@ _MAX_KEYFRAMES = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentMap:
-    """One agent's map, its keyframes, and what it sent: bytes of all messages and Gaussians, resends included.
+    """One agent's map as it hands it over, its keyframes, and what it sent: bytes and Gaussians, resends included.
     bytes_whole: size of its whole map as messages.
 
     messages: the subsets in the order of sending, as the fusion server would receive them.
@@ -78,9 +78,10 @@ def map_agent(
     scene = Scene(agent.task, agent.frames, agent.masks, (), SceneInfo())
     estimator = RecordedRelevanceEstimator(scene) if follows_task else NoTaskEstimator()
     sent = _SentMessages(agent.agent_id, grid)
+    gaussian_mapper = build_mapper(settings)
     mapper = TaskMapper(
         estimator,
-        build_mapper(settings),
+        gaussian_mapper,
         SentVoxelTracker(grid),
         FrameScheduler(settings.scheduler_settings),
         sent.publish,
@@ -100,7 +101,7 @@ def map_agent(
         AgentKeyframe(agent.agent_id, keyframe) for keyframe in _select_keyframes(mapper.keyframes(), grid)
     )
     gaussians_sent = sum(len(message.batch.gaussians) for message in sent.messages)
-    gaussians = mapper.gaussians()
+    gaussians = gaussian_mapper.shared_gaussians()
     whole = split_batch(group_by_voxel(gaussians, grid), _SUBSET_BYTES)
     bytes_whole = sum(len(encode_subset(RoiSubset(agent.agent_id, "", 1, 1, part), grid)) for part in whole)
     return AgentMap(

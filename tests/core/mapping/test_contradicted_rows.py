@@ -12,7 +12,7 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.voxels import VoxelGrid, group_by_voxel
-from gausslite.mapping.free_space import DepthView, seen_through, view_counts
+from gausslite.mapping.free_space import DepthView, guessed_far, seen_through, view_counts
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
@@ -57,6 +57,31 @@ def test_three_views_contradict_a_point_unless_others_show_it(through: int, show
     views = [_view()] * through + [_view(np.full_like(wall_frame().depth_m, 1.5))] * shown
     assert [int(counts[0]) for counts in view_counts(point_m, views)] == [through, shown]
     assert seen_through(point_m, views).tolist() == [contradicted]
+
+
+def test_a_distant_point_at_an_unmeasured_pixel_is_a_guess_unless_another_frame_measures_it_or_comes_near() -> None:
+    depth_m = np.full_like(wall_frame().depth_m, 5.0)
+    depth_m[:, 32:] = 0.0
+    hole = replace(wall_frame(), depth_m=depth_m)
+    points_m = np.array([[1.0, 0.0, 5.0], [-1.0, 0.0, 5.0], [-1.0, 0.0, 7.0], [1.0, 0.0, 3.9]], np.float32)
+    assert guessed_far(points_m, [hole]).tolist() == [True, False, False, False]
+    measured = replace(wall_frame(), depth_m=np.full_like(depth_m, 5.0))
+    near = replace(hole, T_world_camera=np.array([[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1.0]]))
+    for frames in ([hole, measured], [measured, hole], [hole, near], [near, hole], []):
+        assert not guessed_far(points_m, frames).any()
+
+
+def test_only_untrained_guesses_are_kept_from_others() -> None:
+    distant_m = np.array([[1.0, 0.1 * i, 5.0] for i in range(-2, 3)], np.float32)
+    mapper = _continued(plain_gaussians(distant_m, kappa=[0, 0, 0, 0, 1], active=False))
+    frame = wall_frame()
+    depth_m = frame.depth_m.copy()
+    depth_m[:, 32:] = 0.0
+    no_relevance = RelevanceMap(np.zeros(depth_m.shape, np.float32), np.full(depth_m.shape, -1, np.int16))
+    mapper.map_frame(replace(frame, depth_m=depth_m), no_relevance)
+    shared, whole = mapper.shared_gaussians(), mapper.gaussians()
+    assert len(whole) - len(shared) == 4
+    assert np.count_nonzero(shared.means_m[:, 2] > 4.5) == 1
 
 
 def _continued(prior: Gaussians | None) -> GaussianMapper:
