@@ -1,9 +1,9 @@
 """Store the latest update of every voxel and the selected keyframes for the uplink, and whether they are pending.
 
 An update is pending until the server has accepted it or permanently rejected it. A pending update is due if its voxel
-was never sent, if it is a tombstone, or if its Σkappa has changed enough since then. A newer
-update replaces the older one of its voxel, so the size of the spool is bounded by the map. With a path, the spool is
-a SQLite file that survives a restart; otherwise it is in memory.
+was never sent, has lost all Gaussians or a quarter of its Σkappa, or if its Σkappa has changed enough since then: the
+more often it was sent, the more, because training changes it less and less. A newer update replaces the older one of
+its voxel, so the map bounds the spool. With a path, it is a SQLite file that survives a restart; otherwise in memory.
 
 Updates and keyframes share one bandwidth: the highest value per byte is sent first. The value of an update is the
 change of Σkappa, the number of optimiser updates that the server lacks. The value of a keyframe has the same unit.
@@ -159,23 +159,24 @@ _Row = tuple[int, int, int, int, bytes, float]
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS voxel_updates (
     key INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
-    count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL);
+    count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL,
+    sends INTEGER NOT NULL DEFAULT 0);
 CREATE INDEX IF NOT EXISTS voxel_updates_pending ON voxel_updates (pending) WHERE pending = 1;
 CREATE TABLE IF NOT EXISTS properties (name TEXT PRIMARY KEY, value) WITHOUT ROWID;
 """
 _ENQUEUE = """
-INSERT INTO voxel_updates VALUES (?, 1, ?, ?, ?, ?, 1, -1)
+INSERT INTO voxel_updates VALUES (?, 1, ?, ?, ?, ?, 1, -1, 0)
 ON CONFLICT (key) DO UPDATE SET enqueue_count = enqueue_count + 1, purpose = excluded.purpose,
     kappa_sum = excluded.kappa_sum, count = excluded.count, gaussians = excluded.gaussians, pending = 1
 WHERE kappa_sum != excluded.kappa_sum OR gaussians != excluded.gaussians
 """
-# updates never sent and tombstones are due at once; others if Σkappa has changed by a share of the sent value
 _SELECT_DUE = f"""
 SELECT key, enqueue_count, kappa_sum, count, gaussians,
     abs(kappa_sum - sent_kappa) / ({_WIRE_BYTES_PER_VOXEL}.0 + {_WIRE_BYTES_PER_GAUSSIAN}.0 * count) AS value_per_byte
 FROM voxel_updates
 WHERE pending = 1 AND purpose = ?
-    AND (sent_kappa < 0 OR count = 0 OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1))
+    AND (sent_kappa < 0 OR count = 0 OR kappa_sum <= 0.75 * sent_kappa
+        OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1) * (1 << min(max(sends, 1) - 1, 2)))
 ORDER BY value_per_byte DESC, key
 """  # noqa: S608 - two constants of this file
 
@@ -221,6 +222,8 @@ class Spool:
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
             self._database.executescript(_SCHEMA + KEYFRAMES_SCHEMA + SENT_UPDATES_SCHEMA)
+            if "sends" not in [row[1] for row in self._database.execute("PRAGMA table_info (voxel_updates)")]:
+                self._database.execute("ALTER TABLE voxel_updates ADD COLUMN sends INTEGER NOT NULL DEFAULT 0")
             self._sent = SentUpdateTable(self._database)
             self._keyframes = KeyframeTable(self._database)
             self.is_new = self._property("agent_id") is None
@@ -271,8 +274,8 @@ class Spool:
     def next_round(self, max_bytes: int, resend_threshold: float) -> SpoolRound | None:
         """Return what is due with the highest value per byte, about max_bytes, at least one; None if nothing is due.
 
-        A voxel sent before is due if its Σkappa has changed by the share resend_threshold of the sent value. Voxels of
-        the handover follow when nothing else is due.
+        A voxel sent once is due if its Σkappa has changed by the share resend_threshold of the sent value; twice: by
+        double the share; more often: by four times the share. Voxels of the handover follow when nothing else is due.
         """
         with self._transaction():
             due = _by_value(self._due(Purpose.ROI, resend_threshold), self._keyframes.pending())
@@ -337,7 +340,7 @@ class Spool:
         with self._transaction():
             keys = self._sent.forget(lost)
             self._database.executemany(
-                "UPDATE voxel_updates SET pending = 1, sent_kappa = ? WHERE key = ?",
+                "UPDATE voxel_updates SET pending = 1, sent_kappa = ?, sends = 0 WHERE key = ?",
                 ((_NEVER_SENT, key) for key in keys),
             )
             acknowledged = min(int(self._property("acknowledged_seq") or 0), highest_update_seq)
@@ -355,13 +358,13 @@ class Spool:
 
     def mark_done(self, sent: SpoolBatch) -> None:
         """Mark these updates as not pending, because the server has accepted or permanently rejected them."""
-        triples = zip(
-            sent.enqueue_counts.tolist(), sent.batch.kappa_sums.tolist(), sent.batch.keys.tolist(), strict=True
+        batch = sent.batch
+        triples = zip(sent.enqueue_counts.tolist(), batch.kappa_sums.tolist(), batch.keys.tolist(), strict=True)
+        update = (
+            "UPDATE voxel_updates SET pending = (enqueue_count != ?), sent_kappa = ?, sends = sends + 1 WHERE key = ?"
         )
         with self._transaction():
-            self._database.executemany(
-                "UPDATE voxel_updates SET pending = (enqueue_count != ?), sent_kappa = ? WHERE key = ?", triples
-            )
+            self._database.executemany(update, triples)
 
     @property
     def pending_voxels(self) -> int:

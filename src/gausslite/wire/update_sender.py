@@ -87,7 +87,8 @@ class UplinkSettings:
     """Limits and intervals of sending.
 
     interval_s: minimum time between rounds, so that several changes of a voxel are sent as one. resend_threshold:
-    change of a voxel's Σkappa, as a share of the sent value, from which it is sent again; 0 while the uplink drains.
+    change of a voxel's Σkappa, as a share of the sent value, from which it is sent a second time, see
+    `Spool.next_round`; 0 while the uplink drains.
     round_bytes: size limit of a round. deadline_s: of each call. first_backoff_s: wait before the first retry.
     check_interval_s: how often an idle uplink asks the server whether it still has everything. T_fused_agent: declared
     pose of the agent's frame in the fused map's; None: not declared. frame: whether the agent's frame is the team's.
@@ -97,7 +98,7 @@ class UplinkSettings:
         None, "bandwidth limit in kilobits per second (default: none)", key="uplink-kbps", unit="kbit/s", low=0.001
     )
     interval_s: float = option(1.0, "time between two transmissions", key="uplink-interval", unit="s", low=0)
-    resend_threshold: float = 0.25
+    resend_threshold: float = 0.5
     round_bytes: int = 4 << 20
     deadline_s: float = 30.0
     first_backoff_s: float = 0.2

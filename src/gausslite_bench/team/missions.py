@@ -20,10 +20,10 @@ from gausslite.mission.settings import MissionSettings, SceneInfo
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.wire.spool import Purpose, Spool
+from gausslite.wire.update_sender import UplinkSettings
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.team.scenes import AgentScene
 
-_RESEND_THRESHOLD = 0.25
 _ROUND_FRAMES = 4
 _SUBSET_BYTES = 1 << 20
 _MAX_KEYFRAMES = 64
@@ -47,7 +47,7 @@ class AgentMap:
 
 
 class _SentMessages:
-    """A spool that is read every few frames by the uplink's rule: changed by a quarter, the largest change first."""
+    """A spool that is read every few frames by the uplink's rule: what has changed enough, the largest change first."""
 
     def __init__(self, agent_id: str, grid: VoxelGrid) -> None:
         self._agent_id, self._grid = agent_id, grid
@@ -59,7 +59,7 @@ class _SentMessages:
         """Queue the changed voxels of a frame."""
         self._spool.enqueue(batch, Purpose.ROI)
 
-    def send(self, resend_threshold: float = _RESEND_THRESHOLD) -> None:
+    def send(self, resend_threshold: float = UplinkSettings().resend_threshold) -> None:
         """Send all that is due."""
         while (due := self._spool.next_round(_SUBSET_BYTES, resend_threshold)) is not None and due.voxels is not None:
             for part in split_batch(due.voxels.batch, _SUBSET_BYTES):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,6 +147,40 @@ def test_small_changes_are_sent_only_when_draining() -> None:
     kappas = [subset.kappa_sums.tolist() for subset in server.subsets]
     assert kappas[0] == [100]
     assert sorted(total for subset in kappas[1:] for total in subset) == [1, 101]
+
+
+def _send_due(spool: Spool, kappa: int) -> bool:
+    """Enqueue a voxel with this Σkappa; return whether it was due, and mark it as sent then."""
+    spool.enqueue(make_batch({1: [kappa]}), Purpose.ROI)
+    if (due := spool.next_round(1 << 20, 0.5)) is None or due.voxels is None:
+        return False
+    spool.mark_done(due.voxels)
+    return True
+
+
+def test_a_voxel_is_sent_again_after_growing_by_half_then_to_twice_then_to_thrice_its_sent_kappa() -> None:
+    spool = Spool(None, "robot", GRID)
+    sent = [kappa for kappa in range(10, 280) if _send_due(spool, kappa)]
+    assert sent == [10, 15, 30, 90, 270]
+    spool.close()
+
+
+def test_a_voxel_that_lost_a_quarter_of_its_kappa_is_sent_at_once() -> None:
+    spool = Spool(None, "robot", GRID)
+    assert [_send_due(spool, kappa) for kappa in (100, 200, 151, 150)] == [True, True, False, True]
+    spool.close()
+
+
+def test_a_spool_of_an_earlier_version_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "spool.sqlite"
+    spool = Spool(path, "robot", GRID)
+    assert _send_due(spool, 10)
+    spool.close()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("ALTER TABLE voxel_updates DROP COLUMN sends")
+    spool = Spool(path, "robot", GRID)
+    assert [_send_due(spool, kappa) for kappa in (14, 15)] == [False, True]
+    spool.close()
 
 
 def test_limit_drain_ends_a_drain_that_has_begun() -> None:
