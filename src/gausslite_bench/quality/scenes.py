@@ -89,13 +89,13 @@ class RecordedRelevanceEstimator(RelevanceEstimator):
     """A RelevanceEstimator that returns each training frame's precomputed mask, at no cost for any policy."""
 
     def __init__(self, scene: Scene) -> None:
-        # keyed by frame, not by pose: depth holes and moving objects differ between frames of equal pose
-        self._masks = dict(zip(scene.training, scene.masks, strict=True))
+        # not by pose: frames of equal pose differ in holes and moving objects. Not by frame: a loop moves later frames
+        self._masks = {frame.index: mask for frame, mask in zip(scene.training, scene.masks, strict=True)}
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return the ground-truth mask."""
         del rendered_depth_m
-        return RelevanceEstimate(self._masks[frame])
+        return RelevanceEstimate(self._masks[frame.index])
 
 
 def make_scene(
