@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-
 from gausslite.codec.run_files import KeyframeView
-from gausslite.domain.camera import Camera
-from gausslite.domain.errors import GaussLiteError, InvalidInputError
-from gausslite.domain.objects import ObjectLandmark, ObjectRole
-from gausslite.domain.relevance import UNNAMED, PointedObject, PointM
-from gausslite.domain.task import noun_of
+from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert_task import object_from_message
 from gausslite.wire.map_follower import MapFollower
@@ -25,12 +18,10 @@ from gausslite_view.cameras import CameraPanel, with_objects, with_region
 from gausslite_view.contents import ViewContents
 from gausslite_view.map_page import MapPage, text_html
 from gausslite_view.plots import HistoryPlot, QualityPlot
+from gausslite_view.pointing import PointingPanel
 
 _STATE_PREFIX = "AGENT_STATE_"
 _KB = 1e3
-_NO_OBJECT = "none yet"
-_RAY_CAMERA = Camera(1000.0, 1000.0, 8.5, 8.5, 17, 17)
-"""A view so narrow that its middle pixel shows what a click on the page hits."""
 
 
 class AgentPanel:
@@ -123,78 +114,6 @@ class AgentPanel:
             self._message.content = text_html([str(error)])
         finally:
             button.disabled = False
-
-
-class PointingPanel:
-    """Owns the controls with which a person points at objects in the scene, and leaves out objects."""
-
-    def __init__(self, page: MapPage, client: AgentClient) -> None:
-        self._scene, self._client = page.server.scene, client
-        self._objects: dict[str, ObjectLandmark] = {}
-        gui = page.server.gui
-        with gui.add_folder("Point", order=0):
-            self._noun: Any = gui.add_text("Noun", "", hint="what it is, for the team; may be empty")
-            self._point = gui.add_button("Point at an object", hint="then click the object in the map")
-            self._object: Any = gui.add_dropdown("Object", (_NO_OBJECT,))
-            self._exclude = gui.add_button("Not this one")
-            self._message = gui.add_html("")
-        self._point.on_click(lambda _: self._await_click())
-        self._exclude.on_click(lambda _: self._run(self._exclude_object))
-
-    def show_objects(self, objects: Sequence[ObjectLandmark]) -> None:
-        """Offer the task's targets, the best one first, to be left out."""
-        targets = [found for found in objects if found.role is ObjectRole.TARGET]
-        self._objects = {f"{found.object_id} ({found.confidence:.2f})": found for found in targets}
-        options = tuple(self._objects) or (_NO_OBJECT,)
-        if tuple(self._object.options) != options:
-            self._object.options = options
-
-    def _await_click(self) -> None:
-        """Take the next click in the scene as the object."""
-        self._point.disabled = True
-        self._message.content = text_html(["click the object in the map"])
-
-        @self._scene.on_click()
-        def clicked(event: Any) -> None:
-            self._scene.remove_click_callback(clicked)
-            self._point.disabled = False
-            self._run(lambda: self._point_at(event.ray_origin, event.ray_direction))
-
-    def _point_at(self, origin_m: PointM, direction: PointM) -> str:
-        """Point at the map's surface along a ray. Raises GaussLiteError."""
-        T_world_camera = _looking_along(np.array(origin_m), np.array(direction))
-        _, depth_m = self._client.render(_RAY_CAMERA, T_world_camera)
-        middle_m = float(depth_m[depth_m.shape[0] // 2, depth_m.shape[1] // 2])
-        if not middle_m > 0:
-            raise InvalidInputError("point: expected a click on the map, there is nothing")
-        x, y, z = (T_world_camera[:3, 3] + middle_m * T_world_camera[:3, 2]).tolist()
-        noun = noun_of(str(self._noun.value).strip()) or UNNAMED
-        self._client.assign_task(pointed=[PointedObject(point_m=(x, y, z), noun=noun)])
-        return f"{noun} at ({x:.2f}, {y:.2f}, {z:.2f}) m is a target"
-
-    def _exclude_object(self) -> str:
-        chosen = self._objects.get(str(self._object.value))
-        if chosen is None:
-            raise InvalidInputError("object: expected one of the task's objects, there is none yet")
-        self._client.assign_task(excluded_m=[chosen.centroid_m])
-        return f"{chosen.object_id} is left out"
-
-    def _run(self, action: Callable[[], str]) -> None:
-        """Run an action on a thread of the page's server, and show its result or error."""
-        try:
-            self._message.content = text_html([action()])
-        except GaussLiteError as error:
-            self._message.content = text_html([str(error)])
-
-
-def _looking_along(origin_m: Float64[ndarray, "3"], direction: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
-    """Return the pose of a camera at the origin that looks along the direction."""
-    forward = direction / np.linalg.norm(direction)
-    right = np.cross(np.eye(3)[np.argmin(np.abs(forward))], forward)
-    right /= np.linalg.norm(right)
-    T_world_camera = np.eye(4)
-    T_world_camera[:3] = np.column_stack([right, np.cross(forward, right), forward, origin_m])
-    return T_world_camera
 
 
 def _status_lines(status: Any) -> Iterator[str]:

@@ -136,6 +136,33 @@ def test_a_click_in_the_scene_is_a_target_until_it_is_left_out():
         assert next(running.client.ingest([frame(5)])).roi_share == 0
 
 
+@pytest.mark.parametrize("is_box", [False, True])
+def test_a_click_or_a_box_on_the_camera_image_is_a_target(is_box):
+    with (
+        agent(lambda graph: TaskRelevanceEstimator(graph, RegionDetector({}))) as running,
+        open_browser((1200, 900)) as browser,
+        live_page(0, running.client.address, is_agent=True) as url,
+    ):
+        running.client.assign_task("Find the chair")
+        report = next(running.client.ingest([frame(0)]))
+        tab = browser.new_page()
+        tab.goto(url)
+        tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
+        write(tab, 1, "wall")
+        tab.get_by_role("button", name="Point in the image").click()
+        tab.get_by_text("frame 0: click the object, or drag a box around it").wait_for()
+        tab.wait_for_timeout(1000)
+        tab.mouse.move(430, 430)
+        tab.mouse.down()
+        if is_box:
+            tab.mouse.move(700, 620, steps=4)
+        tab.mouse.up()
+        tab.get_by_text("of frame 0 is a target").wait_for()
+        assert next(running.client.ingest([frame(1)])).roi_share > 0
+        (wall,) = running.worker.status().objects
+        assert wall.noun == "wall"
+
+
 def wait_for_map(panel: AgentPanel) -> None:
     waiting = threading.Event()
     for _ in range(1200):
