@@ -175,6 +175,11 @@ class WindowView:
         """True if a pixel belongs to the ROI."""
         return self.roi.tiles is not None and bool(self.roi.tiles.any())
 
+    @property
+    def roi_share(self) -> float:
+        """Share of the image's tiles that the active phase renders."""
+        return 1.0 if self.roi.tiles is None else float(self.roi.tiles.mean())
+
 
 def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSettings) -> WindowView:
     """Prepare a keyframe for training. The margin gives the SSIM window its neighbours at the ROI's border."""
@@ -216,14 +221,12 @@ PrepareView = Callable[[Keyframe], WindowView]
 class KeyframeStore:
     """Every `every`th mapped frame is a keyframe: the `window` most recent train the map, `buffer` are kept.
 
-    `long_term_keyframes` more frames train the map, spread over the mission: those that show the ROI, or any frames if
-    the policy follows no task. Of frames equally close in time, sharp ones stay. Large images reduce all three numbers
-    (`KeyframeSettings.max_pixels`).
+    `long_term_keyframes` more frames that show the ROI train the map, and as many others, both spread over the mission.
+    Of frames equally close in time, sharp ones stay. Large images reduce all numbers (`KeyframeSettings.max_pixels`).
     """
 
-    def __init__(self, settings: KeyframeSettings, follows_task: bool = True) -> None:
+    def __init__(self, settings: KeyframeSettings) -> None:
         self._settings = self._limits = settings
-        self._follows_task = follows_task
         self._largest_px = 1
         self._recent: list[WindowView] = []
         self._long_term: list[WindowView] = []
@@ -262,13 +265,12 @@ class KeyframeStore:
         return self._mapped_frames % self._settings.every == 0
 
     def add(self, view: WindowView) -> None:
-        """Store a mapped frame if it shows the ROI or is the next `every`th frame."""
+        """Store a mapped frame for the long term and, if it is the next `every`th one, among the most recent ones."""
         self._limit_for(view.keyframe)
         is_keyframe = self.next_is_keyframe
         self._mapped_frames += 1
         self._count += is_keyframe
-        if self._is_long_term(view):
-            self._set_long_term([*self._long_term, view])
+        self._set_long_term([*self._long_term, view])
         if not is_keyframe:
             return
         self._recent = [*self._recent, view][-self._limits.window :]
@@ -277,14 +279,8 @@ class KeyframeStore:
             del self._buffer[_most_redundant(self._buffer)]
 
     def replace_view(self, view: WindowView) -> None:
-        """Replace the view of the same recorded frame, if it is in the window.
-
-        A view that no longer shows the ROI stays only among the most recent keyframes.
-        """
-        long_term = [view if is_same_frame(old.keyframe, view.keyframe) else old for old in self._long_term]
-        self._long_term = [
-            prepared for prepared in long_term if self._is_long_term(prepared) or not prepared.keyframe.evaluated
-        ]
+        """Replace the view of the same recorded frame, if it is in the window."""
+        self._set_long_term([view if is_same_frame(old.keyframe, view.keyframe) else old for old in self._long_term])
         self._recent = [view if is_same_frame(old.keyframe, view.keyframe) else old for old in self._recent]
         self._buffer = [view.keyframe if is_same_frame(old, view.keyframe) else old for old in self._buffer]
 
@@ -373,7 +369,7 @@ class KeyframeStore:
         """Replace all keyframes by those of another store of the same settings. Raises MapFileError."""
         limits = {
             "recent": self._settings.window,
-            "long_term": self._settings.long_term_keyframes,
+            "long_term": 2 * self._settings.long_term_keyframes,
             "buffer": self._settings.buffer,
         }
         numbers = {name: get_counts(state, name, len(state.get(name, ()))) for name in limits}
@@ -397,15 +393,15 @@ class KeyframeStore:
             self._largest_px = pixels
             self._limits = self._settings.for_image_size(pixels)
 
-    def _is_long_term(self, view: WindowView) -> bool:
-        """True if the view may train the map after it leaves the most recent keyframes."""
-        return view.shows_roi or not self._follows_task
-
     def _set_long_term(self, views: list[WindowView]) -> None:
-        """Keep these long-term views, without the most redundant ones beyond the limit."""
-        while len(views) > self._limits.long_term_keyframes:
-            del views[_most_redundant([view.keyframe for view in views])]
-        self._long_term = views
+        """Keep these long-term views, of those with and of those without the ROI each the least redundant ones."""
+        kept: set[int] = set()
+        for shows_roi in (True, False):
+            kind = [view for view in views if view.shows_roi == shows_roi]
+            while len(kind) > self._limits.long_term_keyframes:
+                del kind[_most_redundant([view.keyframe for view in kind])]
+            kept |= {id(view) for view in kind}
+        self._long_term = [view for view in views if id(view) in kept]
 
     def _keyframes(self) -> list[Keyframe]:
         """Return every keyframe once, the buffer's first."""

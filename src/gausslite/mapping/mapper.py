@@ -91,7 +91,7 @@ class GaussianMapper:
         if initial_map is not None:
             self.continue_map(initial_map)
         self._seeder = Seeder(settings.seeding, settings.components, self._rng)
-        self._keyframes = KeyframeStore(settings.keyframes, settings.components.follow_task)
+        self._keyframes = KeyframeStore(settings.keyframes)
         refinement = RefinementSettings(
             settings.pose_prior, settings.keyframes.pose_updates_per_frame, settings.pose_anchor_share
         )

@@ -10,18 +10,18 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
-ONLINE_RATES = AdamSettings(means=2e-4, log_scales=4e-2, quats=8e-3, opacity_logits=5e-2, rgb=2e-2)
+ONLINE_RATES = AdamSettings(means=6e-4, log_scales=4e-2, quats=8e-3, opacity_logits=5e-2, rgb=2e-2)
 """Learning rates for Gaussians with a few dozen iterations. Those of shape and colour are 8 times the 3DGS rates,
-those of the means twice. With the 3DGS rates small seeds do not grow enough to blend. On a real kitchen
+those of the means 6 times. With the 3DGS rates small seeds do not grow enough to blend. On a real kitchen
 (320x240, 8 iterations per frame) these rates gain 1.7 dB in the region of interest, and as much for uniform
-mapping. A refinement of 500 iterations gains 0.2 dB in the region and 1.0 dB over the whole image of the
-simulated home.
+mapping. Means that move 6 times instead of twice as fast gain 0.2 dB in the region and 0.5 dB over the whole image.
 """
 
-REFINE_RATES = replace(ONLINE_RATES, decay_after_updates=20)
-"""The same rates with decay from the 20th update of a Gaussian on. A joint refinement ends, and its last large steps
-would remain as noise. The decay gains 0.9 dB in the region (fitted views) on a real kitchen with the frames of two
-robots, and 0.2 dB on simulated homes.
+REFINE_RATES = replace(ONLINE_RATES, means=2e-4, decay_after_updates=20)
+"""The same rates, those of the means twice the 3DGS rate, with decay from the 20th update of a Gaussian on. A joint
+refinement ends, and its last large steps would remain as noise. Over the 3DGS rates, 500 iterations gain 0.2 dB in the
+region and 1.0 dB over the whole image of the simulated home. The decay gains 0.9 dB in the region (fitted views) on a
+real kitchen with the frames of two robots, and 0.2 dB on simulated homes.
 """
 
 
@@ -116,14 +116,15 @@ class KeyframeSettings:
     """Keyframes to train on (Sec. III-D.2) and to keep for joint refinement (Sec. III-E).
 
     every: every `every`th mapped frame is a keyframe. window: most recent keyframes to train on. buffer: keyframes of
-    the whole mission to keep. long_term_keyframes: more frames to train on, spread over the mission, of those that show
-    the ROI (of all frames if no component follows the task); 0 is the paper's window. Each needs as much memory as a
-    keyframe of the window. roi_margin_px: margin around the ROI within which tiles are rendered in the active phase.
-    roi_context_weight: weight in the active phase's loss of pixels outside the ROI but inside its tiles, 0 to 1; 0 is
-    the paper's binary mask. pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame
-    if `MapperSettings.pose_prior` allows an error. depth_edge_px: depth within this distance of a depth jump is not
-    trained; 0 trains all depth, as the paper. max_pixels: cap on the pixels of all keyframes together, reached
-    with images larger than about 1280x720; a pixel needs 13 bytes, or 20 with refined poses.
+    the whole mission to keep. long_term_keyframes: more frames to train on, spread over the mission: this number that
+    show the ROI and as many others; 0 is the paper's window. Each needs as much memory as a keyframe of the window.
+    roi_margin_px: margin around the ROI within which tiles are rendered in the active phase. roi_context_weight: weight
+    in the active phase's loss of pixels outside the ROI but inside its tiles, 0 to 1; 0 is the paper's binary mask.
+    pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame if
+    `MapperSettings.pose_prior` allows an error. depth_edge_px: depth within this distance of a depth jump is not
+    trained; 0 trains all depth, as the paper. rotates: views train in turn (`ViewRotation`); False draws them
+    uniformly, as the paper. max_pixels: cap on the pixels of all keyframes together, reached with images larger than
+    about 1280x720; a pixel needs 13 bytes, or 20 with refined poses.
     """
 
     every: int = 5
@@ -134,6 +135,7 @@ class KeyframeSettings:
     roi_context_weight: float = 0.3
     pose_updates_per_frame: int = 2
     depth_edge_px: int = 2
+    rotates: bool = True
     max_pixels: int = 160_000_000
 
     def __post_init__(self) -> None:
@@ -146,7 +148,7 @@ class KeyframeSettings:
 
     def for_image_size(self, pixels: int) -> KeyframeSettings:
         """Return these settings with as many keyframes as max_pixels allows, at least one of each kind."""
-        share = min(1.0, self.max_pixels / (pixels * (self.window + self.long_term_keyframes + self.buffer)))
+        share = min(1.0, self.max_pixels / (pixels * (self.window + 2 * self.long_term_keyframes + self.buffer)))
         return replace(
             self,
             window=max(1, int(share * self.window)),
@@ -162,16 +164,19 @@ _BALANCED_LOSS = LossWeights(normalise_by_image=True)
 class OptimizationSettings:
     """Training of the map with one frame (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
 
-    loss: weights of Eq. (1). By default they are normalised by the image size. Adam's steps with the small masks of the
-    active phase are then comparable to those with full images. adam: learning rates. decay_after_updates: updates of a
-    Gaussian after which its learning rates decay, if `MapperSettings.pose_prior` allows an error; inf disables the
-    decay. With constant rates, Gaussians would oscillate between views that contradict each other. isotropic: make
-    Gaussians spheres after every frame. ema_updates: time constant, in updates, of the exponential moving average (EMA)
-    of each Gaussian. The EMA is shown and saved, but not trained; 0 shows the trained values.
+    active_views: views that an active iteration trains in turn, if the tiles of their regions are together no more than
+    one image; 1 is the paper's. loss: weights of Eq. (1). By default they are normalised by the image size. Adam's
+    steps with the small masks of the active phase are then comparable to those with full images. adam: learning rates.
+    decay_after_updates: updates of a Gaussian after which its learning rates decay, if `MapperSettings.pose_prior`
+    allows an error; inf disables the decay. With constant rates, Gaussians would oscillate between views that
+    contradict each other. isotropic: make Gaussians spheres after every frame. ema_updates: time constant, in updates,
+    of the exponential moving average (EMA) of each Gaussian. The EMA is shown and saved, but not trained; 0 shows the
+    trained values.
     """
 
     warmup_iterations: int = 2
     active_iterations: int = 6
+    active_views: int = 4
     active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS
     loss: LossWeights = _BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES
@@ -182,6 +187,7 @@ class OptimizationSettings:
     def __post_init__(self) -> None:
         for name in ("warmup_iterations", "active_iterations"):
             _require(getattr(self, name) >= 0, f"optimization {name}", "at least 0", getattr(self, name))
+        _require(self.active_views >= 1, "optimization active_views", "at least 1", self.active_views)
         updates = self.ema_updates
         _require(0 <= updates < math.inf, "optimization ema_updates", "at least 0", updates)
         updates = self.decay_after_updates

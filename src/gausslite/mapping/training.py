@@ -9,8 +9,7 @@ dB, and poses are fitted to all of it (bench/results).
 from __future__ import annotations
 
 import math
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from enum import StrEnum
@@ -27,6 +26,7 @@ from gausslite.mapping.density import densify, prune
 from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings, SaturationSettings
 from gausslite.mapping.splat_table import SplatTable
+from gausslite.mapping.view_rotation import ViewRotation, view_id
 from gausslite.render.rasterizer import Rasterizer, Subset, UpdateCounter
 
 _HORIZON_VISITS = 32
@@ -67,7 +67,7 @@ class RegionSaturation:
         """Compare the loss of an active iteration with the previous one on the view of this recorded frame."""
         if not 0.0 < loss < math.inf:
             return
-        view = _view_id(recorded)
+        view = view_id(recorded)
         previous = self._last_loss.pop(view, None)
         self._last_loss[view] = loss
         if len(self._last_loss) > _MAX_VIEWS:
@@ -102,12 +102,6 @@ class RegionSaturation:
         self._last_loss = dict(zip(views.tolist(), losses, strict=True))
         self._improvement, self._credit = get_floats(state, "mean", 2)
         [self._visits] = get_counts(state, "visits", 1)
-
-
-def _view_id(recorded: Frame) -> int:
-    """Return a number that identifies a recorded frame also after a restart, without its time: clocks may restart."""
-    pose = zlib.crc32(np.ascontiguousarray(recorded.T_world_camera).tobytes())
-    return (recorded.index & 0x7FFFFFFF) << 32 | pose
 
 
 class Stage(StrEnum):
@@ -237,6 +231,7 @@ class Trainer:
         self._rasterizer = rasterizer
         self._rng = rng
         self._saturation = RegionSaturation(settings.saturation)
+        self._rotations = {stage: ViewRotation() for stage in (Stage.WARM_UP, Stage.ACTIVE)}
         self._iterations = 0
         self._since_prune = 0
         self._since_densify = 0
@@ -247,14 +242,20 @@ class Trainer:
         return self._iterations
 
     def state(self) -> State:
-        """Return the iteration counts and the measured saturation, which are all the state between two frames."""
-        counts = int_array(self._iterations, self._since_prune, self._since_densify)
-        return {"counts": counts, **add_prefix("saturation", self._saturation.state())}
+        """Return the iteration counts, the measured saturation and the visited views: all state between two frames."""
+        return {
+            "counts": int_array(self._iterations, self._since_prune, self._since_densify),
+            **add_prefix("saturation", self._saturation.state()),
+            **add_prefix(Stage.WARM_UP, self._rotations[Stage.WARM_UP].state()),
+            **add_prefix(Stage.ACTIVE, self._rotations[Stage.ACTIVE].state()),
+        }
 
     def restore(self, state: State) -> None:
         """Continue from another trainer's state. Raises MapFileError."""
         self._iterations, self._since_prune, self._since_densify = get_counts(state, "counts", 3)
         self._saturation.restore(select_prefix(state, "saturation"))
+        for stage, rotation in self._rotations.items():
+            rotation.restore(select_prefix(state, stage))
 
     def reset_roi(self) -> None:
         """Forget how far the region has been trained: a new task has another region."""
@@ -267,10 +268,10 @@ class Trainer:
         the active ones that a saturated region releases. If the frame has no time for another warm-up iteration, active
         iterations replace it.
         """
-        roi_views = self._roi_views(views)
+        turns = self._turns(views)
         done, frame_is_done = 0, False
         while not frame_is_done:
-            done, frame_is_done = self._iterate_until_density_control(views, roi_views, done, scheduler)
+            done, frame_is_done = self._iterate_until_density_control(turns, done, scheduler)
             self._control_density(extent_m, scheduler)
         with scheduler.timing(Stage.FINALISATION):
             self._table.clip_colours(*_COLOUR_RANGE)
@@ -281,24 +282,30 @@ class Trainer:
 
     def idle_step(self, views: Sequence[WindowView], extent_m: float) -> None:
         """Run one iteration on earlier views while no frame waits; warm-up and active iterations alternate."""
-        roi_views, scheduler = self._roi_views(views), CountedScheduler()
-        stage = self._next_stage(self._iterations, bool(roi_views), scheduler)
+        turns, scheduler = self._turns(views), CountedScheduler()
+        stage = self._next_stage(self._iterations, Stage.ACTIVE in turns, scheduler)
         if stage is None:
             return
         binding = _Binding.of(self._table, self._settings.optimization.active_phase)
         with self._rasterizer.bind_tables(*binding.tables):
-            self._iterate(binding, stage, views if stage is Stage.WARM_UP else roi_views, self._rng.random())
+            self._iterate(binding, stage, turns[stage])
         self._control_density(extent_m, scheduler)
         self._table.clip_colours(*_COLOUR_RANGE)
         if self._iterations % self._settings.optimization.iterations == 0:
             self._update_ema()
 
-    def _roi_views(self, views: Sequence[WindowView]) -> list[WindowView]:
-        """Return the views of the active phase; none without the ROI component, so all iterations are warm-up."""
-        optimization = self._settings.optimization
-        if not self._settings.components.roi or optimization.active_iterations == 0:
-            return []
-        return [view for view in views if view.shows_roi]
+    def _turns(self, views: Sequence[WindowView]) -> dict[Stage, Iterator[WindowView]]:
+        """Return the views of each phase in the order of training (MVO), without end.
+
+        The active phase has those that show the ROI. Without the ROI component all iterations are warm-up.
+        """
+        views_of = {Stage.WARM_UP: list(views)}
+        if self._settings.components.roi and self._settings.optimization.active_iterations > 0:
+            views_of[Stage.ACTIVE] = [view for view in views if view.shows_roi]
+        if self._settings.keyframes.rotates:
+            return {stage: self._rotations[stage].turns(chosen) for stage, chosen in views_of.items() if chosen}
+        draws = _uniform_draws(self._rng)
+        return {stage: _drawn(chosen, draws) for stage, chosen in views_of.items() if chosen}
 
     def _next_stage(self, done: int, roi_in_view: bool, scheduler: StageScheduler) -> Stage | None:
         """Return the stage of the next iteration, after `done` ones; None ends the frame."""
@@ -313,30 +320,34 @@ class Trainer:
         return Stage.ACTIVE if roi_in_view and scheduler.trains_on(Stage.ACTIVE, per_frame) else None
 
     def _iterate_until_density_control(
-        self, views: Sequence[WindowView], roi_views: Sequence[WindowView], done: int, scheduler: StageScheduler
+        self, turns: Mapping[Stage, Iterator[WindowView]], done: int, scheduler: StageScheduler
     ) -> tuple[int, bool]:
         """Iterate until density control is due or the frame ends; return `done` and whether the frame ended.
 
         The rasterizer holds the tables meanwhile; rows move only in density control.
         """
         binding = _Binding.of(self._table, self._settings.optimization.active_phase)
-        draws = _uniform_draws(self._rng)
         with self._rasterizer.bind_tables(*binding.tables):
-            while (stage := self._next_stage(done, bool(roi_views), scheduler)) is not None:
+            while (stage := self._next_stage(done, Stage.ACTIVE in turns, scheduler)) is not None:
                 with scheduler.timing(stage):
-                    self._iterate(binding, stage, views if stage is Stage.WARM_UP else roi_views, next(draws))
+                    self._iterate(binding, stage, turns[stage])
                 done += 1
                 if self._prune_is_due(scheduler) or self._densify_is_due(scheduler):
                     return done, False
         return done, True
 
-    def _iterate(self, binding: _Binding, stage: Stage, views: Sequence[WindowView], draw: float) -> None:
-        """Run one iteration on a uniformly drawn view (MVO); draw is in [0, 1)."""
-        view = views[int(draw * len(views))]
+    def _iterate(self, binding: _Binding, stage: Stage, turns: Iterator[WindowView]) -> None:
+        """Run one iteration: on a whole image, or on the region in as many views as fit in the tiles of one image."""
         if stage is Stage.WARM_UP:
-            self._train_full_image(binding, view)
+            self._train_full_image(binding, next(turns))
         else:
-            self._train_roi(binding, view)
+            images = 0.0
+            for _ in range(self._settings.optimization.active_views):
+                view = next(turns)
+                self._train_roi(binding, view)
+                images += view.roi_share
+                if images + view.roi_share > 1.0:
+                    break
         self._iterations += 1
         self._since_prune += 1
         self._since_densify += 1
@@ -386,6 +397,11 @@ def _uniform_draws(rng: np.random.Generator) -> Iterator[float]:
     """Yield numbers in [0, 1), drawn in blocks: one generator call per iteration would cost measurable time."""
     while True:
         yield from rng.random(_RANDOM_BLOCK).tolist()
+
+
+def _drawn(views: Sequence[WindowView], draws: Iterator[float]) -> Iterator[WindowView]:
+    """Yield uniformly drawn views without end."""
+    return (views[int(draw * len(views))] for draw in draws)
 
 
 def _is_due(iterations: int, interval: int, stage: Stage, scheduler: StageScheduler) -> bool:

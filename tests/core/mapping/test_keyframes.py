@@ -60,12 +60,12 @@ def test_sharp_frames_are_kept_instead_of_blurred_neighbours() -> None:
 
 def test_fewer_large_images_are_kept() -> None:
     pixels = wall_frame(0).depth_m.size
-    settings = KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4, max_pixels=8 * pixels)
+    settings = KeyframeSettings(every=1, window=4, buffer=8, long_term_keyframes=4, max_pixels=10 * pixels)
     store = stored(settings, 40)
     assert [keyframe.frame.index for keyframe in store.buffer][::3] == [0, 39]
     assert len(store.buffer) == 4
     assert len(store.window) <= 4
-    assert store.image_bytes <= 8 * pixels * 14
+    assert store.image_bytes <= 10 * pixels * 14
     tiny = settings.for_image_size(10**9)
     assert (tiny.window, tiny.buffer, tiny.long_term_keyframes) == (1, 1, 1)
     assert KeyframeSettings().for_image_size(1280 * 720) == KeyframeSettings()
@@ -78,7 +78,7 @@ def test_a_larger_image_evicts_several_smaller_ones() -> None:
         CpuRasterizer(threads=1),
     )
     large = wall_frame(40)
-    store = KeyframeStore(replace(settings, max_pixels=4 * large.depth_m.size))
+    store = KeyframeStore(replace(settings, max_pixels=5 * large.depth_m.size))
     for index in range(20):
         frame = wall_frame(index, size=(16, 12))
         store.add(window_view(Keyframe(frame, middle_relevance(frame)), rasterizer, settings))
@@ -97,17 +97,22 @@ def test_frames_that_show_the_region_stay_in_the_window_and_spread_over_the_miss
     assert max(np.diff(sorted(kept))) <= 16
 
 
-def test_frames_without_the_region_are_kept_at_the_regular_interval_only() -> None:
-    settings, rasterizer = KeyframeSettings(every=4, long_term_keyframes=6), CpuRasterizer(threads=1)
+def test_as_many_frames_without_the_region_as_with_it_stay_in_the_window() -> None:
+    settings, rasterizer = KeyframeSettings(every=8, window=1, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = KeyframeStore(settings)
-    for index in range(9):
-        store.add(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
-    assert [view.keyframe.frame.index for view in store.window] == [0, 4, 8]
+    for index in range(64):
+        frame = wall_frame(index)
+        relevance = middle_relevance(frame) if index < 16 else RelevanceMap.empty(48, 64)
+        store.add(window_view(Keyframe(frame, relevance), rasterizer, settings))
+    with_region = [view.shows_roi for view in store.window]
+    assert (sum(with_region), len(with_region)) == (6, 13)
+    others = [view.keyframe.frame.index for view in store.window if not view.shows_roi]
+    assert (others[0], others[-2:]) == (16, [63, 56])
 
 
 def test_a_policy_without_a_task_keeps_as_many_views() -> None:
     settings, rasterizer = KeyframeSettings(every=8, window=2, long_term_keyframes=6), CpuRasterizer(threads=1)
-    store = KeyframeStore(settings, follows_task=False)
+    store = KeyframeStore(settings)
     for index in range(40):
         store.add(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
     kept = [view.keyframe.frame.index for view in store.window]
@@ -118,13 +123,13 @@ def test_a_policy_without_a_task_keeps_as_many_views() -> None:
     assert Components(sb=False, roi=False, sis=False).follow_task
 
 
-def test_a_long_term_view_is_removed_if_revised_relevance_is_empty() -> None:
+def test_a_view_whose_revised_relevance_is_empty_counts_among_the_others() -> None:
     settings, rasterizer = KeyframeSettings(every=4, long_term_keyframes=6), CpuRasterizer(threads=1)
     store = stored(settings, 3)
     wrong = store.window[0].keyframe
     assert wrong.frame.index == 1
     store.replace_view(window_view(Keyframe(wrong.frame, RelevanceMap.empty(48, 64)), rasterizer, settings))
-    assert [view.keyframe.frame.index for view in store.window] == [2, 0]
+    assert [(view.keyframe.frame.index, view.shows_roi) for view in store.window] == [(1, False), (2, True), (0, True)]
 
 
 def test_tiles_cover_the_region_and_its_margin() -> None:

@@ -65,8 +65,8 @@ def test_the_paper_policy_has_the_settings_of_the_paper() -> None:
     assert not seeding.fill_depth
     assert seeding.background_share == 0.0
     assert (keyframes.every, keyframes.window, keyframes.long_term_keyframes) == (5, 24, 0)
-    assert (keyframes.roi_context_weight, keyframes.depth_edge_px) == (0.0, 0)
-    assert (optimization.warmup_iterations, optimization.active_iterations) == (2, 6)
+    assert (keyframes.roi_context_weight, keyframes.depth_edge_px, keyframes.rotates) == (0.0, 0, False)
+    assert (optimization.warmup_iterations, optimization.active_iterations, optimization.active_views) == (2, 6, 1)
     assert optimization.active_phase is ActivePhase.ACTIVE_ONLY
     assert optimization.loss == LossWeights(colour=0.8, depth=1.0, ssim=0.2, normalise_by_image=False)
     assert (optimization.ema_updates, settings.adam) == (0.0, AdamSettings())
@@ -122,5 +122,5 @@ def test_a_mission_maps_with_the_parts_disabled(name: str, iterations: int | Non
 def test_with_all_flags_disabled_no_component_is_left() -> None:
     bare = disable(policy(TASK), ABLATION_FLAGS)
     assert bare.components == Components(sb=False, mvo=False, roi=False, sis=False, gfd=False)
-    keyframes = KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0, depth_edge_px=0)
+    keyframes = KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0, depth_edge_px=0, rotates=False)
     assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == keyframes

@@ -156,7 +156,7 @@ def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
     trained = []
     for index in range(12, 18):
         trained.append(task_mapper.process(wall_frame(index, SIZE, shift_m=-1.1)))
-        assert len(mapper._keyframes.window) <= 3 + 2
+        assert len(mapper._keyframes.window) <= 3 + 2 * 2
     assert mapper.next_unevaluated is None
     assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
     assert any(view.shows_roi for view in mapper._keyframes.window)
