@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from gausslite.domain import verbs
-from gausslite.task import lexicon
+from gausslite.task import lexicon, verbs
 from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind, adjectives_only
 from gausslite.task.clause_types import (
     SUBJECT_PRONOUNS,

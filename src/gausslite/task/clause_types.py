@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Final
 
-from gausslite.domain.verbs import BELONGING_VERBS, verb_base
 from gausslite.task.lexicon import word_set
 from gausslite.task.tags import Tag
+from gausslite.task.verbs import BELONGING_VERBS, verb_base
 
 TaggedWords = Sequence[tuple[str, Tag]]
 

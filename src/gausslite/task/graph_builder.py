@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gausslite.domain.task import TargetRole
-from gausslite.domain.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS, PLACE_VERBS, SPEAKING_VERBS
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
 from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
 from gausslite.task.roles import RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
+from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS, PLACE_VERBS, SPEAKING_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is

@@ -7,7 +7,7 @@ from typing import Final
 
 from gausslite.domain.nouns import is_thing
 from gausslite.domain.task import Superlative
-from gausslite.domain.verbs import word_set as word_set
+from gausslite.task.verbs import word_set as word_set
 
 COLOURS: Final = word_set(
     "red green blue yellow orange black white grey gray brown pink purple beige silver golden gold turquoise violet "

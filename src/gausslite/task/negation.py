@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from gausslite.domain.verbs import HOLDING_VERBS, POSTURE_VERBS, TOOL_VERBS, verb_base
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind
 from gausslite.task.clause_types import INABILITIES, WISHES
 from gausslite.task.lexicon import is_attribute, singular, word_set
 from gausslite.task.tags import Tag
+from gausslite.task.verbs import HOLDING_VERBS, POSTURE_VERBS, TOOL_VERBS, verb_base
 
 HAVE_FORMS: Final = word_set("has have had")
 NOUN_PHRASE_TAGS: Final = frozenset({Tag.NOUN, Tag.ADJECTIVE})

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from gausslite.domain import verbs
 from gausslite.domain.task import TargetRole
-from gausslite.task import lexicon
+from gausslite.task import lexicon, verbs
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, phrase_from_text
 from gausslite.task.graph_draft import Clause, GraphDraft, RelationAssigner, RelationTerms
 from gausslite.task.lexicon import word_set

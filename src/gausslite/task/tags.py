@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Final
 
-from gausslite.domain import verbs
 from gausslite.domain.nouns import is_thing
-from gausslite.task import lexicon
+from gausslite.task import lexicon, verbs
 from gausslite.task.lexicon import UNCHANGED, is_attribute, singular, word_set
 from gausslite.task.tokens import PREPOSITIONS, split_bounds
 

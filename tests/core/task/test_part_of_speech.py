@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gausslite.domain.verbs import VERBS, base_of_ed, base_of_ing, base_of_s, verb_base
 from gausslite.task.clause_types import ClauseType, clause_types
 from gausslite.task.grounding import normalise_text
 from gausslite.task.tags import TRANSITION_COSTS, Tag, best_tags, tag_words
 from gausslite.task.tokens import lexical_units
+from gausslite.task.verbs import VERBS, base_of_ed, base_of_ing, base_of_s, verb_base
 
 TAGS = st.sampled_from(sorted(Tag, key=lambda tag: tag.value))
 OPTIONS = st.dictionaries(TAGS, st.integers(0, 40), min_size=1, max_size=3)
