@@ -66,12 +66,13 @@ def repair_of(path: Path) -> str:
 
 
 def is_bag(path: Path) -> bool:
-    """True for a file of a bag, and for a folder with metadata.yaml or with nothing but files of bags."""
+    """True for a file of a bag, and for a folder with rosbag2's metadata.yaml or with nothing but files of bags."""
     if not path.is_dir():
         return path.is_file() and bool(kind_of(path))
     files = list(path.iterdir())
     only_bags = all(kind_of(file) or file.name.endswith(_BESIDE) for file in files)
-    return (path / METADATA).is_file() or (only_bags and has_bag(path))
+    is_listed = (path / METADATA).is_file()
+    return bool(_metadata(path)) or ((only_bags or is_listed) and has_bag(path))
 
 
 def has_bag(path: Path) -> bool:

@@ -27,7 +27,9 @@ from small_bag import (
     time_of,
     write_small_bag,
 )
+from tiny_sequences import write_tum
 
+from gausslite.datasets.open import open_source
 from gausslite.domain.errors import DatasetError
 from gausslite_ros.bag_file import BagAddress
 from gausslite_ros.bag_source import BagSource
@@ -231,3 +233,9 @@ def test_topics_of_all_parts_are_listed(tmp_path: Path) -> None:
     address = BagAddress.parse(str(tmp_path / "run"))
     assert address is not None
     assert f"color={COLOUR}" in BagSource(address).description
+
+
+def test_a_folder_of_images_with_a_metadata_file_of_its_own_is_no_bag(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr1")
+    (folder / "metadata.yaml").write_text("robot: husky\n")
+    assert len(open_source(str(folder))) == 3
