@@ -131,8 +131,8 @@ def ask_on_image(browser: viser.ClientHandle, view: CameraView, prompted: Callab
     Then the browser shows the map as before, and `prompted` gets the point or the box, clipped to the image.
     """
     camera, T_world_camera, scene = view.camera, view.T_world_camera, browser.scene
-    size_m = np.array([camera.width_px / camera.fx_px, camera.height_px / camera.fy_px]) * _IMAGE_M
-    left_top_m = -np.array([camera.cx_px / camera.fx_px, camera.cy_px / camera.fy_px]) * _IMAGE_M
+    left_top_m = np.array(camera.slopes(0.0, 0.0)) * _IMAGE_M
+    size_m = np.array(camera.slopes(float(camera.width_px), float(camera.height_px))) * _IMAGE_M - left_top_m
     middle_m = T_world_camera @ np.array([*(left_top_m + size_m / 2), _IMAGE_M, 1.0])
     image = scene.add_image(
         "/camera_image",
