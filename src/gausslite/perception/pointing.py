@@ -6,18 +6,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from gausslite.domain.camera import project
+from gausslite.domain.camera import back_project, project
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import PointedObject, Region
 from gausslite.perception.depth_segmenter import DepthSegmenter
-from gausslite.perception.region_growth import grown
-from gausslite.perception.settings import SurfaceSettings
+from gausslite.perception.lifting import without_background_planes
+from gausslite.perception.settings import LiftingSettings, SurfaceSettings
 from gausslite.perception.surface import SurfaceVotes, mask_votes, surface_mask
 
 _NEAR_M: Final = 0.05
@@ -25,14 +26,22 @@ _NEAR_M: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class PointingSettings:
-    """Which frames show a point in the world.
+    """How a region grows around a point.
 
-    max_error_m: between the point and the depth of a frame that shows it. error_step_m: smaller differences of this
-    error do not matter.
+    radii_m: balls around the point, the smallest first; the first that contains the connected surface wins.
+    max_reach_share: of the radius, that the surface may reach. min_ball_share: of the ball's pixels, that the surface
+    has; fewer are a speck beside a plane. seed_px: the surface's largest distance from the point. gap_px: gaps in depth
+    that do not divide a surface. max_error_m: between a point in the world and the depth of a frame that shows it.
+    error_step_m: smaller differences of this error do not matter.
     """
 
+    radii_m: tuple[float, ...] = (0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
+    max_reach_share: float = 0.9
     max_error_m: float = 0.03
     error_step_m: float = 0.005
+    min_ball_share: float = 0.1
+    seed_px: int = 3
+    gap_px: int = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +75,12 @@ def mask_on_image(
     """Return the mask of points and boxes as `region_on_image` does. Raises InvalidInputError."""
     if not (points_px or boxes_px):
         raise InvalidInputError("points: expected at least one point or box, got none")
+    settings = PointingSettings()
     mask = np.zeros(frame.depth_m.shape, np.bool_)
     for x, y in points_px:
-        mask |= grown(frame, *_pixel(frame, x, y))
+        mask |= _grown(frame, *_pixel(frame, x, y), settings)
     for box in boxes_px:
-        mask |= _in_box(frame, box)
+        mask |= _in_box(frame, box, settings)
     return mask
 
 
@@ -95,7 +105,7 @@ def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tup
         place = ",".join(f"{value:g}" for value in point_m)
         raise InvalidInputError(f"target {place}: expected a point on a surface that a frame shows, none shows it")
     _, frame, (row, column) = best
-    return frame, grown(frame, row, column)
+    return frame, _grown(frame, row, column, settings)
 
 
 def pointed_masks(
@@ -137,7 +147,7 @@ def _pixel(frame: Frame, x: float, y: float) -> tuple[int, int]:
     return row, column
 
 
-def _in_box(frame: Frame, box: tuple[float, float, float, float]) -> Bool[ndarray, "h w"]:
+def _in_box(frame: Frame, box: tuple[float, float, float, float], settings: PointingSettings) -> Bool[ndarray, "h w"]:
     """Return the part inside a box of what grows from the box's main surface. Raises InvalidInputError."""
     height, width = frame.depth_m.shape
     left, top, right, bottom = box
@@ -151,7 +161,7 @@ def _in_box(frame: Frame, box: tuple[float, float, float, float]) -> Bool[ndarra
     middle = int(np.argmin((rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2))
     inside = np.zeros(frame.depth_m.shape, np.bool_)
     inside[int(top) : int(np.ceil(bottom)), int(left) : int(np.ceil(right))] = True
-    return grown(frame, int(rows[middle]), int(columns[middle])) & inside
+    return _grown(frame, int(rows[middle]), int(columns[middle]), settings) & inside
 
 
 def _seen(
@@ -173,3 +183,41 @@ def _seen(
     if error_m > settings.max_error_m:
         return None
     return (int(error_m / settings.error_step_m), float(np.linalg.norm(p_camera))), (row, column)
+
+
+def _grown(frame: Frame, row: int, column: int, settings: PointingSettings) -> Bool[ndarray, "h w"]:
+    """Return the connected surface around a pixel with depth, without the planes behind and below it.
+
+    If no ball contains such a surface, as on a table or a wall, it grows as far as depth and colour are continuous.
+    """
+    points_m = back_project(frame.depth_m, frame.camera)
+    distance_m = np.where(frame.depth_m > 0, np.linalg.norm(points_m - points_m[row, column], axis=2), np.inf)
+    for radius_m in settings.radii_m:
+        ball = distance_m <= radius_m
+        standing = without_background_planes(ball, frame.depth_m, frame.camera, LiftingSettings())
+        seed = _nearest(standing, row, column, settings.seed_px)
+        if seed is not None:
+            surface = _connected(standing, seed, settings)
+            is_contained = np.percentile(distance_m[surface], 98) <= settings.max_reach_share * radius_m
+            if is_contained and np.count_nonzero(surface) >= settings.min_ball_share * np.count_nonzero(ball):
+                return surface
+    return DepthSegmenter().grow(frame, (row, column), distance_m <= settings.radii_m[-1])
+
+
+def _nearest(mask: Bool[ndarray, "h w"], row: int, column: int, within_px: int) -> tuple[int, int] | None:
+    """Return the mask's nearest pixel to another, within a distance; None if there is none."""
+    top, left = max(0, row - within_px), max(0, column - within_px)
+    rows, columns = np.nonzero(mask[top : row + within_px + 1, left : column + within_px + 1])
+    if len(rows) == 0:
+        return None
+    best = int(np.argmin((rows + top - row) ** 2 + (columns + left - column) ** 2))
+    return int(rows[best]) + top, int(columns[best]) + left
+
+
+def _connected(mask: Bool[ndarray, "h w"], seed: tuple[int, int], settings: PointingSettings) -> Bool[ndarray, "h w"]:
+    """Return the part of a mask around a pixel; gaps of few pixels do not divide it."""
+    gap = np.ones((settings.gap_px, settings.gap_px), np.uint8)
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, gap)
+    _, labels = cv2.connectedComponents(closed, connectivity=4)
+    part: Bool[ndarray, "h w"] = mask & (labels == labels[seed])
+    return part

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from gausslite.domain.camera import Value, back_project, project
+from gausslite.domain.camera import back_project, project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.voxels import VoxelGrid
@@ -371,7 +371,7 @@ def _resolved(votes: SurfaceVotes, frame: Frame) -> SurfaceVotes:
     return votes.resolved(max(frame.camera.length_m(1.0, middle_m), 2.0 * depth_deviation_m(middle_m)))
 
 
-def depth_deviation_m(depth_m: Value) -> Value:
+def depth_deviation_m(depth_m: float) -> float:
     """Return the standard deviation of a structured-light camera's depth (Nguyen et al., 3DIMPVT 2012, Eq. 3)."""
     return 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
 
