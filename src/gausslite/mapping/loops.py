@@ -41,9 +41,10 @@ _ALIGNED_STD = np.array([0.03] * 3 + [np.radians(0.7)] * 3)
 """Error of a registered motion before images refine it: translation (m) and rotation (rad)."""
 _MIN_ALIGNED = 0.5
 """Share of the points in both images whose depth must agree."""
-_NOISE_M, _NOISE_DEG, _NOISE_STDS = 0.006, 0.15, 2.0 * 2.0**0.5
-"""A motion that the poses contradict by less than these, or by less than this many standard deviations of a pose's
-error, moves nothing until another one does."""
+_NOISE = 0.006, 0.15
+"""A motion that the poses contradict by less, in metres and degrees, moves nothing until another one does."""
+_NOISE_STDS = 2.0 * 2.0**0.5
+"""So does a loop within this many standard deviations of a pose's error: it is noise of single poses and no drift."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +81,10 @@ class LoopCloser:
         self._table = table
         self._rasterizer = rasterizer
         self._graph = PoseGraph(prior)
-        self._noise_m = max(_NOISE_M, _NOISE_STDS * prior.translation_m)
-        self._noise_deg = max(_NOISE_DEG, _NOISE_STDS * prior.rotation_deg)
+        self._noise = (
+            max(_NOISE[0], _NOISE_STDS * prior.translation_m),
+            max(_NOISE[1], _NOISE_STDS * prior.rotation_deg),
+        )
         self._descriptors: list[PlaceDescriptor] = []
         self._times_ns: list[int] = []
         self._refused = self._withdrawn = self._corrections = 0
@@ -114,9 +117,8 @@ class LoopCloser:
         view = View.of(keyframe.frame)
         self._descriptors.append(view.descriptor)
         loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - MIN_GAP])
-        # until a loop shows a drift, images err more than the odometry from one keyframe to the next
-        step = self._graph.newest_step if self._corrections else None
-        is_noise = all(motion is None or self._is_noise(motion) for motion in (loop, step))
+        step = self._graph.newest_step
+        is_noise = (loop is None or self._is_noise(loop)) and (step is None or self._is_noise(step, _NOISE))
         if loop is not None:
             self._graph.add_loop(loop)
         return None if is_noise else self._solve(loop)
@@ -200,10 +202,11 @@ class LoopCloser:
 
         return verify(render, keyframe.frame, T_world_camera).is_accepted
 
-    def _is_noise(self, loop: Loop) -> bool:
-        """True if the poses agree with a motion, so that it does not move the map."""
-        error_m, error_deg = self._graph.residual(loop)
-        return error_m < self._noise_m and error_deg < self._noise_deg
+    def _is_noise(self, motion: Loop, limits: tuple[float, float] | None = None) -> bool:
+        """True if the poses agree with a motion to these limits (m, degrees), so that it does not move the map."""
+        error_m, error_deg = self._graph.residual(motion)
+        limit_m, limit_deg = limits or self._noise
+        return error_m < limit_m and error_deg < limit_deg
 
 
 def _relative(old: Keyframe, keyframe: Keyframe) -> Float64[ndarray, "4 4"]:

@@ -30,9 +30,9 @@ _DRIFT_M, _DRIFT_DEG = 0.03, 1.0
 _LEAST_STD_M, _LEAST_STD_DEG = 0.002, 0.1
 _MAP_SHARE = 1.0 / 3.0
 """Error of the motion between two successive poses that are refined against the map, as a share of the odometry's."""
-_IMAGE_STD_M, _IMAGE_STD_DEG, _IMAGE_SHARE = 0.004, 0.1, 0.7
+_IMAGE_STD_M, _IMAGE_STD_DEG = 0.004, 0.1
 """Error of a motion by alignment of two images; in a home, 1.3 mm and 0.04 degrees (root mean square). The defects of a
-camera from which the prior was estimated also disturb the alignment: at least this share of the prior."""
+camera from which the prior was estimated also disturb the alignment, so its error is at least the prior."""
 _START_STD = 1e-4
 _MAX_STDS = 3.0
 _STAYS_M, _STAYS_DEG = 0.002, 0.05
@@ -77,8 +77,8 @@ class PoseGraph:
     def __init__(self, prior: PoseExposurePrior) -> None:
         """Prior: of the error of single poses."""
         self._image_noise = _noise(
-            max(_IMAGE_STD_M, _IMAGE_SHARE * prior.translation_m),
-            max(_IMAGE_STD_DEG, _IMAGE_SHARE * prior.rotation_deg),
+            max(_IMAGE_STD_M, prior.translation_m),
+            max(_IMAGE_STD_DEG, prior.rotation_deg),
         )
         self._T_world_keyframe: list[Float64[ndarray, "4 4"]] = []
         self._T_world_prior = np.eye(4)
@@ -113,12 +113,12 @@ class PoseGraph:
         """Add the next keyframe, with its pose before refinement, as earlier loops correct it, and its refined pose.
 
         T_last_keyframe: its pose in the last keyframe's camera by both images; None if they do not align. It is not
-        used if the odometry contradicts it.
+        used if the odometry contradicts it, or if the camera's defects disturb it more than the map's poses.
         """
         if self._T_world_keyframe:
             odometry = inverse(self._T_world_prior) @ T_world_prior
             in_map = inverse(self._T_world_keyframe[-1]) @ T_world_keyframe
-            if T_last_keyframe is not None and _is_likely(T_last_keyframe, odometry):
+            if T_last_keyframe is not None and self._is_useful(T_last_keyframe, odometry):
                 self._steps.append(_Step(odometry, T_last_keyframe, by_images=True))
             else:
                 self._steps.append(_Step(odometry, in_map, by_images=False))
@@ -181,6 +181,13 @@ class PoseGraph:
         self._accepted = solution.accepted
         return motions
 
+    def _is_useful(self, T: Float64[ndarray, "4 4"], odometry: Float64[ndarray, "4 4"]) -> bool:
+        """Return True for a motion by images within three standard deviations of the odometry's, if they err less."""
+        noise = _odometry_noise(odometry)
+        max_rad, max_m = (_MAX_STDS * float(std) for std in noise[[0, 3]])
+        is_likely = translation_m(T, odometry) < max_m and bool(np.radians(rotation_angle_deg(T, odometry)) < max_rad)
+        return is_likely and bool((self._image_noise < _MAP_SHARE * noise).all())
+
     def _chain(self, gtsam: Any, first: int) -> tuple[Any, Any]:
         """Return the factors of successive keyframes from this one on, whose pose is fixed, and the present poses."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -241,12 +248,6 @@ def _odometry_noise(T: Float64[ndarray, "4 4"]) -> Float64[ndarray, "6"]:
     """Return the standard deviations of a motion by the odometry."""
     walked = float(np.linalg.norm(T[:3, 3])) + np.radians(rotation_angle_deg(np.eye(4), T))
     return _noise(_LEAST_STD_M + _DRIFT_M * walked**0.5, _LEAST_STD_DEG + _DRIFT_DEG * walked**0.5)
-
-
-def _is_likely(T: Float64[ndarray, "4 4"], odometry: Float64[ndarray, "4 4"]) -> bool:
-    """Return True if a measured motion is within three standard deviations of the odometry's."""
-    max_rad, max_m = (_MAX_STDS * float(std) for std in _odometry_noise(odometry)[[0, 3]])
-    return translation_m(T, odometry) < max_m and bool(np.radians(rotation_angle_deg(T, odometry)) < max_rad)
 
 
 def _between(

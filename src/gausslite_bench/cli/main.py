@@ -122,7 +122,8 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str, str]] = {
         configure_places,
         "frames of a sequence that are localised in a saved map",
         "Localise each frame in the map of a run, from any start. Report how many poses are right, wrong and refused, "
-        "and the time. With mirrored images, or in another place, every pose is wrong.",
+        "the time, and after how many frames a run is localised. With mirrored images, or in another place, every pose "
+        "is wrong. --loops presents the frames as keyframes that may close a loop instead.",
     ),
     "registration": (
         configure_registration,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from gausslite.datasets.source import frame_size, select_frames
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import rotation_angle_deg, translation_m
 from gausslite.evaluation.views import view_map
-from gausslite.mission.prior import SavedMap
+from gausslite.mission.prior import MAX_LOCALISED_FRAMES, SavedMap
 from gausslite.mission.results import as_text
 from gausslite.mission.settings import SourceSettings
 from gausslite.places.localisation import PlaceMap
@@ -48,7 +48,11 @@ class PlacesOptions:
 
 @dataclass(frozen=True, slots=True)
 class PlaceScore:
-    """Frames that were tried, localised rightly (within 25 cm and 10 degrees) and wrongly, and medians of the right."""
+    """Frames that were tried, localised rightly (within 25 cm and 10 degrees) and wrongly, and medians of the right.
+
+    starts: runs of up to 12 of these frames, one from each; localised: those with two right frames, which a new run on
+    this map needs, and the median number of frames until then.
+    """
 
     frames: int
     right: int
@@ -56,15 +60,19 @@ class PlaceScore:
     error_m: float
     error_deg: float
     seconds: float
+    starts: int
+    localised: int
+    frames_to_localise: float
 
     @classmethod
     def of(cls, places: PlaceMap, frames: Iterable[Frame], elsewhere: bool = False) -> PlaceScore:
         """Localise the frames, whose own poses are true; elsewhere: no pose is right."""
-        errors, seconds, wrong = [], [], 0
+        errors, seconds, is_right, wrong = [], [], [], 0
         for frame in frames:
             start_s = time.process_time()
             place = places.localise(frame)
             seconds.append(time.process_time() - start_s)
+            is_right.append(False)
             if place is None:
                 continue
             error = _error(place.T_world_camera, frame.T_world_camera)
@@ -72,15 +80,37 @@ class PlaceScore:
                 wrong += 1
             else:
                 errors.append(error)
+                is_right[-1] = True
+        needed = _frames_until_two(is_right)
         median_m, median_deg = np.median(errors, axis=0).tolist() if errors else (np.nan, np.nan)
-        return cls(len(seconds), len(errors), wrong, median_m, median_deg, float(np.median(seconds)))
+        return cls(
+            frames=len(seconds),
+            right=len(errors),
+            wrong=wrong,
+            error_m=median_m,
+            error_deg=median_deg,
+            seconds=float(np.median(seconds)),
+            starts=max(len(seconds) - MAX_LOCALISED_FRAMES + 1, 1),
+            localised=len(needed),
+            frames_to_localise=float(np.median(needed)) if needed else np.nan,
+        )
 
     def line(self) -> str:
         """Return one line for a person."""
         return (
             f"{self.frames} frames: {self.right} right ({1e3 * self.error_m:.0f} mm, {self.error_deg:.1f} deg), "
-            f"{self.wrong} wrong, {self.frames - self.right - self.wrong} refused; {self.seconds:.2f} s CPU time each"
+            f"{self.wrong} wrong, {self.frames - self.right - self.wrong} refused; {self.seconds:.2f} s CPU time each; "
+            f"localised from {self.localised} of {self.starts} starts, after {self.frames_to_localise:.0f} frames"
         )
+
+
+def _frames_until_two(is_right: Sequence[bool]) -> list[int]:
+    """Return, for each start from which two of the next 12 frames are right, the number of frames up to the second."""
+    counts = []
+    for start in range(max(len(is_right) - MAX_LOCALISED_FRAMES + 1, 1)):
+        right = [i for i, found in enumerate(is_right[start : start + MAX_LOCALISED_FRAMES], 1) if found]
+        counts += right[1:2]
+    return counts
 
 
 def _error(found: Float64[ndarray, "4 4"], true: Float64[ndarray, "4 4"]) -> tuple[float, float]:
