@@ -253,10 +253,7 @@ def align(
 def align_images(
     reference: Frame, frame: Frame, T_reference_camera: Float64[ndarray, "4 4"], prior_std: Float64[ndarray, "6"]
 ) -> Alignment | None:
-    """Return the frame's pose in the reference's camera, near the given one; None if too few points agree.
-
-    Both are images of a camera, which have more detail than a rendering of the map. prior_std: as in `align`.
-    """
+    """Return the frame's pose in the reference's camera, near the given one, as `align` does with a rendering."""
     measured = (reference.depth_m > 0).astype(np.float32)
     rgb = reference.rgb.astype(np.float32) / np.float32(255.0)
     model = _Model.of_surface(Rendering(rgb, reference.depth_m, measured, None), reference.camera, FINE)
