@@ -9,15 +9,18 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
 
 from gausslite.codec.stored import from_bytes
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store import FusionStore
+from gausslite.fusion.store_values import StoredScores
 from gausslite.fusion.vote import FusedMap, fuse
 from gausslite_bench.chaos.journal import JournalReader, RecordKind
 
@@ -119,7 +122,20 @@ def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> S
             return compare_opened(agents, opened)
 
 
-def compare_opened(agents: Mapping[str, AgentAcknowledgements], store: FusionStore) -> StoreComparison:
+@runtime_checkable
+class StoredUpdates(Protocol):
+    """What a comparison reads, as FusionStore has it."""
+
+    def batch(self, agent_id: str) -> VoxelBatch:
+        """Return an agent's updates."""
+        ...
+
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+        """Return the agent's totals on these voxels."""
+        ...
+
+
+def compare_opened(agents: Mapping[str, AgentAcknowledgements], store: StoredUpdates) -> StoreComparison:
     """Compare an open store with what was acknowledged before it was opened."""
     results = [_compare_agent(agent_id, agent, store) for agent_id, agent in agents.items()]
     return StoreComparison(
@@ -130,7 +146,7 @@ def compare_opened(agents: Mapping[str, AgentAcknowledgements], store: FusionSto
     )
 
 
-def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: FusionStore) -> StoreComparison:
+def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: StoredUpdates) -> StoreComparison:
     batch = store.batch(agent_id)
     seqs = store.stored(agent_id, batch.keys).update_seqs.tolist()
     held = {

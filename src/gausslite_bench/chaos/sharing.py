@@ -7,15 +7,22 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from threading import RLock
+
+from jaxtyping import Int64
+from numpy import ndarray
 
 from gausslite.codec.ply import ply_bytes
 from gausslite.domain.errors import StorageError, UnavailableError
-from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots
+from gausslite.domain.voxels import VoxelBatch
+from gausslite.fusion.regions import slots_of
+from gausslite.fusion.store_rows import UpdateLog, read_batches, require_intact
+from gausslite.fusion.store_values import StoredScores
 from gausslite.wire.clients import Export, FusionClient
 from gausslite_bench.chaos.acknowledged import (
     AgentAcknowledgements,
@@ -30,6 +37,7 @@ from gausslite_bench.server.sharing import new_database
 
 _PROGRESS_S, _POLL_S, _MAX_FAULT_S = 240.0, 0.02, 2.0
 _STARTS = 10
+_SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM gausslite.voxel_updates ORDER BY slot, number"
 _END_SERVERS = """
 SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = current_database() AND pid <> pg_backend_pid()
 """
@@ -208,19 +216,33 @@ class _SharingRun:
         )
 
 
-class _Reader:
-    """Stands in for the holder of the slots' locks: the comparison only reads, while the servers write."""
+class _Snapshot:
+    """The updates of a database at one instant, while servers write."""
 
-    def write(self, work: object) -> None:  # noqa: ARG002 - of the protocol
-        raise StorageError("chaos: the comparison writes nothing")
+    def __init__(self, url: str) -> None:
+        # an extra
+        import psycopg
+
+        self._log, self._lock = UpdateLog(slots_of), RLock()
+        with psycopg.connect(url) as db:
+            rows = db.execute(_SELECT_UPDATES, binary=True).fetchall()
+        self._log.load(require_intact(rows, StorageError))
+        self._data = {row[0]: row[3] for row in rows}
+
+    def batch(self, agent_id: str) -> VoxelBatch:
+        """Return an agent's updates."""
+        return read_batches(self._log, self._lock, self._read, None, (agent_id,))[agent_id]
+
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+        """Return the agent's totals on these voxels."""
+        return self._log.index.stored(agent_id, keys)
+
+    def _read(self, numbers: Sequence[int]) -> dict[int, bytes]:
+        return {number: self._data[number] for number in numbers}
 
 
 def _compare_database(agents: Mapping[str, AgentAcknowledgements], url: str) -> StoreComparison:
-    # an extra
-    from gausslite.fusion.postgres_store import PostgresStore
-
-    with closing(PostgresStore(url, OwnedSlots("", ALL_SLOTS), _Reader())) as store:
-        return compare_opened(agents, store)
+    return compare_opened(agents, _Snapshot(url))
 
 
 def _end_connections(url: str) -> None:
