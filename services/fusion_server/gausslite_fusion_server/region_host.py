@@ -105,7 +105,8 @@ class RegionHost:
                 if self._failure:
                     _log.info("server %s: it shares the store again", self.server)
                 self._failure = ""
-            except StorageError as error:
+            except (StorageError, UnavailableError) as error:
+                # the latter if the locks are lost while the engine is opened
                 if not self._failure:
                     _log.error("server %s: %s; trying again", self.server, error)
                 self._failure = str(error)
