@@ -416,7 +416,9 @@ class GaussianMapper:
         if rendered is None or keyframe.recorded is not None:
             rendered = self.render_view(frame)
         with scheduler.timing(Stage.SEEDING):
-            context = SeedingContext(table.free_slots, rendered, table.means_m[table.active])
+            share = self._settings.seeding.background_share
+            max_active = round((1.0 - share) * table.capacity) if share > 0 else None
+            context = SeedingContext(table.free_slots, rendered, table.means_m[table.active], max_active)
             seeds = self._seeder.seed(frame, keyframe.relevance, context)
             return self._insert(replace(seeds, anchor=keyframe.anchor))
 

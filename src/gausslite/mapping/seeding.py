@@ -208,6 +208,8 @@ def _count_around(mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
 
 
 _REFERENCE_PIXELS = 640 * 480
+_MIN_ROI_ROOM = 0.05
+"""Lowest density of ROI seeds relative to that of an empty map."""
 """Image size of the seed counts in SeedingSettings."""
 
 
@@ -216,12 +218,13 @@ class SeedingContext:
     """State of the map before seeding.
 
     free_slots: Gaussians that still fit under the cap. rendered: the map rendered from the frame's pose, None if the
-    map is empty. active_means_m: means of the active Gaussians.
+    map is empty. active_means_m: means of the active Gaussians. max_active: how many may be active; None: any number.
     """
 
     free_slots: int
     rendered: RenderedView | None
     active_means_m: Float32[ndarray, "n 3"]
+    max_active: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,7 +278,12 @@ class Seeder:
         sparse = undersampled_roi(frame, relevance.roi, active_means_m, settings.roi_pixels_per_gaussian)
         pixels = sparse & (frame.depth_m <= settings.max_depth_m)
         budget = round(settings.roi_share * settings.first_frame_seeds * pixels.size / _REFERENCE_PIXELS)
-        return self._draw(frame, relevance, self._roi_pool(pixels, budget), self._pixel_weights(frame))
+        return self._draw(
+            frame,
+            relevance,
+            self._roi_pool(pixels, budget, settings.roi_pixels_per_gaussian),
+            self._pixel_weights(frame),
+        )
 
     def _split_budget(
         self, frame: Frame, surface: Frame, relevance: RelevanceMap, context: SeedingContext
@@ -296,16 +304,25 @@ class Seeder:
             no_roi = _Pool(np.zeros_like(seedable), 0, stratified=False)
             return no_roi, self._background_pool(candidates, budget, context.free_slots)
         roi_budget = int(settings.roi_share * budget)
+        spacing = self._roi_pixels_per_gaussian(context)
         if settings.fill_sparse_roi:
-            sparse = undersampled_roi(frame, relevance.roi, context.active_means_m, settings.roi_pixels_per_gaussian)
+            sparse = undersampled_roi(frame, relevance.roi, context.active_means_m, spacing)
             roi_candidates = roi_candidates | (sparse & seedable)
-        roi_pool = self._roi_pool(relevance.roi & roi_candidates, roi_budget)
+        roi_pool = self._roi_pool(relevance.roi & roi_candidates, roi_budget, spacing)
         background_budget = budget - roi_budget
         return roi_pool, self._background_pool(candidates & ~relevance.roi, background_budget, context.free_slots)
 
-    def _roi_pool(self, pixels: Bool[ndarray, "h w"], budget: int) -> _Pool:
-        """Limit the ROI seeds to one per `roi_pixels_per_gaussian` pixels. Eviction frees slots for them."""
-        max_count = int(np.ceil(np.count_nonzero(pixels) / self._settings.roi_pixels_per_gaussian))
+    def _roi_pixels_per_gaussian(self, context: SeedingContext) -> float:
+        """Return the spacing of ROI seeds: a region that fills its share of the cap gets sparser ones."""
+        spacing = self._settings.roi_pixels_per_gaussian
+        if context.max_active is None:
+            return spacing
+        room = 1.0 - len(context.active_means_m) / max(context.max_active, 1)
+        return spacing / max(room, _MIN_ROI_ROOM)
+
+    def _roi_pool(self, pixels: Bool[ndarray, "h w"], budget: int, pixels_per_gaussian: float) -> _Pool:
+        """Limit the ROI seeds to one per `pixels_per_gaussian` pixels. Eviction frees slots for them."""
+        max_count = int(np.ceil(np.count_nonzero(pixels) / pixels_per_gaussian))
         return _Pool(pixels, min(budget, max_count), stratified=False)
 
     def _background_pool(self, pixels: Bool[ndarray, "h w"], budget: int, free_slots: int) -> _Pool:

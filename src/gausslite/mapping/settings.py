@@ -67,10 +67,11 @@ class SeedingSettings:
     ROI pixels per active Gaussian, below which the ROI is dense enough. fill_sparse_roi: seed ROI pixels with fewer
     active Gaussians too. reserved_views: background seeds leave free slots for this many more images.
     min_density_ratio: lowest density of background seeds relative to a first frame's. background_share: share of the
-    cap that ROI seeds leave to the background. opacity, roi_scale, background_scale: opacity and the multipliers m of
-    s0 (Sec. III-C.2); init_scale: m without SIS. edge_epsilon: ε of GFD (Sec. III-C.3). fill_depth: blocks without a
-    measured depth are seeded too, at `with_filled_depth`. Sensors have none on dark, glossy or distant surfaces and at
-    the border of registered images; without seeds, the colours there distort the Gaussians around.
+    cap that ROI seeds leave to the background; they become sparser as the region fills the rest. opacity, roi_scale,
+    background_scale: opacity and the multipliers m of s0 (Sec. III-C.2); init_scale: m without SIS. edge_epsilon: ε of
+    GFD (Sec. III-C.3). fill_depth: blocks without a measured depth are seeded too, at `with_filled_depth`. Sensors have
+    none on dark, glossy or distant surfaces and at the border of registered images; without seeds, the colours there
+    distort the Gaussians around.
     """
 
     first_frame_seeds: int = 60_000

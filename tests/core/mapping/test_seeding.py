@@ -145,3 +145,15 @@ def test_background_that_becomes_the_region_is_seeded() -> None:
     seeds = seeder(sb=True, sis=True).seed(frame, middle_relevance(frame), state)
     assert len(seeds.roi) > 0
     assert len(seeds.background) == 0
+
+
+def test_seeds_of_the_region_become_sparser_as_it_fills_its_share_of_the_cap() -> None:
+    frame = wall_frame()
+    elsewhere = np.full((500, 3), 9.0, np.float32)
+    counts = [
+        len(seeder(sb=True).seed(frame, middle_relevance(frame), SeedingContext(9_000, None, elsewhere, limit)).roi)
+        for limit in (None, 1000, 625, 500)
+    ]
+    assert counts[1] == pytest.approx(counts[0] / 2, abs=1)
+    assert counts[2] == pytest.approx(counts[0] / 5, abs=1)
+    assert counts[3] == pytest.approx(counts[0] / 20, abs=1)
