@@ -255,12 +255,10 @@ def align_images(
 ) -> Alignment | None:
     """Return the frame's pose in the reference's camera, near the given one, as `align` does with a rendering."""
     measured = (reference.depth_m > 0).astype(np.float32)
-    rgb = reference.rgb.astype(np.float32) / np.float32(255.0)
-    model = _Model.of_surface(Rendering(rgb, reference.depth_m, measured, None), reference.camera, FINE)
-    if model is None:
-        return None
-    solution = _solve(model, frame, FINE, T_reference_camera, prior_std, inverse(T_reference_camera))
-    if solution is None:
+    image = Rendering(reference.rgb.astype(np.float32) / np.float32(255.0), reference.depth_m, measured, None)
+    model = _Model.of_surface(image, reference.camera, FINE)
+    solution = model and _solve(model, frame, FINE, T_reference_camera, prior_std, inverse(T_reference_camera))
+    if not solution:
         return None
     return Alignment(inverse(solution.T_camera_rendered), solution.overlap, solution.residual)
 
