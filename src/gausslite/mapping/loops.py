@@ -41,6 +41,10 @@ _ALIGNED_STD = np.array([0.03] * 3 + [np.radians(0.7)] * 3)
 """Error of a registered motion before images refine it: translation (m) and rotation (rad)."""
 _MIN_ALIGNED = 0.5
 """Share of the points in both images whose depth must agree."""
+_MAX_MOVED = 0.04, 1.0
+"""By how much, in metres and degrees, the rendering may move the pose of a loop. Where depth or images of a camera err,
+surfaces and images agree on a wrong motion, and the map draws the pose back: by 4 to 18 cm in the kitchen of 7-Scenes,
+by at most 3 cm and 0.5 degrees for true loops of homes with drift."""
 _NOISE = 0.006, 0.15
 """A motion that the poses contradict by less, in metres and degrees, moves nothing until another one does."""
 _NOISE_STDS = 2.0 * 2.0**0.5
@@ -192,7 +196,7 @@ class LoopCloser:
         return None
 
     def _is_verified(self, keyframe: Keyframe, T_world_camera: Float64[ndarray, "4 4"]) -> bool:
-        """True if what earlier keyframes have mapped, rendered from this pose, agrees with the keyframe's image."""
+        """True if what earlier keyframes have mapped, rendered from this pose, agrees with its image there."""
         table = self._table
         earlier = (table.anchor <= keyframe.anchor - MIN_GAP) & (table.anchor != NO_ANCHOR)
         subset = Subset(None, np.flatnonzero(earlier).astype(np.uint32))
@@ -200,7 +204,10 @@ class LoopCloser:
         def render(camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None) -> Rendering:
             return self._rasterizer.forward(table.rows, camera, inverse(T_world_camera), subset, motion)
 
-        return verify(render, keyframe.frame, T_world_camera).is_accepted
+        verification = verify(render, keyframe.frame, T_world_camera)
+        moved_m = translation_m(verification.T_world_camera, T_world_camera)
+        moved_deg = rotation_angle_deg(verification.T_world_camera, T_world_camera)
+        return verification.is_accepted and moved_m < _MAX_MOVED[0] and moved_deg < _MAX_MOVED[1]
 
     def _is_noise(self, motion: Loop, limits: tuple[float, float] | None = None) -> bool:
         """True if the poses agree with a motion to these limits (m, degrees), so that it does not move the map."""
