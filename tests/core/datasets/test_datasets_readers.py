@@ -251,4 +251,4 @@ def test_poses_far_from_the_origin_are_mapped_from_a_stated_origin(
     np.testing.assert_allclose(offsets_m, np.tile(FAR_M - (460_000, 5_430_000, 0), (3, 1)), atol=1e-5)
     assert (expected.world_frame, source.world_frame) == ("fr1", "fr1 from 460000 5430000 0")
     assert any("the map's origin is at 460000 5430000 0 m" in note for note in source.notes)
-    assert expected.notes == ()
+    assert not any("origin" in note for note in expected.notes)
