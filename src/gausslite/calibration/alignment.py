@@ -3,8 +3,7 @@
 Points of the rendering are moved by the pose and looked up in the photograph (direct image alignment). Splats move
 rigidly with the camera, so this equals the derivative through the rasterizer, and one rendering serves all steps.
 Refinement uses the luminance of fixed pixels. Tracking, which starts farther away, associates the points anew in each
-step and adds point-to-plane residuals, as in KinectFusion (Newcombe et al. 2011, Eq. 16) and Kintinuous (Whelan et al.
-2015).
+step and adds point-to-plane residuals: KinectFusion (Newcombe et al. 2011, Eq. 16), Kintinuous (Whelan et al. 2015).
 """
 
 from __future__ import annotations
@@ -244,10 +243,10 @@ def align(
     model = _Model.of_surface(rendering, frame.camera, levels)
     if model is None:
         return None
-    solution = _solve(model, frame, levels, np.eye(4), prior_std)
-    if solution is None:
+    found = _solve(model, frame, levels, np.eye(4), prior_std)
+    if found is None:
         return None
-    return Alignment(T_world_rendered @ inverse(solution.T_camera_rendered), solution.overlap, solution.residual)
+    return Alignment(T_world_rendered @ inverse(found.T_camera_rendered), found.overlap, found.residual)
 
 
 def align_images(
@@ -257,10 +256,10 @@ def align_images(
     measured = (reference.depth_m > 0).astype(np.float32)
     image = Rendering(reference.rgb.astype(np.float32) / np.float32(255.0), reference.depth_m, measured, None)
     model = _Model.of_surface(image, reference.camera, FINE)
-    solution = model and _solve(model, frame, FINE, T_reference_camera, prior_std, inverse(T_reference_camera))
-    if not solution:
+    if model is None:
         return None
-    return Alignment(inverse(solution.T_camera_rendered), solution.overlap, solution.residual)
+    found = _solve(model, frame, FINE, T_reference_camera, prior_std, inverse(T_reference_camera))
+    return None if found is None else Alignment(inverse(found.T_camera_rendered), found.overlap, found.residual)
 
 
 def fit_pose(
