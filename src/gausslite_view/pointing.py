@@ -41,13 +41,14 @@ class PointingPanel:
         gui = page.server.gui
         with gui.add_folder("Point", order=0):
             self._noun: Any = gui.add_text("Noun", "", hint="what it is, for the team; may be empty")
-            self._in_map = gui.add_button("Point at an object", hint="then click the object in the map")
-            self._in_image = gui.add_button("Point in the image", hint="then click the object, or drag a box around it")
+            in_map = gui.add_button("Point at an object", hint="then click the object in the map")
+            in_image = gui.add_button("Point in the image", hint="then click the object, or drag a box around it")
             self._object: Any = gui.add_dropdown("Object", (_NO_OBJECT,))
             self._exclude = gui.add_button("Not this one")
             self._message = gui.add_html("")
-        self._in_map.on_click(lambda _: self._await_click())
-        self._in_image.on_click(lambda event: self._run(lambda: self._await_prompt(event.client)))
+        self._end_wait: Callable[[], None] | None = None
+        in_map.on_click(lambda _: self._run(lambda: self._wait(self._await_click)))
+        in_image.on_click(lambda event: self._run(lambda: self._wait(lambda: self._await_prompt(event.client))))
         self._exclude.on_click(lambda _: self._run(self._exclude_object))
 
     def show_objects(self, objects: Sequence[ObjectLandmark]) -> None:
@@ -58,29 +59,35 @@ class PointingPanel:
         if tuple(self._object.options) != options:
             self._object.options = options
 
-    def _await_click(self) -> None:
+    def _wait(self, begin: Callable[[], str]) -> str:
+        """Begin to wait for a click; a button that is pressed while the page waits ends that wait."""
+        if self._end_wait is None:
+            return begin()
+        self._end_wait()
+        self._end_wait = None
+        return "no object was chosen"
+
+    def _answer(self, action: Callable[[], str]) -> None:
+        self._end_wait = None
+        self._run(action)
+
+    def _await_click(self) -> str:
         """Take the next click in the scene as the object."""
-        self._in_map.disabled = True
-        self._message.content = text_html(["click the object in the map"])
 
         @self._scene.on_click()
         def clicked(event: Any) -> None:
             self._scene.remove_click_callback(clicked)
-            self._in_map.disabled = False
-            self._run(lambda: self._point_at(event.ray_origin, event.ray_direction))
+            self._answer(lambda: self._point_at(event.ray_origin, event.ray_direction))
+
+        self._end_wait = lambda: self._scene.remove_click_callback(clicked)
+        return "click the object in the map"
 
     def _await_prompt(self, browser: viser.ClientHandle | None) -> str:
         """Show the newest keyframe to this browser, and take the next click or box as the object."""
         view = self._client.camera_view()
         if view is None or browser is None:
             raise InvalidInputError("point: expected a mapped frame first, there is no image yet")
-
-        def prompted(prompt: Prompt) -> None:
-            self._in_image.disabled = False
-            self._run(lambda: self._point_in(view, prompt))
-
-        self._in_image.disabled = True
-        ask_on_image(browser, view, prompted)
+        self._end_wait = ask_on_image(browser, view, lambda prompt: self._answer(lambda: self._point_in(view, prompt)))
         return f"frame {view.frame_index}: click the object, or drag a box around it"
 
     def _point_at(self, origin_m: PointM, direction: PointM) -> str:
@@ -125,10 +132,13 @@ class PointingPanel:
             self._message.content = text_html([str(error)])
 
 
-def ask_on_image(browser: viser.ClientHandle, view: CameraView, prompted: Callable[[Prompt], None]) -> None:
+def ask_on_image(
+    browser: viser.ClientHandle, view: CameraView, prompted: Callable[[Prompt], None]
+) -> Callable[[], None]:
     """Show a keyframe's image in front of one browser's camera until a person clicks it or drags a box on it.
 
-    Then the browser shows the map as before, and `prompted` gets the point or the box, clipped to the image.
+    Then the browser shows the map as before, and `prompted` gets the point or the box, clipped to the image. Return a
+    function that ends this without an answer.
     """
     camera, T_world_camera, scene = view.camera, view.T_world_camera, browser.scene
     left_top_m = np.array(camera.slopes(0.0, 0.0)) * _IMAGE_M
@@ -147,12 +157,15 @@ def ask_on_image(browser: viser.ClientHandle, view: CameraView, prompted: Callab
     shown.position, shown.look_at, shown.up_direction = T_world_camera[:3, 3], middle_m[:3], -T_world_camera[:3, 1]
     shown.fov = 2 * float(np.arctan(_MARGIN * max(size_m[1], size_m[0] / shown.aspect) / 2 / _IMAGE_M))
 
-    def answer(*screen: tuple[float, float]) -> None:
-        corners = tuple(_pixel(shown, position, view) for position in screen)
+    def end() -> None:
         scene.remove_click_callback(clicked)
         scene.remove_rect_select_callback(drawn)
         image.remove()
         shown.position, shown.look_at, shown.up_direction, shown.fov = before
+
+    def answer(*screen: tuple[float, float]) -> None:
+        corners = tuple(_pixel(shown, position, view) for position in screen)
+        end()
         prompted(corners)
 
     @scene.on_click()
@@ -162,6 +175,8 @@ def ask_on_image(browser: viser.ClientHandle, view: CameraView, prompted: Callab
     @scene.on_rect_select()
     def drawn(event: viser.SceneRectSelectEvent) -> None:
         answer(event.screen_min, event.screen_max)
+
+    return end
 
 
 def _pixel(shown: viser.CameraHandle, screen: tuple[float, float], view: CameraView) -> tuple[float, float]:
