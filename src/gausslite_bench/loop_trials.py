@@ -94,7 +94,7 @@ class LoopTrials:
                 is_right = not elsewhere and _is_near(found, frame, _WRONG_M, _WRONG_DEG)
                 right += is_right
                 wrong += not is_right
-        return LoopScore(len(seconds), near, refused, rejected, right, wrong, float(np.median(seconds)))
+        return LoopScore(len(seconds), near, refused, rejected, right, wrong, seconds=float(np.median(seconds)))
 
 
 def _keyframe(frame: Frame, number: int) -> Keyframe:

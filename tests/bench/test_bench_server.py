@@ -67,7 +67,9 @@ def test_servers_that_share_a_mission_do_no_foreign_work_and_replace_a_killed_on
     arguments = ("bench", "server", "--held", "20000", "--agents", "4", "--seconds", "2", "--servers", "2")
     assert main([*arguments, "--store", postgres.new_database(), "--json"]) == 0
     (result,) = json.loads(capsys.readouterr().out)
-    assert result["received"] == [16, 16]
+    # agents begin at both servers, and go on where most of their voxels are owned
+    assert sum(result["received"]) == 32
+    assert min(result["received"]) > 0
     assert sum(result["stored"]) >= 32
     assert result["missing"] == result["foreign"] == 0
     assert min(result["server_cpu_ms"], result["failover_s"]) > 0

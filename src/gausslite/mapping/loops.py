@@ -46,7 +46,7 @@ _MAX_MOVED = 0.04, 1.0
 surfaces and images agree on a wrong motion, and the map draws the pose back: by 4 to 18 cm in the kitchen of 7-Scenes,
 by at most 3 cm and 0.5 degrees for true loops of homes with drift."""
 _NOISE = 0.006, 0.15
-"""A motion that the poses contradict by less, in metres and degrees, moves nothing until another one does."""
+"""A loop that the poses contradict by less, in metres and degrees, moves nothing until another one does."""
 _NOISE_STDS = 2.0 * 2.0**0.5
 """So does a loop within this many standard deviations of a pose's error: it is noise of single poses and no drift."""
 
@@ -110,21 +110,18 @@ class LoopCloser:
 
         prior: the frame with the pose before refinement, by the odometry or by tracking. kept: keyframes with images.
         """
-        last = None
         for old in kept:
             if old.frame.capture_time_ns == self._times_ns[old.anchor]:
                 self._graph.set_pose(old.anchor, old.frame.T_world_camera)
-                last = old if old.anchor == keyframe.anchor - 1 else last
-        T_last_keyframe = None if last is None else _aligned(last, keyframe, _relative(last, keyframe))
-        self._graph.add(prior.T_world_camera, keyframe.frame.T_world_camera, T_last_keyframe)
+        self._graph.add(prior.T_world_camera, keyframe.frame.T_world_camera)
         self._times_ns.append(keyframe.frame.capture_time_ns)
         view = View.of(keyframe.frame)
         self._descriptors.append(view.descriptor)
         loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - MIN_GAP])
-        step = self._graph.newest_step
-        is_noise = (loop is None or self._is_noise(loop)) and (step is None or self._is_noise(step, _NOISE))
-        if loop is not None:
-            self._graph.add_loop(loop)
+        if loop is None:
+            return None
+        is_noise = self._is_noise(loop)
+        self._graph.add_loop(loop)
         return None if is_noise else self._solve(loop)
 
     def state(self) -> State:
@@ -146,7 +143,7 @@ class LoopCloser:
         self._descriptors = [PlaceDescriptor(values.copy()) for values in descriptors]
         self._times_ns = get_array(state, "times_ns", (len(self._graph),), np.int64).tolist()
 
-    def _solve(self, newest: Loop | None) -> Float64[ndarray, "k 4 4"]:
+    def _solve(self, newest: Loop) -> Float64[ndarray, "k 4 4"]:
         """Solve the pose graph and report the loops that it rejects."""
         solution = self._graph.solve()
         for i in np.flatnonzero(self._graph.accepted & ~solution.accepted).tolist():
@@ -209,11 +206,10 @@ class LoopCloser:
         moved_deg = rotation_angle_deg(verification.T_world_camera, T_world_camera)
         return verification.is_accepted and moved_m < _MAX_MOVED[0] and moved_deg < _MAX_MOVED[1]
 
-    def _is_noise(self, motion: Loop, limits: tuple[float, float] | None = None) -> bool:
-        """True if the poses agree with a motion to these limits (m, degrees), so that it does not move the map."""
-        error_m, error_deg = self._graph.residual(motion)
-        limit_m, limit_deg = limits or self._noise
-        return error_m < limit_m and error_deg < limit_deg
+    def _is_noise(self, loop: Loop) -> bool:
+        """True if the poses agree with a loop, so that it does not move the map."""
+        error_m, error_deg = self._graph.residual(loop)
+        return error_m < self._noise[0] and error_deg < self._noise[1]
 
 
 def _relative(old: Keyframe, keyframe: Keyframe) -> Float64[ndarray, "4 4"]:

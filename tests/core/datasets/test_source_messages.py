@@ -81,7 +81,7 @@ def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtu
     rows = (folder / "depth.txt").read_text().splitlines()
     (folder / "depth.txt").write_text("\n".join(rows[:3]))
     open_recorded(str(folder), None)
-    [line] = capsys.readouterr().err.splitlines()
+    _camera, line = capsys.readouterr().err.splitlines()
     assert line == (f"{folder}: 1 of 4 colour images are skipped: without a pose at their time or depth within 20 ms")
 
 

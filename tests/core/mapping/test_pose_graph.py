@@ -99,24 +99,3 @@ def test_a_loop_with_an_unknown_keyframe_is_refused() -> None:
     graph.add_loop(Loop(0, COUNT, np.eye(4)))
     with pytest.raises(MapFileError, match="loops"):
         PoseGraph(PoseExposurePrior()).restore(graph.state())
-
-
-def test_images_of_successive_keyframes_remove_drift_without_a_loop() -> None:
-    true = circle()
-    graph, T = PoseGraph(PoseExposurePrior()), true[0]
-    graph.add(T, T)
-    for before, after in itertools.pairwise(true):
-        T = T @ inverse(before) @ after @ DRIFT
-        graph.add(T, T, inverse(before) @ after)
-    before_m = error_m(graph, true)
-    graph.apply(graph.solve())
-    assert error_m(graph, true) < 0.2 * before_m
-
-
-def test_a_motion_by_images_that_the_odometry_contradicts_is_not_used() -> None:
-    graph = PoseGraph(PoseExposurePrior())
-    graph.add(np.eye(4), np.eye(4))
-    T = transform_of(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    graph.add(T, T, transform_of(np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0])))
-    assert graph.newest_step is None
-    np.testing.assert_allclose(graph.solve().T_world_keyframe[1], T, atol=1e-6)

@@ -42,7 +42,9 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_continues_a_saved_map_in_its_frame(
     saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = _map(f"{HOME}&changes=stool:gone,blanket:gone", tmp_path / "next", "--prior", str(saved))
+    # an active iteration trains up to four views, so that the saved stool takes twice as long to fade
+    more = ("--prior", str(saved), "--iterations", "12")
+    report = _map(f"{HOME}&changes=stool:gone,blanket:gone", tmp_path / "next", *more)
     printed = capsys.readouterr()
     assert "localised after" in printed.err
     assert "gone from (3." in printed.out

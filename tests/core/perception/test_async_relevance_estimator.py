@@ -156,7 +156,8 @@ def test_a_keyframe_in_the_window_receives_its_delayed_relevance() -> None:
 def test_a_frame_outside_the_window_is_not_revised() -> None:
     executor = DeferredExecutor()
     mapper = GaussianMapper(
-        MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=1, window=2)), CpuRasterizer(threads=1)
+        MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=1, window=2, long_term_keyframes=0)),
+        CpuRasterizer(threads=1),
     )
     loop = TaskMapper(async_estimator(executor, every=9), mapper)
     for index in range(4):
