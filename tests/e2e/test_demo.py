@@ -84,7 +84,9 @@ def test_the_demo_maps_fuses_scores_and_ends_its_processes_on_a_recording_with_a
     assert "One map for all tasks: the voted map has" in done.stdout
     sizes = {name: len(read_ply(out / f"{name}.ply")) for name in ("concatenation", "vote")}
     both = sum(len(read_ply(out / agent / "map.ply")) for agent in report["agents"])
-    assert sizes["vote"] < sizes["concatenation"] == both
+    # a handover leaves out distant guesses
+    assert sizes["vote"] < sizes["concatenation"]
+    assert 0.95 * both < sizes["concatenation"] <= both
     assert list((out / "pictures").glob("*.png"))
     assert f"{out / 'report.html'} shows them" in done.stdout
     page = (out / "report.html").read_text(encoding="utf-8")
