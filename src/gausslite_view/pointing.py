@@ -98,24 +98,22 @@ class PointingPanel:
         if not middle_m > 0:
             raise InvalidInputError("point: expected a click on the map, there is nothing")
         x, y, z = (T_world_camera[:3, 3] + middle_m * T_world_camera[:3, 2]).tolist()
-        noun = self._assign(PointedObject(point_m=(x, y, z), noun=self._chosen_noun))
+        noun = self._chosen_noun
+        self._client.assign_task(pointed=[PointedObject(point_m=(x, y, z), noun=noun)])
         return f"{noun} at ({x:.2f}, {y:.2f}, {z:.2f}) m is a target"
 
     def _point_in(self, view: CameraView, prompt: Prompt) -> str:
         """Point at what a click or a box on a keyframe shows. Raises GaussLiteError."""
         index, noun = view.frame_index, self._chosen_noun
         points_px, boxes_px = (prompt[:1], ()) if len(prompt) == 1 else ((), (prompt[0] + prompt[1],))
-        self._assign(PointedObject(points_px, boxes_px, frame_index=index, noun=noun))
+        pointed = PointedObject(points_px, boxes_px, frame_index=index, noun=noun)
+        self._client.assign_task(pointed=[pointed])
         place = " to ".join(f"{x:.0f},{y:.0f}" for x, y in prompt)
         return f"{noun} at {place} of frame {index} is a target"
 
     @property
     def _chosen_noun(self) -> str:
         return noun_of(str(self._noun.value).strip()) or UNNAMED
-
-    def _assign(self, pointed: PointedObject) -> str:
-        self._client.assign_task(pointed=[pointed])
-        return pointed.noun
 
     def _exclude_object(self) -> str:
         chosen = self._objects.get(str(self._object.value))

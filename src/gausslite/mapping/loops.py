@@ -163,7 +163,8 @@ class LoopCloser:
         frame = keyframe.frame
         nearest = min(earlier, key=lambda old: _distance(old.frame, frame))
         if _distance(nearest.frame, frame) < _MAX_DISTANCE:
-            loop = self._registered(keyframe, view, nearest, _relative(nearest, keyframe))
+            guess = inverse(nearest.frame.T_world_camera) @ frame.T_world_camera
+            loop = self._registered(keyframe, view, nearest, guess)
             if loop is not None:
                 return loop
         similar = max(earlier, key=self._similarity)
@@ -210,12 +211,6 @@ class LoopCloser:
         """True if the poses agree with a loop, so that it does not move the map."""
         error_m, error_deg = self._graph.residual(loop)
         return error_m < self._noise[0] and error_deg < self._noise[1]
-
-
-def _relative(old: Keyframe, keyframe: Keyframe) -> Float64[ndarray, "4 4"]:
-    """Return T_old_keyframe by the poses in the map."""
-    T_old_keyframe: Float64[ndarray, "4 4"] = inverse(old.frame.T_world_camera) @ keyframe.frame.T_world_camera
-    return T_old_keyframe
 
 
 def _aligned(
