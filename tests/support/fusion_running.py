@@ -23,8 +23,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineSettings
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store import FusionStore
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb

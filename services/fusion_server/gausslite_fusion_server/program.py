@@ -14,9 +14,8 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageEr
 from gausslite.fusion import store_maintenance
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fit_process import FitProcess
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import rasterizer_of_backend
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import StoreReport
 from gausslite.process import Sibling, print_message, sibling

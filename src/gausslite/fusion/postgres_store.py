@@ -18,24 +18,19 @@ from gausslite.domain.errors import StorageError
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
 from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots, slots_of
 from gausslite.fusion.store import Execute, FusionStore
-from gausslite.fusion.store_migration import rows_of_voxels
 from gausslite.fusion.store_rows import SLOT_BITS, LogChange, data_checksum, require_intact
 from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import PROBE_RECORD, TRAFFIC_RECORD
 
 SCHEMA_VERSION = 3
-_VOXEL_ROWS_VERSION = 1
-"""Had one row a voxel; such a database is converted when a server opens it."""
 LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
-_UPDATES_SCHEMA = """
+_SCHEMA = """
+CREATE SCHEMA gausslite;
 CREATE TABLE gausslite.voxel_updates (
     slot SMALLINT NOT NULL, number BIGINT NOT NULL, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL,
     voxels BYTEA NOT NULL, PRIMARY KEY (slot, number));
 ALTER TABLE gausslite.voxel_updates ALTER COLUMN voxels SET STORAGE EXTERNAL;
-CREATE TABLE IF NOT EXISTS gausslite.servers (pid INTEGER PRIMARY KEY, address TEXT NOT NULL);
-"""
-_SCHEMA = """
-CREATE SCHEMA gausslite;
+CREATE TABLE gausslite.servers (pid INTEGER PRIMARY KEY, address TEXT NOT NULL);
 CREATE TABLE gausslite.sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
 CREATE TABLE gausslite.keyframes (
     agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
@@ -180,7 +175,10 @@ class PostgresStore(FusionStore):
         return f"@{self._owned.server}" if self._owned is not None and name in _OF_SERVER else agent_id
 
     def _damaged(self, what: str) -> StorageError:
-        return _damaged(self._name, what)
+        return StorageError(
+            f"store {self._name}: {what} is damaged (its checksum does not match); restore a backup of the database, "
+            "or delete the row, and the agents send again what is missing"
+        )
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         return self._reader.run(lambda db: db.execute(_translated(query), values, binary=True).fetchall())
@@ -248,42 +246,17 @@ def begin_opening(db: Database) -> str:
 
 
 def create_or_check(db: Database, name: str) -> None:
-    """Create the tables, or convert those of an earlier release. Raises StorageError for other ones."""
+    """Create the tables. Raises StorageError for those of another release."""
     if db.execute("SELECT to_regclass('gausslite.properties')").fetchone() == (None,):
         db.execute(_SCHEMA)
-        db.execute(_UPDATES_SCHEMA)
         db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
         db.execute(_SET_PROPERTY, ("incarnation_id", secrets.token_hex(16)))
-    if _property(db, "schema_version") == str(_VOXEL_ROWS_VERSION):
-        _convert(db, name)
     version = _property(db, "schema_version")
     if version != str(SCHEMA_VERSION):
         raise StorageError(
             f"store {name}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use that "
             "release, or another database, and the agents send their updates again"
         )
-
-
-def _convert(db: Database, name: str) -> None:
-    """Write the rows of a database with one row a voxel as those of this version."""
-    db.execute("ALTER TABLE gausslite.voxel_updates RENAME TO voxel_rows")
-    db.execute("ALTER INDEX gausslite.voxel_updates_pkey RENAME TO voxel_rows_pkey")
-    db.execute(_UPDATES_SCHEMA)
-    with db.cursor("convert", binary=True) as cursor:
-        cursor.execute('SELECT * FROM gausslite.voxel_rows ORDER BY agent_id COLLATE "C", voxel')
-        for number, *row in rows_of_voxels(cursor, lambda what: _damaged(name, what), slots_of):
-            db.execute(
-                "INSERT INTO gausslite.voxel_updates VALUES (%s, %s, %s, %s, %s)", (number >> SLOT_BITS, number, *row)
-            )
-    db.execute("DROP TABLE gausslite.voxel_rows")
-    db.execute(_SET_PROPERTY, ("schema_version", str(SCHEMA_VERSION)))
-
-
-def _damaged(name: str, what: str) -> StorageError:
-    return StorageError(
-        f"store {name}: {what} is damaged (its checksum does not match); restore a backup of the database, or delete "
-        "the row, and the agents send again what is missing"
-    )
 
 
 def _by_slot(numbers: Iterable[int]) -> Iterator[tuple[int, list[int]]]:

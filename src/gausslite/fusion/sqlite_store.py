@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
-import logging
 import os
 import secrets
 import sqlite3
@@ -17,15 +16,10 @@ from typing import Any
 
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.store import Execute, FusionStore
-from gausslite.fusion.store_migration import rows_of_voxels
 from gausslite.fusion.store_rows import LogChange, require_intact
 
-_log = logging.getLogger(__name__)
-IN_MEMORY = Path(":memory:")
-"""Of a store that ends with its process."""
+_IN_MEMORY = Path(":memory:")
 SCHEMA_VERSION = 7
-_VOXEL_ROWS_VERSION = 6
-"""Had one row a voxel; such a store is converted when a server opens it."""
 PAGE_BYTES = 4096
 RESTORE_ADVICE = (
     "restore a backup (gausslite-fusion-server restore BACKUP STORE), or delete the damaged rows "
@@ -34,11 +28,9 @@ RESTORE_ADVICE = (
 _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
 # 32 MiB: smaller logs are copied into the file so often that acknowledgements wait
 _CHECKPOINT_PAGES = 8192
-_UPDATES_SCHEMA = """
+_SCHEMA = """
 CREATE TABLE voxel_updates (
     number INTEGER PRIMARY KEY, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, voxels BLOB NOT NULL);
-"""
-_SCHEMA = """
 CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
 CREATE TABLE keyframes (
     agent_id TEXT NOT NULL, frame_index INTEGER NOT NULL, checksum INTEGER NOT NULL, data BLOB NOT NULL,
@@ -83,7 +75,7 @@ class StoreLock:
         os.close(self._file)
 
 
-def open_existing(path: Path, versions: Sequence[int] = (SCHEMA_VERSION,)) -> sqlite3.Connection:
+def open_existing(path: Path) -> sqlite3.Connection:
     """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError."""
     if not path.is_file():
         raise StorageError(f"store {path}: expected a GaussLite store, got no file")
@@ -98,15 +90,10 @@ def open_existing(path: Path, versions: Sequence[int] = (SCHEMA_VERSION,)) -> sq
             if db.execute("PRAGMA application_id").fetchone()[0] != _APPLICATION_ID:
                 raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
             version = db.execute("PRAGMA user_version").fetchone()[0]
-            if version not in versions:
-                advice = (
-                    "a server converts it when it opens it"
-                    if version == _VOXEL_ROWS_VERSION
-                    else "use that release, or another file, and the agents send their updates again"
-                )
+            if version != SCHEMA_VERSION:
                 raise StorageError(
                     f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; "
-                    f"{advice}"
+                    "use that release, or another file, and the agents send their updates again"
                 )
     except BaseException:
         db.close()
@@ -118,7 +105,7 @@ def open_or_create(path: Path) -> sqlite3.Connection:
     """Connect to a store for writing; a missing file is created. Raises StorageError."""
     if not path.exists():
         _create(path)
-    db = open_existing(path, (SCHEMA_VERSION, _VOXEL_ROWS_VERSION))
+    db = open_existing(path)
     try:
         with storage_errors(path):
             db.execute("PRAGMA journal_mode = WAL")
@@ -126,8 +113,6 @@ def open_or_create(path: Path) -> sqlite3.Connection:
             # freed pages are overwritten only where that costs no additional write
             db.execute("PRAGMA secure_delete = FAST")
             db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
-            if db.execute("PRAGMA user_version").fetchone()[0] == _VOXEL_ROWS_VERSION:
-                _convert(db, path)
     except BaseException:
         db.close()
         raise
@@ -135,7 +120,7 @@ def open_or_create(path: Path) -> sqlite3.Connection:
 
 
 def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
-    if path != IN_MEMORY:
+    if path != _IN_MEMORY:
         opened.callback(StoreLock(path).release)
         return open_or_create(path)
     db = connect(path)
@@ -145,7 +130,7 @@ def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
 
 def _create_tables(db: sqlite3.Connection) -> None:
     header = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
-    db.executescript(f"BEGIN IMMEDIATE; {header} {_UPDATES_SCHEMA} {_SCHEMA} COMMIT;")
+    db.executescript(f"BEGIN IMMEDIATE; {header} {_SCHEMA} COMMIT;")
     renew_incarnation(db)
 
 
@@ -158,27 +143,6 @@ def _create(path: Path) -> None:
     with contextlib.closing(connect(new)) as db, storage_errors(path):
         _create_tables(db)
     new.replace(path)
-
-
-def _convert(db: sqlite3.Connection, path: Path) -> None:
-    """Write the rows of a store with one row a voxel as those of this version, in one transaction."""
-    _log.info("store %s: converted from schema version %d", path, _VOXEL_ROWS_VERSION)
-    db.execute("BEGIN IMMEDIATE")
-    try:
-        db.execute("ALTER TABLE voxel_updates RENAME TO voxel_rows")
-        db.execute(_UPDATES_SCHEMA)
-        old = db.execute("SELECT * FROM voxel_rows ORDER BY agent_id, voxel")
-        db.executemany(_INSERT, rows_of_voxels(old, lambda what: _damaged(path, what)))
-        db.execute("DROP TABLE voxel_rows")
-        db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-        db.execute("COMMIT")
-    except BaseException:
-        db.execute("ROLLBACK")
-        raise
-
-
-def _damaged(path: Path, what: str) -> StorageError:
-    return StorageError(f"store {path}: {what} is damaged (its checksum does not match); {RESTORE_ADVICE}")
 
 
 def renew_incarnation(db: sqlite3.Connection) -> None:
@@ -237,7 +201,7 @@ class SqliteStore(FusionStore):
         self._path, self._read_lock = path, RLock()
         with ExitStack() as opened:
             self._writer = self._reader = opened.enter_context(contextlib.closing(_open(path, opened)))
-            if path == IN_MEMORY:
+            if path == _IN_MEMORY:
                 # both use one connection
                 self._read_lock = self._write_lock
             else:
@@ -267,7 +231,7 @@ class SqliteStore(FusionStore):
         return {row[0]: row[3] for row in require_intact(rows, self._damaged)}
 
     def _damaged(self, what: str) -> StorageError:
-        return _damaged(self._path, what)
+        return StorageError(f"store {self._path}: {what} is damaged (its checksum does not match); {RESTORE_ADVICE}")
 
     def _write_change(self, change: LogChange) -> None:
         with self._transaction() as db:
@@ -297,3 +261,10 @@ class SqliteStore(FusionStore):
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
                 raise
+
+
+class MemoryStore(SqliteStore):
+    """A FusionStore without a file, which ends with its process."""
+
+    def __init__(self) -> None:
+        super().__init__(_IN_MEMORY)

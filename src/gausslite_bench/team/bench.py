@@ -16,8 +16,8 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineSettings, refine
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome

@@ -14,7 +14,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batc
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.vote import FusedMap, fuse, rank_voxels
 

@@ -15,8 +15,7 @@ from gausslite.fusion.agent_data import earlier_map_of
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentSettings, AlignmentState
 from gausslite.fusion.limits import FusionSettings, Quotas
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig
 

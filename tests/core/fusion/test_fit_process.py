@@ -19,7 +19,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fit_process import FitProcess
 from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.unknown_frames import find_frame
 

@@ -10,7 +10,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchE
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig, reconcile
 from gausslite.fusion.traffic import TrafficCounters
 

@@ -22,8 +22,7 @@ from gausslite.domain.voxels import (
     select_voxels,
     tombstones,
 )
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import FusedMap, fuse, fuse_maps, rank_voxels, union_maps
 

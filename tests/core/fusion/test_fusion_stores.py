@@ -23,8 +23,7 @@ from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, select_keys
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
+from gausslite.fusion.sqlite_store import SCHEMA_VERSION, MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import AgentTotals, MissionConfig, SessionRecord
 

@@ -26,9 +26,8 @@ from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.membership import SessionRegistry
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.mission_clock import MissionClock
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.updates import MAX_SEQ_STEP, UpdateChecks

@@ -15,9 +15,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.keyframes import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframeLimits, KeyframePool
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineProgress, RefineSettings, refine
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.mapping.settings import ONLINE_RATES, DensitySettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings

@@ -18,8 +18,7 @@ from gausslite.domain.voxels import VoxelBatch, select_voxels
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store_values import MissionConfig, VoxelScoreTable
 from gausslite.fusion.traffic import TrafficCounters, TrafficLog
 

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import Mock
 
-import google_crc32c
 import numpy as np
 import pytest
 from support.sample_batches import make_batch
 from test_fusion_stores import OpenStore, make_subset, opener
 
-from gausslite.codec.stored import to_records
-from gausslite.codec.stored_voxels import CODES, StoredSubset, StoredVoxels
+from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.codec.subset_codec import decode_stored, decode_subset, encode_subset
-from gausslite.domain.errors import StorageError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion import store_rows
 from gausslite.fusion.score_index import voxel_records
-from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_maintenance import verify
 
 AGENTS = ("ant", "bee", "cat")
 Latest = dict[str, dict[int, tuple[int, int, int, bytes]]]
@@ -126,97 +118,3 @@ def test_outdated_rows_are_deleted(open_store: OpenStore) -> None:
     in_use = sum(2 + 2 for _ in range(60))
     assert held < 4 * in_use + 4 * 60
     store.close()
-
-
-def old_rows() -> Iterator[tuple[str, int, int, int, int, int, bytes]]:
-    """Rows of a voxel each, as earlier releases stored them: codes with a kappa of two bytes, or exact records."""
-    grid = VoxelGrid(0.5)
-    batch = make_batch(7, 60, grid)
-    labels = {"kappa": batch.gaussians.kappa & np.uint32(0xFFFF), "target": batch.gaussians.target % np.int16(127)}
-    batch = replace(batch, gaussians=replace(batch.gaussians, **labels))
-    for agent_id, is_exact in (("ant", False), ("bee", True)):
-        stored = decode_stored(encode_subset(RoiSubset(agent_id, "", 4, 4, batch), grid))[0].voxels
-        old_codes = np.dtype([(name, *CODES.fields[name][:1]) for name in CODES.names[:-1]] + [("kappa", "<u2")])
-        for place in range(len(stored)):
-            voxel = stored.take(np.array([place]))
-            if is_exact or len(voxel.gaussians) == 0:
-                data = to_records(voxel.batch().gaussians).tobytes()
-            else:
-                data = np.float64(0.5).tobytes() + voxel.gaussians.astype(old_codes).tobytes()
-            key, seq, kappa_sum, count = (int(value) for value in voxel.voxels[0].item())
-            head = agent_id.encode() + np.array([key, seq, kappa_sum, count], "<i8").tobytes()
-            yield agent_id, key, seq, kappa_sum, count, google_crc32c.extend(google_crc32c.value(head), data), data
-
-
-OLD_TABLE = """
-    agent_id TEXT NOT NULL, voxel {0} NOT NULL, update_seq {0} NOT NULL, kappa_sum {0} NOT NULL, count {0} NOT NULL,
-    checksum {0} NOT NULL, gaussians {1} NOT NULL, PRIMARY KEY (agent_id, voxel)
-"""
-
-
-def make_old_sqlite(path: Path) -> None:
-    SqliteStore(path).close()
-    with sqlite3.connect(path) as db:
-        db.execute("DROP TABLE voxel_updates")
-        db.execute(f"CREATE TABLE voxel_updates ({OLD_TABLE.format('INTEGER', 'BLOB')})")
-        db.executemany("INSERT INTO voxel_updates VALUES (?, ?, ?, ?, ?, ?, ?)", old_rows())
-        db.execute("PRAGMA user_version = 6")
-    db.close()
-
-
-def require_converted(store: FusionStore) -> None:
-    grid = VoxelGrid(0.5)
-    rows = list(old_rows())
-    for agent_id in ("ant", "bee"):
-        own = [row for row in rows if row[0] == agent_id]
-        batch = store.batch(agent_id)
-        assert batch.keys.tolist() == [row[1] for row in own]
-        assert batch.kappa_sums.tolist() == [row[3] for row in own]
-        assert store.stored(agent_id, batch.keys).update_seqs.tolist() == [row[2] for row in own]
-        assert voxel_records(batch) == voxel_records(store.batch("bee"))
-    exact = [row[6] for row in rows if row[0] == "bee"]
-    assert voxel_records(store.batch("ant")) == exact
-    assert np.array_equal(grid.keys(batch.gaussians.means_m), np.repeat(batch.keys, batch.counts))
-
-
-def test_a_file_with_a_row_for_each_voxel_is_converted(tmp_path: Path) -> None:
-    path = tmp_path / "store.sqlite"
-    make_old_sqlite(path)
-    with pytest.raises(StorageError, match="a server converts it"):
-        verify(path)
-    for _ in range(2):
-        store = SqliteStore(path)
-        require_converted(store)
-        store.close()
-    assert verify(path).damaged_rows == 0
-    assert verify(path).agents == 2
-
-
-def test_a_damaged_old_file_is_refused_and_not_changed(tmp_path: Path) -> None:
-    path = tmp_path / "store.sqlite"
-    make_old_sqlite(path)
-    with sqlite3.connect(path) as db:
-        db.execute("UPDATE voxel_updates SET kappa_sum = kappa_sum + 1 WHERE agent_id = 'ant'")
-    db.close()
-    for _ in range(2):
-        with pytest.raises(StorageError, match="of agent 'ant' is damaged"):
-            SqliteStore(path)
-
-
-def test_a_database_with_a_row_for_each_voxel_is_converted(postgres) -> None:
-    psycopg = pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
-    from gausslite.fusion.postgres_store import PostgresStore
-
-    url = postgres.new_database()
-    PostgresStore(url).close()
-    with psycopg.connect(url, autocommit=True) as db:
-        db.execute("DROP TABLE gausslite.voxel_updates")
-        db.execute(f"CREATE TABLE gausslite.voxel_updates ({OLD_TABLE.format('BIGINT', 'BYTEA')})")
-        db.cursor().executemany(
-            "INSERT INTO gausslite.voxel_updates VALUES (%s, %s, %s, %s, %s, %s, %s)", list(old_rows())
-        )
-        db.execute("UPDATE gausslite.properties SET value = '1' WHERE name = 'schema_version'")
-    for _ in range(2):
-        store = PostgresStore(url)
-        require_converted(store)
-        store.close()

@@ -23,8 +23,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentSettings, AlignmentState, FrameAlignment
 from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.unknown_frames import FrameSearch, find_frame, keyframe_samples

@@ -19,7 +19,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome
 from gausslite.fusion.updates import SLICE_VOXELS, PendingUpdate, UpdateQueue
 from gausslite.fusion.vote import fuse

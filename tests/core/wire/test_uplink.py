@@ -24,7 +24,7 @@ from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frames import AlignmentState, FrameAlignment
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
 

@@ -24,7 +24,7 @@ from gausslite.domain.errors import (
     UnavailableError,
 )
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.server import Service

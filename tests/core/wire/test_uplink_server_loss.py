@@ -8,8 +8,7 @@ from pathlib import Path
 from fusion_running import GRID, fusion_server, make_batch
 from waiting import wait_until
 
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import back_up, restore
 from gausslite.wire.clients import FusionClient

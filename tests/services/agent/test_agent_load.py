@@ -16,7 +16,7 @@ from fusion_running import CAMERA, GRID, frame, fusion_server
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient

@@ -26,7 +26,7 @@ from gausslite.domain.errors import DatasetError, InvalidInputError, StorageErro
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.relevance import BallRegion, Region
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.schedule import read_timeline
 from gausslite.mission.settings import SourceSettings

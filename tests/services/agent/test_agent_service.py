@@ -30,7 +30,7 @@ from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import BallRegion, PointedObject
 from gausslite.domain.task import TargetRole, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.task.rules import RuleParser

@@ -27,7 +27,7 @@ from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.relevance import BallRegion, Region
 from gausslite.domain.state import State
 from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, group_by_voxel
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate
 from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient

@@ -20,8 +20,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.fusion import traffic
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.traffic import Acknowledgements, StorageProbe
 from gausslite.wire import server

@@ -13,7 +13,7 @@ from fusion_running import GRID, make_subset
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.traffic import TrafficCounters
 

@@ -20,8 +20,7 @@ from gausslite.domain.errors import (
 )
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.fusion.limits import FusionSettings, Quotas
-from gausslite.fusion.memory_store import MemoryStore
-from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export, FusionClient
 

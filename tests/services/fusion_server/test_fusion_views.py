@@ -20,8 +20,8 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import MapRenderer
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb

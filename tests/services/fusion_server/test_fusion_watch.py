@@ -14,8 +14,8 @@ from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.refinement import RefineSettings
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb

@@ -45,8 +45,8 @@ from gausslite.domain.voxels import (
     group_by_voxel,
     select_keys,
 )
-from gausslite.fusion.memory_store import MemoryStore
 from gausslite.fusion.regions import ALL_SLOTS, slots_of, wanted_slots
+from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
