@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.fusion import store_maintenance
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fit_process import FitProcess
@@ -142,9 +142,6 @@ async def _serve(settings: ServerSettings) -> None:
             # else the servicer waits for a comparison
             fit.close()
             servicer.close()
-            # a full disk is in the log already
-            with contextlib.suppress(StorageError):
-                engine.save_counters()
 
 
 def _page(settings: ServerSettings) -> AbstractContextManager[None]:

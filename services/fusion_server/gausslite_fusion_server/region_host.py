@@ -17,6 +17,7 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.postgres_regions import SharedSlots
 from gausslite.fusion.postgres_store import PostgresStore
 from gausslite.fusion.regions import OwnedSlots, Owners, wanted_slots
+from gausslite.fusion.traffic import TrafficLog
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.servicer import FusionServicer
@@ -42,11 +43,13 @@ class RegionHost:
         self._local: FusionServicer | None = None
         # the connection and the slots of the open engine
         self._opened: tuple[int, frozenset[int]] | None = None
-        self._owned = OwnedSlots(slots.server, frozenset())
+        self._owned = OwnedSlots(frozenset())
         self._owners = Owners()
         self._failure = ""
         self.changes = ChangeNotifier()
         """Notified when the owners, or the open engine, have changed."""
+        self.traffic = TrafficLog()
+        """Of the messages that this server received."""
 
     @property
     def server(self) -> str:
@@ -143,7 +146,7 @@ class RegionHost:
         connection, held = self._slots.connection, self._slots.held
         engine = await asyncio.to_thread(self._open_engine)
         self._local, self._opened = self._create_servicer(engine), (connection, held)
-        self._owned = OwnedSlots(self.server, held)
+        self._owned = OwnedSlots(held)
         _log.info("server %s: serves %d of the mission's regions", self.server, len(held))
         self.changes.notify()
 
@@ -151,7 +154,9 @@ class RegionHost:
         store = self._slots.open_store()
         try:
             store.set_mission_config(self.settings.mission_config)
-            engine = FusionEngine(store, self.settings, decode_keyframe=decode_frame, others=store)
+            engine = FusionEngine(
+                store, self.settings, decode_keyframe=decode_frame, others=store, traffic=self.traffic
+            )
             if engine.moved_agents:
                 raise MismatchError(
                     f"server {self.server}: the frames of {', '.join(engine.moved_agents[:8])} differ from the fused "
@@ -170,6 +175,4 @@ class RegionHost:
             return
         local.drain()
         await asyncio.to_thread(local.close)
-        with contextlib.suppress(StorageError, UnavailableError):
-            await asyncio.to_thread(local.engine.save_counters)
         await asyncio.to_thread(self._store.close)

@@ -144,7 +144,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
         find = functools.partial(self._work, session_of, engine)
-        self._contributions = Contributions(find, self._store_message, engine.record_traffic, RejectionLog(_log))
+        self._contributions = Contributions(find, self._store_message, engine.traffic.record, RejectionLog(_log))
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
         self._exports, self._keyframes, self._queries, self._joins = (asyncio.Semaphore(1) for _ in range(4))
 

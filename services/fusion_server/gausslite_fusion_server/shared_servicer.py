@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import logging
 from collections.abc import AsyncIterator, Iterable, Mapping
@@ -19,7 +18,6 @@ from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, merge_batches
 from gausslite.fusion.regions import Owners
 from gausslite.fusion.store_values import SessionRecord
-from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1 import region_service_pb2 as region_pb
@@ -51,7 +49,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         self._host, self._regions, self._peers, self._sender = host, regions, peers, sender
         self._gate = DrainGate()
         self._watch = SharedWatch(host, peers, SharedRevisions(), host.settings.grid)
-        self._contributions = Contributions(self._session, sender.store, self._record_traffic, RejectionLog(_log))
+        self._contributions = Contributions(self._session, sender.store, host.traffic.record, RejectionLog(_log))
         self._exports = asyncio.Semaphore(1)
 
     def service(self) -> Service:
@@ -266,11 +264,6 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
     async def _require_mission(self, mission_id: str) -> None:
         self._gate.require_open()
         (await self._host.ready()).engine.require_mission(mission_id)
-
-    def _record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
-        # figures are not worth an error while the engine is opened
-        with contextlib.suppress(UnavailableError):
-            self._host.local().engine.record_traffic(agent_id, traffic)
 
     def _home(self, agent_id: str) -> str:
         server = self._host.owners.home(agent_id)

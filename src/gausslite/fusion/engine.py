@@ -20,35 +20,35 @@ from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
+from gausslite.fusion.agent_data import AgentData
 from gausslite.fusion.alignment import Fit, fit_frame
-from gausslite.fusion.frames import FrameAlignment
-from gausslite.fusion.fused_map import FusedMapLayers, save_refinement
+from gausslite.fusion.frame_aligner import FrameAligner
+from gausslite.fusion.frames import FrameAlignment, FrameAlignments
+from gausslite.fusion.fused_map import FusedMapLayers, load_refinement, save_refinement
 from gausslite.fusion.keyframes import (
     AgentKeyframe,
     EncodedKeyframe,
     FrameDecoder,
+    KeyframePool,
     in_fused_frame,
     no_decoder,
 )
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.mission_data import MissionData
+from gausslite.fusion.membership import Membership
+from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, SharedRows, require_storable
-from gausslite.fusion.traffic import (
-    Acknowledgements,
-    MissionStatus,
-    StorageProbe,
-    TrafficCounters,
-)
-from gausslite.fusion.unknown_frames import Find, find_frame
+from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
+from gausslite.fusion.unknown_frames import Find, UnknownFrames, find_frame
 from gausslite.fusion.updates import (
     PendingUpdate,
+    UpdateChecks,
     UpdateCommitter,
-    decode_own,
     require_own,
     require_within_quotas,
 )
+from gausslite.fusion.vote_input import VoteInput
 
 
 class JoinResult(NamedTuple):
@@ -66,12 +66,13 @@ class JoinResult(NamedTuple):
 class FusionEngine:
     """Owns the store, the sessions, the keyframes and the refined map of one mission. Thread-safe.
 
-    Updates, sessions, keyframes, objects, counters and the refined map persist with the store.
-    first_revision must exceed the revisions from before a restart; by default it is the time in microseconds.
+    Updates, sessions, keyframes, objects and the refined map persist with the store. first_revision must exceed the
+    revisions from before a restart; by default it is the time in microseconds.
     decode_keyframe reads keyframes as they were received; a refinement and the search for an unknown frame need it. fit
     and find compare two agents' maps. others: finds what the other servers of the store know; this engine then has the
-    store's part of the voxels.
-    Raises MismatchError if the store belongs to another mission configuration, StorageError.
+    store's part of the voxels. traffic: continues the counters of an earlier engine.
+    Raises MismatchError if the store belongs to another mission configuration, CodecError for damaged records,
+    StorageError.
     """
 
     def __init__(
@@ -83,37 +84,33 @@ class FusionEngine:
         fit: Fit = fit_frame,
         find: Find = find_frame,
         others: SharedRows | None = None,
+        traffic: TrafficLog | None = None,
     ) -> None:
-        self._lock = RLock()
-        self._store = store
-        self._settings = settings
-        self._storage = StorageProbe(store)
-        self._acknowledgements = Acknowledgements()
-        self._merged_objects = MergedObjects()
+        self.settings, self.grid, quotas = settings, settings.grid, settings.quotas
+        self.storage, self.acknowledgements = StorageProbe(store), Acknowledgements()
+        self.traffic = traffic or TrafficLog()
+        self._lock, self._store = RLock(), store
+        self._members = Membership(store, settings, others)
+        self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
+        self._objects, self._merged_objects = TeamObjects(store), MergedObjects()
+        self._checks = UpdateChecks(store, quotas, MissionClock(store), others)
+        self._alignments = FrameAlignments(store)
+        self._votes = VoteInput(store, self._alignments, self.grid)
+        self._aligner = FrameAligner(store, self._alignments, self._lock, self.grid, settings.alignment, fit)
+        self._unknown_frames = UnknownFrames(store, self._alignments, self._aligner, self._keyframes, self._lock, find)
         first = time.time_ns() // 1000 if first_revision is None else first_revision
-        comparisons = fit, find
-        self._mission = MissionData.open(
-            store, settings, self._lock, first, decode_keyframe, comparisons=comparisons, others=others
-        )
-        self._committer = UpdateCommitter(
-            store, self._lock, self._decode_update, self._check_update, self._record_updates
-        )
-
-    @property
-    def grid(self) -> VoxelGrid:
-        """The voxel grid of the vote."""
-        return self._settings.grid
-
-    @property
-    def settings(self) -> FusionSettings:
-        """The server's configuration."""
-        return self._settings
+        # a refinement is of the whole map
+        refined = load_refinement(store) if others is None else None
+        self.maps = FusedMapLayers(self._votes, self._lock, self.grid, first, settings.max_removed_voxels, refined)
+        parts = self._members.sessions, self._checks, self.traffic, self._keyframes, self._objects
+        self._agents = AgentData(store, self._votes, self.maps, self._alignments, self._aligner, parts)
+        self._committer = UpdateCommitter(store, self._lock, self.grid, self._check_update, self._record_updates)
 
     @property
     def mission_config(self) -> MissionConfig:
         """The mission's configuration, with default names in place of empty ones."""
         with self._lock:
-            return self._mission.members.mission_config
+            return self._members.mission_config
 
     @property
     def incarnation_id(self) -> str:
@@ -124,16 +121,6 @@ class FusionEngine:
         """Return the highest sequence number among the agent's stored updates; 0 without any."""
         return self._store.totals(agent_id).highest_update_seq
 
-    @property
-    def storage(self) -> StorageProbe:
-        """The check whether the store can write."""
-        return self._storage
-
-    @property
-    def acknowledgements(self) -> Acknowledgements:
-        """The times until the messages are answered."""
-        return self._acknowledgements
-
     def stored_digests(self, session_id: str) -> TileDigests:
         """Return the digests of the stored updates of the session's agent. Raises SessionUnknownError."""
         return self._store.digests(self.session(session_id).agent_id)
@@ -141,12 +128,7 @@ class FusionEngine:
     @property
     def revision(self) -> int:
         """The revision of the vote; it increases with every change."""
-        return self._mission.maps.revision()
-
-    @property
-    def maps(self) -> FusedMapLayers:
-        """The layers of the fused map."""
-        return self._mission.maps
+        return self.maps.revision()
 
     def require_mission(self, mission_id: str) -> None:
         """Raise MismatchError unless the id is this mission's, or empty."""
@@ -161,18 +143,18 @@ class FusionEngine:
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
         with self._committer.committing, self._lock:
-            for ended in self._mission.members.admit(agent_id, requested, token):
-                self._mission.agents.remove(ended)
-            session = self._mission.members.open_session(agent_id, token)
+            for ended in self._members.admit(agent_id, requested, token):
+                self._agents.remove(ended)
+            session = self._members.open_session(agent_id, token)
             if fresh_map:
-                self._mission.agents.begin_new_map(agent_id)
-                self._mission.members.sessions.save_token(agent_id, token)
-            self._mission.checks.record_join(agent_id)
+                self._agents.begin_new_map(agent_id)
+                self._members.sessions.save_token(agent_id, token)
+            self._checks.record_join(agent_id)
             return JoinResult(
                 session,
                 self.highest_update_seq(agent_id),
-                self._mission.maps.revision(),
-                self._mission.keyframes.indices(agent_id),
+                self.maps.revision(),
+                self._keyframes.indices(agent_id),
             )
 
     def begin_elsewhere(self, agent_id: str, fresh_map: bool) -> int:
@@ -181,29 +163,29 @@ class FusionEngine:
         fresh_map: as in `join`. Raises StorageError.
         """
         with self._committer.committing, self._lock:
-            self._mission.members.sessions.forget_elsewhere(agent_id)
+            self._members.sessions.forget_elsewhere(agent_id)
             if fresh_map:
-                self._mission.agents.begin_new_map(agent_id)
+                self._agents.begin_new_map(agent_id)
             return self.highest_update_seq(agent_id)
 
     def remove_elsewhere(self, agent_id: str) -> int:
         """Delete the agent's voxels here, after another server has ended its session; returns their number."""
         with self._committer.committing, self._lock:
             voxels = self._store.totals(agent_id).voxels
-            self._mission.members.sessions.forget_elsewhere(agent_id)
-            self._mission.agents.remove(agent_id)
+            self._members.sessions.forget_elsewhere(agent_id)
+            self._agents.remove(agent_id)
             return voxels
 
     @property
     def moved_agents(self) -> tuple[str, ...]:
         """The agents whose frame is not the fused map's, or whose data are not used."""
-        alignments = self._mission.alignments
+        alignments = self._alignments
         return tuple(sorted(alignments.unused | alignments.transforms().keys()))
 
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
         with self._lock:
-            return self._mission.members.sessions.get(session_id)
+            return self._members.sessions.get(session_id)
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Store an agent's voxel updates; they are durable on return, if the store is.
@@ -233,13 +215,12 @@ class FusionEngine:
 
     def _enqueue(self, update: PendingUpdate) -> Future[PutOutcome]:
         put = self._committer.add(update)
-        self._acknowledgements.add(update.agent_id, put)
+        self.acknowledgements.add(update.agent_id, put)
         return put
 
     def commit_updates(self) -> None:
         """Commit the queued updates. Call it after each `enqueue_update`."""
         self._committer.commit()
-        self._mission.traffic.save_if_due()
 
     def align_due(self, at_most: int | None = None) -> bool:
         """Compare the frames of the agents with enough new updates; returns whether the fused map changed.
@@ -248,31 +229,27 @@ class FusionEngine:
         time. Raises StorageError, UnavailableError if an agent could not be compared.
         """
         before = self.revision
-        if self._settings.alignment is not None:
-            self._mission.unknown_frames.run()
-        self._mission.aligner.run(self._apply_frame, self._drop_contradicted, at_most)
+        if self.settings.alignment is not None:
+            self._unknown_frames.run()
+        self._aligner.run(self._apply_frame, self._drop_contradicted, at_most)
         return self.revision != before
 
     @property
     def is_alignment_due(self) -> bool:
         """Return whether `align_due` would compare an agent."""
-        return self._mission.aligner.is_due
+        return self._aligner.is_due
 
     def alignment(self, agent_id: str) -> FrameAlignment:
         """Return how the agent's frame fits the fused map."""
         with self._lock:
-            return self._mission.alignments.get(agent_id)
+            return self._alignments.get(agent_id)
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> None:
         """Set the motion to the fused map's frame that the agent declares, None if unknown. Raises StorageError."""
         with self._lock:
-            is_new = self._mission.aligner.declare(agent_id, T_fused_agent)
+            is_new = self._aligner.declare(agent_id, T_fused_agent)
         if is_new:
             self._apply_frame(agent_id)
-
-    def record_traffic(self, agent_id: str, traffic: TrafficCounters) -> None:
-        """Add to the agent's counters, and set its last_seen_ns to now."""
-        self._mission.traffic.record(agent_id, traffic)
 
     def add_keyframe(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store a keyframe for the refinement; the agent's others that are not `selected` are deleted.
@@ -280,28 +257,28 @@ class FusionEngine:
         An empty `selected` deletes none. Raises QuotaError, StorageError.
         """
         with self._lock:
-            self._mission.keyframes.add(keyframe, selected)
+            self._keyframes.add(keyframe, selected)
 
     def encoded_keyframe(self, agent_id: str, index: int | None = None) -> tuple[bytes, tuple[int, ...]]:
         """Return a keyframe of the agent (see KeyframePool.find) and the indices of all. Raises InvalidInputError."""
         with self._lock:
-            return self._mission.keyframes.find(agent_id, index), self._mission.keyframes.indices(agent_id)
+            return self._keyframes.find(agent_id, index), self._keyframes.indices(agent_id)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""
         with self._lock:
-            self._mission.objects.report(self._mission.members.sessions.get(session_id).agent_id, report)
+            self._objects.report(self._members.sessions.get(session_id).agent_id, report)
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
         with self._lock:
-            return self._mission.objects.of_task(agent_id, graph)
+            return self._objects.of_task(agent_id, graph)
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
         with self._lock:
-            reports, frames = self._mission.objects.reports(), self._mission.alignments.transforms()
-            unlocalised = self._mission.alignments.unlocalised
+            reports, frames = self._objects.reports(), self._alignments.transforms()
+            unlocalised = self._alignments.unlocalised
         used = {name: report for name, report in reports.items() if name not in unlocalised}
         return find_objects(self._merged_objects.of(used, frames), noun)
 
@@ -317,47 +294,47 @@ class FusionEngine:
         """
         with self._committer.committing, self._lock:
             voxels = self._store.totals(agent_id).voxels
-            self._mission.members.require_evictable(agent_id, ban)
-            self._mission.members.sessions.end_agent(agent_id)
-            self._mission.agents.remove(agent_id)
+            self._members.require_evictable(agent_id, ban)
+            self._members.sessions.end_agent(agent_id)
+            self._agents.remove(agent_id)
             if ban:
-                self._mission.members.bans.add(agent_id)
+                self._members.bans.add(agent_id)
             return voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises InvalidInputError if it is not banned, StorageError."""
         with self._lock:
-            self._mission.members.bans.remove(agent_id)
+            self._members.bans.remove(agent_id)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._committer.committing, self._lock:
-            agent_id = self._mission.members.sessions.get(session_id).agent_id
+            agent_id = self._members.sessions.get(session_id).agent_id
             if forget:
-                self._mission.agents.remove(agent_id)
-            self._mission.members.sessions.end(session_id)
-            return self._mission.maps.revision()
+                self._agents.remove(agent_id)
+            self._members.sessions.end(session_id)
+            return self.maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
         """Return the fused map, all agents' keyframes, and the map's revision. Raises MismatchError if one is empty."""
         # before the map is read: what changes meanwhile counts as changed
-        revision, gaussians = self.revision, self._mission.maps.voted_map().gaussians
+        revision, gaussians = self.revision, self.maps.voted_map().gaussians
         with self._lock:
-            names = self._mission.keyframes.names()
-        encoded = self._mission.keyframes.read(names)
+            names = self._keyframes.names()
+        encoded = self._keyframes.read(names)
         if not encoded or len(gaussians) == 0:
             raise MismatchError(
                 f"refinement: expected a fused map and keyframes, got {len(gaussians)} Gaussians and "
                 f"{len(encoded)} keyframes; agents send keyframes with handover = true"
             )
-        return gaussians, self.in_fused_frame(self._mission.keyframes.decode(encoded)), revision
+        return gaussians, self.in_fused_frame(self._keyframes.decode(encoded)), revision
 
     def store_refined(self, gaussians: Gaussians, revision: int) -> None:
         """Store the result of a refinement of the vote at this revision. Raises RevisionGoneError, StorageError."""
-        shown = self._mission.maps.show_refined(gaussians, revision)
+        shown = self.maps.show_refined(gaussians, revision)
         # no update may be in the store without being in the change log
         with self._committer.committing:
-            changed = self._mission.maps.changed_since(revision)
+            changed = self.maps.changed_since(revision)
         save_refinement(self._store, shown.without(changed))
 
     def in_fused_frame(self, keyframes: Sequence[AgentKeyframe]) -> list[AgentKeyframe]:
@@ -366,18 +343,40 @@ class FusionEngine:
         Those of agents that are quarantined or in an unknown frame, and those too far from the origin, are left out.
         """
         with self._lock:
-            frames, unused = self._mission.alignments.transforms(), self._mission.alignments.unused
+            frames, unused = self._alignments.transforms(), self._alignments.unused
         moved = (in_fused_frame(keyframe, frames) for keyframe in keyframes if keyframe.agent_id not in unused)
         return [keyframe for keyframe in moved if keyframe is not None]
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
         with self._lock:
-            return self._mission.status(self._store)
+            fused_voxels, fused_gaussians = self.maps.size()
+            return MissionStatus(
+                mission_config=self._members.mission_config,
+                revision=self.revision,
+                fused_gaussians=fused_gaussians,
+                fused_voxels=fused_voxels,
+                keyframes=len(self._keyframes),
+                refined=self.maps.is_refined,
+                agents=tuple(map(self._contribution, sorted(self._members.sources))),
+                banned_agents=self._members.bans.agents,
+            )
 
-    def save_counters(self) -> None:
-        """Save the agents' counters, which are otherwise saved every 10 s. Raises StorageError."""
-        self._mission.traffic.save()
+    def _contribution(self, agent_id: str) -> AgentContribution:
+        totals = self._store.totals(agent_id)
+        return AgentContribution(
+            agent_id,
+            joined=agent_id in self._members.sessions.agents,
+            voxels=totals.occupied_voxels,
+            gaussians=totals.gaussians,
+            kappa_sum=totals.kappa_sum,
+            won_voxels=self.maps.won_voxels(agent_id),
+            last_update_seq=totals.highest_update_seq,
+            keyframes=self._keyframes.count(agent_id),
+            targets=self._objects.targets(agent_id),
+            alignment=self._alignments.get(agent_id),
+            traffic=self.traffic.of(agent_id),
+        )
 
     def close(self) -> None:
         """Close the store."""
@@ -386,36 +385,30 @@ class FusionEngine:
 
     def _apply_frame(self, agent_id: str) -> None:
         """Move the agent's map to its frame and state as they are now, in slices between which messages are served."""
-        for keys in self._mission.votes.slices(agent_id):
+        for keys in self._votes.slices(agent_id):
             with self._lock:
-                self._mission.maps.record(agent_id, self._mission.votes.move(agent_id, keys))
+                self.maps.record(agent_id, self._votes.move(agent_id, keys))
 
     def _drop_contradicted(self, agent_id: str) -> bool:
         with self._committer.committing, self._lock:
-            return self._mission.agents.drop_contradicted(agent_id)
-
-    def _decode_update(self, update: PendingUpdate) -> StoredSubset:
-        """Return the message as it is stored, with computed sums. Raises GaussLiteError."""
-        if not isinstance(update.message, bytes):
-            return update.message
-        return decode_own(update.message, update.agent_id, self.grid)
+            return self._agents.drop_contradicted(agent_id)
 
     def _check_update(self, update: PendingUpdate) -> None:
         """Raise GaussLiteError for a message that may not be stored; only its first part is checked."""
-        session = self._mission.members.sessions.get(update.session_id)
+        session = self._members.sessions.get(update.session_id)
         if not update.outcomes:
             require_own(session.agent_id, update.agent_id, self.grid, self.grid)
-            self._mission.checks.require_plausible(update.subset)
+            self._checks.require_plausible(update.subset)
             require_storable(update.subset)
-            require_within_quotas(update.subset, self._store, self._settings.quotas)
+            require_within_quotas(update.subset, self._store, self.settings.quotas)
 
     def _record_updates(self, stored: Sequence[tuple[str, Int64[ndarray, " _"]]]) -> None:
         """Update the fused map after a commit of these accepted voxels of different agents."""
         changed = {}
         for agent_id, accepted in stored:
-            self._mission.aligner.record(agent_id, accepted)
+            self._aligner.record(agent_id, accepted)
             if len(accepted):
-                changed[agent_id] = self._mission.votes.move(agent_id, accepted)
-        self._mission.maps.record_all(changed)
+                changed[agent_id] = self._votes.move(agent_id, accepted)
+        self.maps.record_all(changed)
         for agent_id in changed:
-            self._mission.agents.drop_outgrown(agent_id)
+            self._agents.drop_outgrown(agent_id)

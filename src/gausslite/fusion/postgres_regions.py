@@ -78,7 +78,7 @@ class SharedSlots:
 
     def open_store(self) -> PostgresStore:
         """Return the store of the slots that are held now. Raises StorageError."""
-        return PostgresStore(self._url, OwnedSlots(self.server, self._held), _Writer(self._locks, self._holder))
+        return PostgresStore(self._url, OwnedSlots(self._held), _Writer(self._locks, self._holder))
 
     def close(self) -> None:
         """Close the connection; the locks end."""

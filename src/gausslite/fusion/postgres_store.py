@@ -20,7 +20,6 @@ from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots, slots_of
 from gausslite.fusion.store import Execute, FusionStore
 from gausslite.fusion.store_rows import SLOT_BITS, LogChange, data_checksum, require_intact
 from gausslite.fusion.store_values import SessionRecord
-from gausslite.fusion.traffic import PROBE_RECORD, TRAFFIC_RECORD
 
 SCHEMA_VERSION = 3
 LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
@@ -52,7 +51,6 @@ SELECT %s::smallint, * FROM unnest(%s::bigint[], %s::text[], %s::bigint[], %b::b
 _DELETE = "DELETE FROM gausslite.voxel_updates WHERE slot = %s::smallint AND number = ANY(%s::bigint[])"
 _SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM gausslite.voxel_updates WHERE"
 _SELECT_ROWS = f"{_SELECT_UPDATES} slot = %s::smallint AND number = ANY(%s::bigint[])"
-_OF_SERVER = (TRAFFIC_RECORD, PROBE_RECORD)
 _SET_PROPERTY = """
 INSERT INTO gausslite.properties VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SET value = excluded.value
 """
@@ -106,10 +104,6 @@ class PostgresStore(FusionStore):
         query = "SELECT session_id, agent_id FROM sessions WHERE session_id = ?"
         return next((SessionRecord(*row) for row in self._read(query, (session_id,))), None)
 
-    def save_record(self, agent_id: str, name: str, data: bytes) -> None:
-        """Store a named record of an agent; it replaces the earlier one."""
-        super().save_record(self._record_owner(agent_id, name), name, data)
-
     def find_record(self, agent_id: str, name: str) -> bytes:
         """Return a named record of an agent; empty if it does not exist. Raises StorageError for a damaged one."""
         query = "SELECT data, checksum FROM records WHERE name = ? AND agent_id = ?"
@@ -118,11 +112,6 @@ class PostgresStore(FusionStore):
                 raise self._damaged(f"record {name!r} of agent {agent_id!r}")
             return bytes(data)
         return b""
-
-    def records(self, name: str) -> dict[str, bytes]:
-        """Return the record of this name of every agent that has one; a server's figures are its own."""
-        found, own = super().records(name), self._record_owner("", name)
-        return found if not own else {"": found[own]} if own in found else {}
 
     def close(self) -> None:
         """Close the own connections; without owned slots, this frees the database for another server."""
@@ -168,11 +157,6 @@ class PostgresStore(FusionStore):
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         rows = itertools.chain.from_iterable(self._read(_SELECT_ROWS, part) for part in _by_slot(numbers))
         return {row[0]: row[3] for row in require_intact(rows, self._damaged)}
-
-    def _record_owner(self, agent_id: str, name: str) -> str:
-        """Return under which name a record is kept: each server that shares the store has its own figures."""
-        # no agent's name begins with @
-        return f"@{self._owned.server}" if self._owned is not None and name in _OF_SERVER else agent_id
 
     def _damaged(self, what: str) -> StorageError:
         return StorageError(

@@ -88,9 +88,8 @@ class Owners:
 
 @dataclass(frozen=True, slots=True)
 class OwnedSlots:
-    """The slots of one server, by its address."""
+    """The slots of one server."""
 
-    server: str
     slots: frozenset[int]
     _has: Bool[ndarray, " s"] = field(init=False, repr=False, compare=False)
 

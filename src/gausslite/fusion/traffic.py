@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import time
 from bisect import bisect_left
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from threading import Lock
 
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import CodecError, StorageError, UnavailableError
+from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome
 
 _PROBE_BYTES = 256 << 10
 # no agent can have an empty id
-_STORAGE_PROBE_OWNER, PROBE_RECORD = "", "storage-probe"
+_PROBE = "", "storage-probe"
 
 
 class StorageProbe:
@@ -37,9 +35,9 @@ class StorageProbe:
     def check(self) -> None:
         """Raise StorageError if the store does not take 256 KiB."""
         try:
-            self._store.save_record(_STORAGE_PROBE_OWNER, PROBE_RECORD, bytes(_PROBE_BYTES))
+            self._store.save_record(*_PROBE, bytes(_PROBE_BYTES))
             # its pages are free again, so that the next check needs new ones if messages have taken them
-            self._store.save_record(_STORAGE_PROBE_OWNER, PROBE_RECORD, b"")
+            self._store.save_record(*_PROBE, b"")
         except StorageError:
             self._is_writable = False
             raise
@@ -111,14 +109,9 @@ class Acknowledgements:
             self._total_s += taken_s
 
 
-_SAVE_INTERVAL_S = 10.0
-# no agent can have an empty id
-_OWNER, TRAFFIC_RECORD = "", "traffic"
-
-
 @dataclass(frozen=True, slots=True)
 class TrafficCounters:
-    """Messages of one agent since it first joined. last_seen_ns: time of its latest subset, 0 before the first."""
+    """Messages of one agent. last_seen_ns: time of its latest subset, 0 before the first."""
 
     last_seen_ns: int = 0
     roi_bytes: int = 0
@@ -140,40 +133,17 @@ class TrafficCounters:
 
 
 class TrafficLog:
-    """The counters of each agent, saved in the store every 10 s. Thread-safe: counting waits for no commit."""
+    """The counters of each agent since the start of the server. Thread-safe: counting waits for no commit."""
 
-    def __init__(self, store: FusionStore, clock_s: Callable[[], float] = time.monotonic) -> None:
-        """Raises CodecError if the stored counters are damaged."""
-        self._store, self._clock_s, self._lock = store, clock_s, Lock()
-        self._by_agent = _decode(store.records(TRAFFIC_RECORD).get(_OWNER, b"{}"))
-        self._is_saved, self._next_save_s = True, clock_s() + _SAVE_INTERVAL_S
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._by_agent: dict[str, TrafficCounters] = {}
 
     def record(self, agent_id: str, traffic: TrafficCounters) -> None:
         """Add to the agent's counters, and set its last_seen_ns to now."""
         newer = replace(traffic, last_seen_ns=time.time_ns())
         with self._lock:
             self._by_agent[agent_id] = self.of(agent_id).plus(newer)
-            self._is_saved = False
-
-    def save_if_due(self) -> None:
-        """Save the counters if 10 s have passed; a store that refuses is asked again after as long."""
-        if self._clock_s() >= self._next_save_s:
-            # the updates of the caller are stored, and figures are not worth an error
-            with contextlib.suppress(StorageError):
-                self.save()
-            self._next_save_s = self._clock_s() + _SAVE_INTERVAL_S
-
-    def save(self) -> None:
-        """Save the counters. Raises StorageError."""
-        with self._lock:
-            if self._is_saved:
-                return
-            data, self._is_saved = _encode(self._by_agent), True
-        try:
-            self._store.save_record(_OWNER, TRAFFIC_RECORD, data)
-        except StorageError:
-            self._is_saved = False
-            raise
 
     def of(self, agent_id: str) -> TrafficCounters:
         """Return the agent's counters; zero for an unknown agent."""
@@ -182,7 +152,7 @@ class TrafficLog:
     def remove_agent(self, agent_id: str) -> None:
         """Delete the counters of the agent."""
         with self._lock:
-            self._is_saved &= self._by_agent.pop(agent_id, None) is None
+            self._by_agent.pop(agent_id, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,18 +184,3 @@ class MissionStatus:
     refined: bool
     agents: tuple[AgentContribution, ...]
     banned_agents: tuple[str, ...] = ()
-
-
-def _encode(counters: dict[str, TrafficCounters]) -> bytes:
-    return json.dumps({agent_id: asdict(counter) for agent_id, counter in counters.items()}).encode()
-
-
-def _decode(data: bytes) -> dict[str, TrafficCounters]:
-    try:
-        stored = json.loads(data)
-        return {
-            str(agent_id): TrafficCounters(**{name: int(value) for name, value in counters.items()})
-            for agent_id, counters in stored.items()
-        }
-    except (AttributeError, TypeError, ValueError, RecursionError) as error:
-        raise CodecError(f"stored counters: expected the JSON of counters, got other bytes ({error})") from error

@@ -264,8 +264,6 @@ def _encoded_bytes(update: PendingUpdate) -> int:
 
 
 _GROUP_BYTES = 2 << 20
-Decode = Callable[[PendingUpdate], StoredSubset]
-"""Returns the decoded message. Raises GaussLiteError to refuse it."""
 Check = Callable[[PendingUpdate], None]
 """Raises GaussLiteError to refuse a message."""
 Record = Callable[[Sequence[tuple[str, Int64[ndarray, " _"]]]], None]
@@ -279,8 +277,8 @@ class UpdateCommitter:
     part stays; it is a part of the agent's newest data, and sending the message again completes it. Thread-safe.
     """
 
-    def __init__(self, store: FusionStore, lock: RLock, decode: Decode, check: Check, record: Record) -> None:
-        self._store, self._lock, self._decode, self._check, self._record = store, lock, decode, check, record
+    def __init__(self, store: FusionStore, lock: RLock, grid: VoxelGrid, check: Check, record: Record) -> None:
+        self._store, self._lock, self._grid, self._check, self._record = store, lock, grid, check, record
         self._queue = UpdateQueue()
         self._next_log_s = 0.0
         self.committing = Lock()
@@ -311,7 +309,8 @@ class UpdateCommitter:
         for update in group:
             self._log_if_late(update)
             try:
-                update.message = self._decode(update)
+                if isinstance(update.message, bytes):
+                    update.message = decode_own(update.message, update.agent_id, self._grid)
             except GaussLiteError as error:
                 _fail(update, error)
 

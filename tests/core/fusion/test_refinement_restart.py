@@ -1,4 +1,4 @@
-"""The refined map and the counters survive a restart of the server."""
+"""The refined map survives a restart of the server."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store_values import MissionConfig, VoxelScoreTable
-from gausslite.fusion.traffic import TrafficCounters, TrafficLog
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
 Shown = dict[int, tuple[bytes, bytes]]
@@ -155,35 +154,6 @@ def test_a_damaged_refinement_is_refused() -> None:
     store.save_record("", "refined-map", b"\x08\0\0\0\0\0\0\0{}      ")
     with pytest.raises(CodecError, match="stored refinement: expected its arrays"):
         FusionEngine(store, FusionSettings(grid=GRID))
-    store = MemoryStore()
-    store.save_record("", "traffic", b'{"ant": {"unknown": 1}}')
-    with pytest.raises(CodecError, match="stored counters"):
-        FusionEngine(store, FusionSettings(grid=GRID))
-
-
-def test_counters_survive_a_restart(tmp_path: Path) -> None:
-    engine = open_engine(tmp_path / "store.sqlite")
-    engine.join("ant", ANYTHING)
-    engine.record_traffic("ant", TrafficCounters(roi_bytes=7, subsets_accepted=1))
-    engine.save_counters()
-    engine = restart(engine, tmp_path / "store.sqlite")
-    engine.record_traffic("ant", TrafficCounters(roi_bytes=3))
-    traffic = engine.status().agents[0].traffic
-    assert (traffic.roi_bytes, traffic.subsets_accepted) == (10, 1)
-    engine.evict("ant")
-    engine.save_counters()
-    assert restart(engine, tmp_path / "store.sqlite").status().agents == ()
-
-
-def test_counters_are_saved_every_ten_seconds() -> None:
-    store, now_s = MemoryStore(), [0.0]
-    log = TrafficLog(store, lambda: now_s[0])
-    log.record("ant", TrafficCounters(roi_bytes=7))
-    log.save_if_due()
-    assert store.records("traffic") == {}
-    now_s[0] = 10.0
-    log.save_if_due()
-    assert TrafficLog(store).of("ant").roi_bytes == 7
 
 
 def test_the_hash_of_a_row_depends_on_all_its_columns_and_their_order() -> None:

@@ -175,7 +175,7 @@ def test_a_found_frame_that_newer_data_contradict_is_taken_back() -> None:
     send(engine, "bee", halves[0], unknown=True)
     wrong = transform_of(np.array([0.6, 0.4, 0.0, 0.0, 0.0, 0.2])) @ inverse(T_BEE_ROOM)
     fit = FrameFit(wrong, Misfit(0.1, 0.25), Misfit(0.0, 0.0), 9.0, 149.0, 500, True, False)
-    engine._mission.aligner.put_frame("bee", alignment_of(engine, "bee").localised(fit))
+    engine._aligner.put_frame("bee", alignment_of(engine, "bee").localised(fit))
     send(engine, "bee", halves[1], seq=2)
     assert won(engine, "bee") > 0
     engine.align_due()

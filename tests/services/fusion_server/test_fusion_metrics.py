@@ -33,7 +33,7 @@ def engine() -> FusionEngine:
     for agent_id, kappa in (("ant", 1), ("bee", 2)):
         session = engine.join(agent_id, ANYTHING).session.session_id
         engine.contribute(session, make_subset(agent_id, 1, {0: [kappa], 1: [3 - kappa], 2: [kappa]}), GRID)
-    engine.record_traffic("bee", TrafficCounters(roi_bytes=5000, subsets_rejected=7))
+    engine.traffic.record("bee", TrafficCounters(roi_bytes=5000, subsets_rejected=7))
     return engine
 
 
