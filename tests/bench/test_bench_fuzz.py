@@ -10,7 +10,7 @@ import pytest
 from gausslite.cli.main import main
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import ChecksumError
-from gausslite.wire.async_calls import service_methods
+from gausslite_bench.async_calls import service_methods
 from gausslite_bench.fuzz.checksummed_messages import change_body, with_checksum
 from gausslite_bench.fuzz.corpus import CORPUS, read_corpus
 from gausslite_bench.fuzz.decoders import DECODERS, Outcomes, decode_one

@@ -14,8 +14,8 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-from gausslite.wire.async_calls import is_stored
 from gausslite.wire.clients import FusionClient
+from gausslite_bench.async_calls import is_stored
 
 _RECORD = struct.Struct("<BQII")
 

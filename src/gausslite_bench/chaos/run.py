@@ -20,8 +20,8 @@ from pathlib import Path
 
 from gausslite.codec.ply import ply_bytes
 from gausslite.domain.errors import UnavailableError
-from gausslite.wire.async_calls import UpdateStreams
 from gausslite.wire.clients import Export, FusionClient
+from gausslite_bench.async_calls import UpdateStreams
 from gausslite_bench.chaos.acknowledged import StoreComparison, compare_store, offline_map
 from gausslite_bench.chaos.agent_team import AgentTeam
 from gausslite_bench.chaos.fault_proxy import FaultProxy

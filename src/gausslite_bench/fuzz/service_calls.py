@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from gausslite.wire.async_calls import RawCalls, service_methods
+from gausslite_bench.async_calls import RawCalls, service_methods
 from gausslite_bench.fuzz.corpus import SESSION_ID
 from gausslite_bench.fuzz.decoders import HANG_S, Outcomes
 from gausslite_bench.fuzz.fuzzed_service import FuzzedService

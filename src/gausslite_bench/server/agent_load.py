@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gausslite.task.rules import RuleParser
-from gausslite.wire.async_calls import UpdateStream, UpdateStreams
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import frame_to_message
+from gausslite_bench.async_calls import UpdateStream, UpdateStreams
 from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, keyframe, object_report
 
 RATE_HZ = 4.0

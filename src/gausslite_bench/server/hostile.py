@@ -27,10 +27,10 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.voxels import RoiSubset
 from gausslite.task.rules import RuleParser
-from gausslite.wire.async_calls import UpdateStreams
 from gausslite.wire.channel import require_serving
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import frame_to_message
+from gausslite_bench.async_calls import UpdateStreams
 from gausslite_bench.server.agent_load import AgentLoad, LoadResult
 from gausslite_bench.server.server_process import ServerProcess
 from gausslite_bench.server.synthetic_updates import (

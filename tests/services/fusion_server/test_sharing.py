@@ -52,10 +52,10 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
 from gausslite.v1.region_service_pb2 import RemoveAgentRequest, StorePartsRequest, SubsetPart
 from gausslite.v1.region_service_pb2_grpc import RegionServiceStub
-from gausslite.wire.async_calls import UpdateStreams
 from gausslite.wire.channel import open_channel
 from gausslite.wire.clients import Export
 from gausslite.wire.convert import MapUpdate, frame_to_message
+from gausslite_bench.async_calls import UpdateStreams
 
 pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
 
