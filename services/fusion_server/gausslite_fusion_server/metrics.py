@@ -6,15 +6,15 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import accumulate
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.traffic import (
     ACKNOWLEDGEMENT_BOUNDS_S,
     Acknowledgements,
     AgentContribution,
     MissionStatus,
-    StorageProbe,
 )
 from gausslite.wire.channel import host_and_port
 
@@ -77,42 +77,28 @@ _OF_SHARE = (
 )
 
 
-@runtime_checkable
-class Figures(Protocol):
-    """What a server knows of its mission, or of its part."""
-
-    @property
-    def storage(self) -> StorageProbe:
-        """The check whether the store can write."""
-        ...
-
-    @property
-    def acknowledgements(self) -> Acknowledgements:
-        """The times until the messages are answered."""
-        ...
-
-    def status(self) -> MissionStatus:
-        """Return the totals."""
-        ...
+FindEngine = Callable[[], FusionEngine]
+FindCounts = Callable[[], MessageCounts]
 
 
 class MissionCollector:
     """Reads the figures when Prometheus asks for them; counters start at 0 with the server."""
 
-    def __init__(self, engine: Figures, counts: Callable[[], MessageCounts] | None = None) -> None:
-        self._engine, self._counts = engine, counts
+    def __init__(self, engine: FindEngine, acknowledgements: Acknowledgements, counts: FindCounts | None) -> None:
+        self._engine, self._acknowledgements, self._counts = engine, acknowledgements, counts
 
     def collect(self) -> Iterator[Any]:
         """Yield the metrics of the mission and of each agent, with the ids as the labels `mission` and `agent`."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
-        status, is_writable = self._engine.status(), self._engine.storage.is_writable
+        engine = self._engine()
+        status, is_writable = engine.status(), engine.storage.is_writable
         mission_id = status.mission_config.mission_id
         for name, help_text, value in _OF_MISSION:
             of_mission = GaugeMetricFamily(f"gausslite_fusion_{name}", help_text, labels=["mission"])
             of_mission.add_metric([mission_id], value(status, is_writable))
             yield of_mission
-        counts, total_s = self._engine.acknowledgements.histogram()
+        counts, total_s = self._acknowledgements.histogram()
         bounds = [*map(str, ACKNOWLEDGEMENT_BOUNDS_S), "+Inf"]
         acknowledgement = HistogramMetricFamily(
             "gausslite_fusion_acknowledgement_seconds", "time from a message to its answer", labels=["mission"]
@@ -134,9 +120,11 @@ class MissionCollector:
 
 @contextmanager
 def metrics_server(
-    address: str | None, engine: Figures, counts: Callable[[], MessageCounts] | None = None
+    address: str | None, engine: FindEngine, acknowledgements: Acknowledgements, counts: FindCounts | None = None
 ) -> Iterator[int]:
     """Serve /metrics on HOST:PORT while the context is open, with the figures of the process; gives the actual port.
+
+    engine: returns the mission, or this server's part of it.
 
     None serves nothing and gives 0. Raises InvalidInputError without prometheus-client or for another address,
     UnavailableError if the address is in use.
@@ -151,7 +139,7 @@ def metrics_server(
         raise InvalidInputError("--metrics: needs prometheus-client; pip install 'gausslite[metrics]'") from error
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
-    registry.register(MissionCollector(engine, counts))
+    registry.register(MissionCollector(engine, acknowledgements, counts))
     try:
         server, thread = start_http_server(port, host.strip("[]"), registry)
     except OSError as error:

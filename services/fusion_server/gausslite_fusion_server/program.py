@@ -161,7 +161,7 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
             # runs when the server begins to stop, so that open streams end with UNAVAILABLE
             servicer.drain()
 
-    with metrics_server(settings.metrics, engine), _page(settings):
+    with metrics_server(settings.metrics, lambda: engine, engine.acknowledgements), _page(settings):
         await serve_until_stopped(
             settings.listen, [servicer.service()], work_until_stopped, settings.tls, settings.limits, settings.health
         )
@@ -172,7 +172,8 @@ async def _serve_share(settings: ServerSettings, peer_address: str) -> None:
     with _extra_needed():
         from gausslite_fusion_server.sharing import open_share
     async with open_share(settings, peer_address) as share:
-        with metrics_server(settings.metrics, share, share.counts), _page(settings):
+        metrics = metrics_server(settings.metrics, share.engine, share.sender.acknowledgements, share.counts)
+        with metrics, _page(settings):
             await serve_until_stopped(
                 settings.listen, share.services, share.run, settings.tls, settings.limits, settings.health
             )

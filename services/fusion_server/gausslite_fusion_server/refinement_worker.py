@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from threading import Event
 
 from gausslite.domain.errors import QuotaError
@@ -13,16 +13,8 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings, refine
 from gausslite.render.rasterizer import Rasterizer
+from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.views import ChangeNotifier
-
-
-@dataclass(frozen=True, slots=True)
-class RefineRequest:
-    """The values of a client's request; 0 = the server's default."""
-
-    iterations: int = 0
-    max_gaussians: int = 0
-    seed: int = 0
 
 
 class RefinementWorker:
@@ -38,7 +30,7 @@ class RefinementWorker:
         """Return a rasterizer of the refinement's backend. Raises KernelError."""
         return self._create_rasterizer()
 
-    async def run(self, engine: FusionEngine, request: RefineRequest) -> AsyncIterator[RefineProgress]:
+    async def run(self, engine: FusionEngine, request: pb.RefineFusedMapRequest) -> AsyncIterator[RefineProgress]:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
 
         A slow reader misses some progress, but never the last one. Raises QuotaError if another refinement runs, and
@@ -84,7 +76,7 @@ class RefinementWorker:
         """Wait until the last refinement has ended after its cancellation."""
         self._worker.shutdown(wait=True, cancel_futures=True)
 
-    def _settings_for(self, request: RefineRequest) -> RefineSettings:
+    def _settings_for(self, request: pb.RefineFusedMapRequest) -> RefineSettings:
         if request.iterations > MAX_REFINE_ITERATIONS:
             raise QuotaError(f"refine iterations: expected at most {MAX_REFINE_ITERATIONS}, got {request.iterations}")
         default = self._settings

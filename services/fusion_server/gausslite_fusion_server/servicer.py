@@ -53,7 +53,7 @@ from gausslite_fusion_server.messages import (
     store_keyframe,
     view_to_message,
 )
-from gausslite_fusion_server.refinement_worker import RefinementWorker, RefineRequest
+from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.watch import FusedMapReader, WatchedPart
 
 _Message = TypeVar("_Message")
@@ -307,9 +307,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Refine the fused map and report progress; closing the stream cancels the refinement."""
         self._gate.require_open()
         self._engine.require_mission(request.mission_id)
-        refine_request = RefineRequest(request.iterations, request.max_gaussians, request.seed)
         response = pb.RefineFusedMapResponse()
-        async for progress in self._refinement_worker.run(self._engine, refine_request):
+        async for progress in self._refinement_worker.run(self._engine, request):
             self._gate.require_open()
             response = pb.RefineFusedMapResponse(
                 iteration=progress.iteration,

@@ -12,7 +12,6 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.postgres_regions import SharedSlots
 from gausslite.fusion.refinement import rasterizer_of_backend
-from gausslite.fusion.traffic import Acknowledgements, MissionStatus, StorageProbe
 from gausslite.wire.server import Service
 from gausslite_fusion_server.metrics import MessageCounts
 from gausslite_fusion_server.part_sender import PartSender
@@ -49,19 +48,9 @@ class Share:
             self.servicer.drain()
             await self.host.close()
 
-    @property
-    def storage(self) -> StorageProbe:
-        """The check whether the store can write. Raises UnavailableError while the engine is opened."""
-        return self.host.local().engine.storage
-
-    @property
-    def acknowledgements(self) -> Acknowledgements:
-        """The times until the messages that this server received are answered."""
-        return self.sender.acknowledgements
-
-    def status(self) -> MissionStatus:
-        """Return the totals of the part that this server owns. Raises UnavailableError while the engine is opened."""
-        return self.host.local().engine.status()
+    def engine(self) -> FusionEngine:
+        """Return the engine of the part that this server owns. Raises UnavailableError while it is opened."""
+        return self.host.local().engine
 
     def counts(self) -> MessageCounts:
         """Return how much of the mission's work this server has done."""

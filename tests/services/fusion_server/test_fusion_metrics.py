@@ -48,7 +48,7 @@ def read(port: int) -> dict[tuple[str, str], float]:
 
 
 def test_prometheus_reads_the_mission_and_each_agent(engine: FusionEngine) -> None:
-    with metrics_server("127.0.0.1:0", engine) as port:
+    with metrics_server("127.0.0.1:0", lambda: engine, engine.acknowledgements) as port:
         values = read(port)
         assert values["gausslite_fusion_fused_voxels", ""] == 3
         assert values["gausslite_agent_won_voxels", "ant"] == 1
@@ -68,7 +68,7 @@ def test_the_dashboard_shows_metrics_that_exist(engine: FusionEngine) -> None:
     dashboard = json.loads((ROOT / "deploy/grafana_dashboard.json").read_text())
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     used = {name for query in queries for name in re.findall(r"(?:gausslite|process)_\w+", query)}
-    with metrics_server("127.0.0.1:0", engine) as port:
+    with metrics_server("127.0.0.1:0", lambda: engine, engine.acknowledgements) as port:
         served = {name for name, _ in read(port)}
     assert len(used) >= 8
     assert used <= served
@@ -76,10 +76,10 @@ def test_the_dashboard_shows_metrics_that_exist(engine: FusionEngine) -> None:
 
 def test_wrong_addresses_are_one_line(engine: FusionEngine) -> None:
     with pytest.raises(InvalidInputError, match="--metrics: expected HOST:PORT"):
-        metrics_server("9100", engine).__enter__()
-    with metrics_server("127.0.0.1:0", engine) as port:
-        second = metrics_server(f"127.0.0.1:{port}", engine)
+        metrics_server("9100", lambda: engine, engine.acknowledgements).__enter__()
+    with metrics_server("127.0.0.1:0", lambda: engine, engine.acknowledgements) as port:
+        second = metrics_server(f"127.0.0.1:{port}", lambda: engine, engine.acknowledgements)
         with pytest.raises(UnavailableError, match="choose another address"):
             second.__enter__()
-    with metrics_server(None, engine) as port:
+    with metrics_server(None, lambda: engine, engine.acknowledgements) as port:
         assert port == 0

@@ -144,7 +144,7 @@ def test_shuffled_and_repeated_messages_to_three_servers_give_the_offline_vote_b
     assert frozenset.union(*slots) == ALL_SLOTS
     assert sum(map(len, slots)) == len(ALL_SLOTS)
     # each server has its part alone
-    parts = [server.share.status() for server in servers]
+    parts = [server.share.engine().status() for server in servers]
     total = servers[0].client.status()
     assert total.fused_voxels == sum(part.fused_voxels for part in parts) == len(gaussians_from_ply(expected).means_m)
     assert [agent.agent_id for agent in total.agents] == list(AGENTS)
