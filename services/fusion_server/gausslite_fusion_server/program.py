@@ -1,4 +1,4 @@
-"""Start the fusion server from the command line, or maintain its store: backup, restore, verify, compact."""
+"""Start the fusion server from the command line, or maintain its store: backup, restore, verify."""
 
 from __future__ import annotations
 
@@ -59,17 +59,12 @@ def _run(options: MaintenanceSettings) -> int:
             earlier = "" if replaced is None else f"; the earlier file is now {replaced}"
             text = f"{options.store}: {_summary(report)}; agents will send what is missing{earlier}"
             _print(options, text, dataclasses.asdict(report) | {"replaced": str(replaced or "")})
-        case "verify":
+        case _:
             report = store_maintenance.verify(options.store, options.repair)
             done = " deleted; agents will send what is missing" if options.repair and report.damaged_rows else ""
             text = f"{options.store}: {_summary(report)}, {report.damaged_rows} damaged rows{done}"
             _print(options, text, dataclasses.asdict(report))
             return int(report.damaged_rows > 0 and not options.repair)
-        case _:
-            before, after = store_maintenance.compact(options.store)
-            _print(
-                options, f"{options.store}: {before} bytes before, {after} after", {"before": before, "after": after}
-            )
     return 0
 
 

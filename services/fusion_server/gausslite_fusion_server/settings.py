@@ -31,7 +31,6 @@ _MAINTENANCE = (
     ("backup", ("store", "target"), "copy a store to a new file and verify the copy; a server may be using it"),
     ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
     ("verify", ("store",), "check every row; a server may be using the store"),
-    ("compact", ("store",), "rewrite the file without unused space; no server may be using it"),
 )
 MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 

@@ -1,4 +1,4 @@
-"""Back up, restore, verify, repair and compact the SQLite file of a fusion server."""
+"""Back up, restore, verify and repair the SQLite file of a fusion server."""
 
 from __future__ import annotations
 
@@ -78,16 +78,6 @@ def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
         copy.replace(store)
         _synchronise_folder(store.parent)
     return report, replaced
-
-
-def compact(path: Path) -> tuple[int, int]:
-    """Rewrite the file without unused pages, without a server; returns the bytes before and after."""
-    with _locked(path), contextlib.closing(open_existing(path)) as db, storage_errors(path):
-        before = path.stat().st_size
-        _check(db, path)
-        db.execute("VACUUM")
-        db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        return before, path.stat().st_size
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from test_fusion_stores import make_subset
 
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_maintenance import back_up, compact, restore, verify
+from gausslite.fusion.store_maintenance import back_up, restore, verify
 
 VOXELS = range(1, 41)
 
@@ -128,14 +128,4 @@ def test_a_damaged_backup_replaces_nothing(path: Path, tmp_path: Path) -> None:
     flip_a_bit(backup, "voxel_updates", "voxels")
     with pytest.raises(StorageError, match="1 damaged"):
         restore(backup, path)
-    assert verify(path).voxels == len(VOXELS)
-
-
-def test_compact_gives_back_the_space_of_removed_agents(path: Path) -> None:
-    store = SqliteStore(path)
-    store.put(make_subset("bee", 1, dict.fromkeys(range(500), 20)))
-    store.remove_agent("bee")
-    store.close()
-    before, after = compact(path)
-    assert after < before
     assert verify(path).voxels == len(VOXELS)
