@@ -9,7 +9,7 @@ import secrets
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import google_crc32c
 from jaxtyping import Float32, Float64, UInt8
@@ -51,17 +51,8 @@ FrameOutcome = agent_service_pb2.FrameOutcome
 """Names the outcomes of `AgentClient.ingest`: `FrameOutcome.Name(result.outcome)`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Session:
-    """The fusion server's answer to a joining agent; keyframes: indices of those that it stores of the agent."""
-
-    session_id: str
-    highest_update_seq: int
-    fused_revision: int
-    max_subset_bytes: int
-    max_gaussians: int
-    keyframes: tuple[int, ...] = ()
-    incarnation_id: str = ""
+Session = fusion_service_pb2.JoinSessionResponse
+"""The fusion server's answer to a joining agent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +61,21 @@ class Export:
 
     strategy: str = "vote"
     agent_id: str = ""
+
+
+_View = tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]
+
+
+def _decode_view(response: Any, camera: Camera) -> _View:
+    size = camera.width_px, camera.height_px
+    return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
+
+
+def _decode_updates(responses: Iterator[Any]) -> Iterator[convert.MapUpdate]:
+    first = True
+    for response in responses:
+        yield (update := convert.map_update_from_message(response.block, _WATCH_LIMITS, first))
+        first = update.last
 
 
 class ParserClient(ServiceChannel):
@@ -143,16 +149,12 @@ class AgentClient(ServiceChannel):
         response: agent_service_pb2.GetAgentStatusResponse = self._call(self._stub.GetAgentStatus, request)
         return response
 
-    def render(
-        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
-    ) -> tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]:
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> _View:
         """Return colour and depth in metres of the agent's map, rendered from this pose."""
         request = agent_service_pb2.RenderViewRequest(
             camera=convert.camera_to_message(camera), t_world_camera=convert.transform_to_message(T_world_camera)
         )
-        response = self._call(self._stub.RenderView, request)
-        size = camera.width_px, camera.height_px
-        return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
+        return _decode_view(self._call(self._stub.RenderView, request), camera)
 
     def camera_view(self) -> CameraView | None:
         """Return the newest keyframe with its region and the camera's path; None before the first keyframe."""
@@ -167,10 +169,7 @@ class AgentClient(ServiceChannel):
             region=None if region is None else convert.box_to_message(region),
             roi_only=roi_only,
         )
-        first = True
-        for response in self._stream(self._stub.WatchMap, request):
-            yield (update := convert.map_update_from_message(response.block, _WATCH_LIMITS, first))
-            first = update.last
+        yield from _decode_updates(self._stream(self._stub.WatchMap, request))
 
 
 def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
@@ -229,16 +228,8 @@ class FusionClient(ServiceChannel):
             token=self._token,
             frame_is_unknown=isinstance(T_fused_agent, str),
         )
-        response = self._call(self._stub.JoinSession, request)
-        return Session(
-            session_id=response.session_id,
-            highest_update_seq=response.highest_update_seq,
-            fused_revision=response.fused_revision,
-            max_subset_bytes=response.max_subset_bytes,
-            max_gaussians=response.max_gaussians,
-            keyframes=tuple(response.keyframes),
-            incarnation_id=response.incarnation_id,
-        )
+        session: Session = self._call(self._stub.JoinSession, request)
+        return session
 
     def keep_session(self, session_id: str) -> fusion_service_pb2.KeepSessionResponse:
         """Renew the lease; returns what identifies the updates that the server has. Raises SessionUnknownError."""
@@ -351,10 +342,7 @@ class FusionClient(ServiceChannel):
             layer=fusion_service_pb2.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
             exclude_agent_id=exclude_agent,
         )
-        first = True
-        for response in self._stream(self._stub.WatchFusedMap, request):
-            yield (update := convert.map_update_from_message(response.block, _WATCH_LIMITS, first))
-            first = update.last
+        yield from _decode_updates(self._stream(self._stub.WatchFusedMap, request))
 
     def refine(
         self, iterations: int = 0, max_gaussians: int = 0, seed: int = 0
@@ -383,9 +371,7 @@ class FusionClient(ServiceChannel):
             raise ChecksumError("export: CRC32C does not match; the map was damaged in transit")
         return bytes(data)
 
-    def render(
-        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: str = "vote"
-    ) -> tuple[UInt8[ndarray, "h w 3"], Float32[ndarray, "h w"]]:
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: str = "vote") -> _View:
         """Return colour and depth in metres of a layer of the map (vote, refined), rendered from this pose."""
         request = fusion_service_pb2.RenderFusedViewRequest(
             mission_id=self.mission_id,
@@ -393,9 +379,7 @@ class FusionClient(ServiceChannel):
             t_world_camera=convert.transform_to_message(T_world_camera),
             layer=fusion_service_pb2.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
         )
-        response = self._call(self._stub.RenderView, request)
-        size = camera.width_px, camera.height_px
-        return decode_colour(response.colour_png, *size), decode_depth(response.depth_png, *size)
+        return _decode_view(self._call(self._stub.RenderView, request), camera)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> int:
         """Replace the agent's task graph and objects; returns the bytes sent. Raises SessionUnknownError."""

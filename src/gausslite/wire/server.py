@@ -251,6 +251,9 @@ async def serve_until_stopped(
             raise result
 
 
+_ARITY = {False: "unary", True: "stream"}
+
+
 class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     """Check the caller's role and limits, and end a call with the status of the error that its method raised.
 
@@ -281,19 +284,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
             handler.request_deserializer,
             handler.request_streaming,
         )
-        if handler.response_streaming:
-            inner = handler.stream_stream if handler.request_streaming else handler.unary_stream
-            make = (
-                grpc.stream_stream_rpc_method_handler
-                if handler.request_streaming
-                else grpc.unary_stream_rpc_method_handler
-            )
-            return make(guard.stream_method(inner), **message_codecs)
-        inner = handler.stream_unary if handler.request_streaming else handler.unary_unary
-        make = (
-            grpc.stream_unary_rpc_method_handler if handler.request_streaming else grpc.unary_unary_rpc_method_handler
-        )
-        return make(guard.unary_method(inner), **message_codecs)
+        kind = f"{_ARITY[handler.request_streaming]}_{_ARITY[handler.response_streaming]}"
+        wrap = guard.stream_method if handler.response_streaming else guard.unary_method
+        return getattr(grpc, f"{kind}_rpc_method_handler")(wrap(getattr(handler, kind)), **message_codecs)
 
 
 @dataclass(frozen=True, slots=True)

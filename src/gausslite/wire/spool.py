@@ -15,6 +15,7 @@ a restarted agent needs the list of its selected keyframes. The agent limits the
 from __future__ import annotations
 
 import heapq
+import json
 import os
 import secrets
 import sqlite3
@@ -34,53 +35,6 @@ from gausslite.codec.stored import from_bytes, to_records
 from gausslite.domain.errors import MismatchError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of
-
-SENT_UPDATES_SCHEMA = "CREATE TABLE IF NOT EXISTS sent_updates (key INTEGER PRIMARY KEY, update_seq INTEGER NOT NULL);"
-
-
-class SentUpdateTable:
-    """The table in the spool's database. The spool owns the connection, its transactions and its errors."""
-
-    def __init__(self, database: sqlite3.Connection) -> None:
-        self._database = database
-
-    def record(self, keys: Iterable[int], update_seq: int) -> None:
-        """Record that the server has stored the updates of these voxels with this sequence number."""
-        self._database.executemany(
-            "INSERT OR REPLACE INTO sent_updates VALUES (?, ?)", ((key, update_seq) for key in keys)
-        )
-
-    def digests(self) -> TileDigests:
-        """Return the digests of all acknowledged updates."""
-        return TileDigests.of(*self._columns())
-
-    def forget(self, tiles: Int64[ndarray, " t"]) -> list[int]:
-        """Delete the rows of these tiles; returns their voxels."""
-        keys, _ = self._columns()
-        forgotten: list[int] = keys[np.isin(tiles_of(keys), tiles)].tolist()
-        self._database.executemany("DELETE FROM sent_updates WHERE key = ?", ((key,) for key in forgotten))
-        return forgotten
-
-    def _columns(self) -> tuple[Int64[ndarray, " k"], Int64[ndarray, " k"]]:
-        rows = self._database.execute("SELECT key, update_seq FROM sent_updates").fetchall()
-        columns = np.array(rows, np.int64).reshape(-1, 2)
-        return columns[:, 0], columns[:, 1]
-
-
-KEYFRAMES_SCHEMA = """
-CREATE TABLE IF NOT EXISTS keyframes (
-    frame_index INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, value REAL NOT NULL, coverage BLOB NOT NULL,
-    data BLOB NOT NULL, pending INTEGER NOT NULL);
-"""
-_SPOOLED_KEYFRAMES_ENQUEUE = """
-INSERT INTO keyframes VALUES (?, 1, ?, ?, ?, 1)
-ON CONFLICT (frame_index) DO UPDATE SET enqueue_count = enqueue_count + 1, value = excluded.value,
-    coverage = excluded.coverage, data = excluded.data, pending = 1
-"""
-_SELECT_PENDING = """
-SELECT frame_index, enqueue_count, value, coverage, data FROM keyframes WHERE pending = 1
-ORDER BY value / length(data) DESC, frame_index
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,69 +57,23 @@ class SpooledKeyframe:
         return self.value / len(self.data)
 
 
-class KeyframeTable:
-    """The table in the spool's database. The spool owns the connection, its transactions and its errors."""
-
-    def __init__(self, database: sqlite3.Connection) -> None:
-        self._database = database
-
-    def enqueue(self, keyframe: SpooledKeyframe) -> None:
-        """Store a keyframe as pending; it replaces one of the same index."""
-        row = (keyframe.frame_index, keyframe.value, keyframe.coverage, keyframe.data)
-        self._database.execute(_SPOOLED_KEYFRAMES_ENQUEUE, row)
-
-    def remove(self, frame_index: int) -> None:
-        """Delete a keyframe."""
-        self._database.execute("DELETE FROM keyframes WHERE frame_index = ?", (frame_index,))
-
-    def pending(self) -> Iterator[SpooledKeyframe]:
-        """Yield the pending keyframes, the highest value per byte first."""
-        for index, enqueue_count, value, coverage, data in self._database.execute(_SELECT_PENDING):
-            yield SpooledKeyframe(index, value, coverage, data, enqueue_count)
-
-    def stored(self) -> list[SpooledKeyframe]:
-        """Return all keyframes, in the order of their indices."""
-        query = "SELECT frame_index, value, coverage, data, enqueue_count FROM keyframes ORDER BY frame_index"
-        return [SpooledKeyframe(*row) for row in self._database.execute(query)]
-
-    def indices(self) -> tuple[int, ...]:
-        """Return the indices of all keyframes, ascending."""
-        query = "SELECT frame_index FROM keyframes ORDER BY frame_index"
-        return tuple(index for (index,) in self._database.execute(query))
-
-    def count_pending(self) -> int:
-        """Return the number of pending keyframes."""
-        return int(self._database.execute("SELECT count(*) FROM keyframes WHERE pending = 1").fetchone()[0])
-
-    def mark_done(self, keyframes: Iterable[SpooledKeyframe]) -> None:
-        """Mark these keyframes as no longer pending."""
-        pairs = [(keyframe.enqueue_count, keyframe.frame_index) for keyframe in keyframes]
-        self._database.executemany("UPDATE keyframes SET pending = (enqueue_count != ?) WHERE frame_index = ?", pairs)
-
-    def mark_missing(self, stored: Iterable[int]) -> None:
-        """Mark every keyframe as pending that the server does not store."""
-        self._database.execute("CREATE TEMP TABLE IF NOT EXISTS stored (frame_index INTEGER PRIMARY KEY)")
-        self._database.execute("DELETE FROM stored")
-        self._database.executemany("INSERT OR IGNORE INTO stored VALUES (?)", ((index,) for index in stored))
-        self._database.execute(
-            "UPDATE keyframes SET pending = 1 WHERE frame_index NOT IN (SELECT frame_index FROM stored)"
-        )
-
-
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1
-_NEVER_SENT = -1
 _Row = tuple[int, int, int, int, bytes, float]
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS voxel_updates (
     key INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
     count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL,
-    sends INTEGER NOT NULL DEFAULT 0);
+    sends INTEGER NOT NULL DEFAULT 0, acknowledged_seq INTEGER);
 CREATE INDEX IF NOT EXISTS voxel_updates_pending ON voxel_updates (pending) WHERE pending = 1;
+CREATE TABLE IF NOT EXISTS keyframes (
+    frame_index INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, value REAL NOT NULL, coverage BLOB NOT NULL,
+    data BLOB NOT NULL, pending INTEGER NOT NULL);
 CREATE TABLE IF NOT EXISTS properties (name TEXT PRIMARY KEY, value) WITHOUT ROWID;
 """
 _ENQUEUE = """
-INSERT INTO voxel_updates VALUES (?, 1, ?, ?, ?, ?, 1, -1, 0)
+INSERT INTO voxel_updates (key, enqueue_count, purpose, kappa_sum, count, gaussians, pending, sent_kappa, sends)
+VALUES (?, 1, ?, ?, ?, ?, 1, -1, 0)
 ON CONFLICT (key) DO UPDATE SET enqueue_count = enqueue_count + 1, purpose = excluded.purpose,
     kappa_sum = excluded.kappa_sum, count = excluded.count, gaussians = excluded.gaussians, pending = 1
 WHERE kappa_sum != excluded.kappa_sum OR gaussians != excluded.gaussians
@@ -179,6 +87,13 @@ WHERE pending = 1 AND purpose = ?
         OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1) * (1 << min(max(sends, 1) - 1, 2)))
 ORDER BY value_per_byte DESC, key
 """  # noqa: S608 - two constants of this file
+_ENQUEUE_KEYFRAME = """
+INSERT INTO keyframes VALUES (?, 1, ?, ?, ?, 1)
+ON CONFLICT (frame_index) DO UPDATE SET enqueue_count = enqueue_count + 1, value = excluded.value,
+    coverage = excluded.coverage, data = excluded.data, pending = 1
+"""
+_SELECT_KEYFRAMES = "SELECT frame_index, value, coverage, data, enqueue_count FROM keyframes"
+_PENDING_KEYFRAMES = f"{_SELECT_KEYFRAMES} WHERE pending = 1 ORDER BY value / length(data) DESC, frame_index"
 
 
 class Purpose(IntEnum):
@@ -221,11 +136,8 @@ class Spool:
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = NORMAL")
-            self._database.executescript(_SCHEMA + KEYFRAMES_SCHEMA + SENT_UPDATES_SCHEMA)
-            if "sends" not in [row[1] for row in self._database.execute("PRAGMA table_info (voxel_updates)")]:
-                self._database.execute("ALTER TABLE voxel_updates ADD COLUMN sends INTEGER NOT NULL DEFAULT 0")
-            self._sent = SentUpdateTable(self._database)
-            self._keyframes = KeyframeTable(self._database)
+            self._database.executescript(_SCHEMA)
+            self._add_new_columns()
             self.is_new = self._property("agent_id") is None
             if self.is_new:
                 properties = [("agent_id", agent_id), ("voxel_size_m", grid.size_m), ("update_seq", 0)]
@@ -241,6 +153,18 @@ class Spool:
                 f"{self._error_prefix}: expected agent {agent_id!r} and voxels of {grid.size_m} m, "
                 f"got {stored[0]!r} and {stored[1]} m; choose another file"
             )
+
+    def _add_new_columns(self) -> None:
+        """Bring the tables of an earlier version up to date."""
+        columns = [row[1] for row in self._database.execute("PRAGMA table_info (voxel_updates)")]
+        if "sends" not in columns:
+            self._database.execute("ALTER TABLE voxel_updates ADD COLUMN sends INTEGER NOT NULL DEFAULT 0")
+        if "acknowledged_seq" not in columns:
+            self._database.execute("ALTER TABLE voxel_updates ADD COLUMN acknowledged_seq INTEGER")
+            acknowledged = "SELECT update_seq FROM sent_updates WHERE sent_updates.key = voxel_updates.key"
+            self._database.execute(f"UPDATE voxel_updates SET acknowledged_seq = ({acknowledged})")  # noqa: S608
+            self._database.execute("DROP TABLE sent_updates")
+            self._database.commit()
 
     def enqueue(self, batch: VoxelBatch, purpose: Purpose) -> None:
         """Replace the stored updates of these voxels; an update equal to the stored one changes nothing."""
@@ -268,8 +192,8 @@ class Spool:
             rows = self._database.execute(
                 "SELECT key FROM voxel_updates WHERE count > 0 AND (? IS NULL OR purpose = ?) ORDER BY key",
                 (purpose, purpose),
-            ).fetchall()
-        return np.array([key for (key,) in rows], np.int64)
+            )
+            return np.array([key for (key,) in rows], np.int64)
 
     def next_round(self, max_bytes: int, resend_threshold: float) -> SpoolRound | None:
         """Return what is due with the highest value per byte, about max_bytes, at least one; None if nothing is due.
@@ -278,7 +202,7 @@ class Spool:
         double the share; more often: by four times the share. Voxels of the handover follow when nothing else is due.
         """
         with self._transaction():
-            due = _by_value(self._due(Purpose.ROI, resend_threshold), self._keyframes.pending())
+            due = _by_value(self._due(Purpose.ROI, resend_threshold), self._select_keyframes(_PENDING_KEYFRAMES))
             if chosen := _take(due, max_bytes):
                 return SpoolRound(
                     _to_batch(Purpose.ROI, [item for item in chosen if isinstance(item, tuple)]),
@@ -291,35 +215,38 @@ class Spool:
     def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
         """Store a selected keyframe as pending, and delete the one that it replaces in the selection."""
         with self._transaction():
-            if replaced is not None:
-                self._keyframes.remove(replaced)
-            self._keyframes.enqueue(keyframe)
+            self._database.execute("DELETE FROM keyframes WHERE frame_index = ?", (replaced,))
+            row = keyframe.frame_index, keyframe.value, keyframe.coverage, keyframe.data
+            self._database.execute(_ENQUEUE_KEYFRAME, row)
 
     def mark_keyframes_done(self, keyframes: Iterable[SpooledKeyframe]) -> None:
         """Mark these keyframes as not pending, because the server has accepted or permanently rejected them."""
         with self._transaction():
-            self._keyframes.mark_done(keyframes)
+            pairs = [(keyframe.enqueue_count, keyframe.frame_index) for keyframe in keyframes]
+            update = "UPDATE keyframes SET pending = (enqueue_count != ?) WHERE frame_index = ?"
+            self._database.executemany(update, pairs)
 
     def mark_keyframes_missing(self, stored: Iterable[int]) -> None:
         """Mark all keyframes as pending except those with these indices, which the server stores."""
         with self._transaction():
-            self._keyframes.mark_missing(stored)
+            missing = "UPDATE keyframes SET pending = 1 WHERE frame_index NOT IN (SELECT value FROM json_each(?))"
+            self._database.execute(missing, (json.dumps(list(stored)),))
 
     def keyframes(self) -> list[SpooledKeyframe]:
         """Return all keyframes, in the order of their indices."""
         with self._transaction():
-            return self._keyframes.stored()
+            return list(self._select_keyframes(f"{_SELECT_KEYFRAMES} ORDER BY frame_index"))
 
     def keyframe_indices(self) -> tuple[int, ...]:
         """Return the indices of all keyframes, ascending."""
         with self._transaction():
-            return self._keyframes.indices()
+            rows = self._database.execute("SELECT frame_index FROM keyframes ORDER BY frame_index")
+            return tuple(index for (index,) in rows)
 
     @property
     def pending_keyframes(self) -> int:
         """The number of pending keyframes."""
-        with self._transaction():
-            return self._keyframes.count_pending()
+        return self._count_pending("keyframes")
 
     def is_stored_by(self, incarnation_id: str, highest_update_seq: int) -> bool:
         """Return whether a server with this content has every update that was acknowledged to this spool."""
@@ -330,7 +257,7 @@ class Spool:
     def acknowledged_digests(self) -> TileDigests:
         """Return the digests of the updates that were acknowledged."""
         with self._transaction():
-            return self._sent.digests()
+            return TileDigests.of(*self._acknowledged())
 
     def begin_sending_to(self, incarnation_id: str, highest_update_seq: int, lost: Int64[ndarray, " t"]) -> int:
         """Mark the voxels of the tiles in `lost` as pending and never sent; returns their number.
@@ -338,11 +265,12 @@ class Spool:
         The server with this content has all acknowledged updates of the other tiles.
         """
         with self._transaction():
-            keys = self._sent.forget(lost)
-            self._database.executemany(
-                "UPDATE voxel_updates SET pending = 1, sent_kappa = ?, sends = 0 WHERE key = ?",
-                ((_NEVER_SENT, key) for key in keys),
-            )
+            keys, _ = self._acknowledged()
+            keys = keys[np.isin(tiles_of(keys), lost)]
+            resend = """
+                UPDATE voxel_updates SET pending = 1, sent_kappa = -1, sends = 0, acknowledged_seq = NULL WHERE key = ?
+            """
+            self._database.executemany(resend, ((key,) for key in keys.tolist()))
             acknowledged = min(int(self._property("acknowledged_seq") or 0), highest_update_seq)
             properties = [("incarnation_id", incarnation_id), ("acknowledged_seq", acknowledged)]
             self._database.executemany("INSERT OR REPLACE INTO properties VALUES (?, ?)", properties)
@@ -351,7 +279,8 @@ class Spool:
     def record_acknowledged(self, keys: Int64[ndarray, " v"], update_seq: int) -> None:
         """Record that the server has stored the updates of these voxels, with this sequence number."""
         with self._transaction():
-            self._sent.record(keys.tolist(), update_seq)
+            stored = ((update_seq, key) for key in keys.tolist())
+            self._database.executemany("UPDATE voxel_updates SET acknowledged_seq = ? WHERE key = ?", stored)
             self._database.execute(
                 "UPDATE properties SET value = max(value, ?) WHERE name = 'acknowledged_seq'", (update_seq,)
             )
@@ -369,8 +298,7 @@ class Spool:
     @property
     def pending_voxels(self) -> int:
         """The number of voxels whose latest update is pending."""
-        with self._transaction():
-            return int(self._database.execute("SELECT count(*) FROM voxel_updates WHERE pending = 1").fetchone()[0])
+        return self._count_pending("voxel_updates")
 
     def next_update_seq(self, above: int = 0) -> int:
         """Return a number greater than `above` and than all earlier numbers, also those from before a restart."""
@@ -386,6 +314,20 @@ class Spool:
 
     def _due(self, purpose: Purpose, resend_threshold: float) -> Iterator[_Row]:
         return iter(self._database.execute(_SELECT_DUE, (int(purpose), resend_threshold)))
+
+    def _select_keyframes(self, query: str) -> Iterator[SpooledKeyframe]:
+        return (SpooledKeyframe(*row) for row in self._database.execute(query))
+
+    def _acknowledged(self) -> tuple[Int64[ndarray, " k"], Int64[ndarray, " k"]]:
+        """Return the voxels whose updates the server has stored, and the sequence numbers of these."""
+        query = "SELECT key, acknowledged_seq FROM voxel_updates WHERE acknowledged_seq IS NOT NULL"
+        columns = np.array(self._database.execute(query).fetchall(), np.int64).reshape(-1, 2)
+        return columns[:, 0], columns[:, 1]
+
+    def _count_pending(self, table: str) -> int:
+        with self._transaction():
+            query = f"SELECT count(*) FROM {table} WHERE pending = 1"  # noqa: S608 - constant names
+            return int(self._database.execute(query).fetchone()[0])
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:

@@ -183,6 +183,25 @@ def test_a_spool_of_an_earlier_version_goes_on(tmp_path: Path) -> None:
     spool.close()
 
 
+def test_what_was_acknowledged_to_a_spool_of_an_earlier_version_is_known(tmp_path: Path) -> None:
+    path, batch = tmp_path / "spool.sqlite", make_batch({1: [5], 2: [6]})
+    spool = Spool(path, "robot", GRID)
+    spool.enqueue(batch, Purpose.ROI)
+    spool.record_acknowledged(batch.keys[:1], 7)
+    expected = spool.acknowledged_digests()
+    spool.close()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("ALTER TABLE voxel_updates DROP COLUMN acknowledged_seq")
+        database.execute("CREATE TABLE sent_updates (key INTEGER PRIMARY KEY, update_seq INTEGER NOT NULL)")
+        database.execute("INSERT INTO sent_updates VALUES (?, 7)", (int(batch.keys[0]),))
+        database.commit()
+    for _ in range(2):
+        spool = Spool(path, "robot", GRID)
+        found = spool.acknowledged_digests()
+        assert (found.tiles.tolist(), found.hashes.tolist()) == (expected.tiles.tolist(), expected.hashes.tolist())
+        spool.close()
+
+
 def test_limit_drain_ends_a_drain_that_has_begun() -> None:
     with uplink("127.0.0.1:1") as link:
         link.enqueue(make_batch({1: [5]}))
