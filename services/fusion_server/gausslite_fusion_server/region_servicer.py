@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator
-from typing import Any
+from typing import Any, NamedTuple
+
+from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
 
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.codec.subset_codec import SubsetCoding, encode_subset, split_batch
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import CodecError, GaussLiteError, UnavailableError
+from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import region_service_pb2 as region_pb
@@ -22,7 +25,6 @@ from gausslite.wire.status import code_and_reason
 from gausslite_fusion_server.contributions import StoredCount
 from gausslite_fusion_server.messages import select_map
 from gausslite_fusion_server.region_host import RegionHost
-from gausslite_fusion_server.servicer import FusionServicer
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
 
@@ -30,6 +32,27 @@ SLOTS_KEY = "gausslite-slots"
 """The initial metadata of an answer: the slots for which it holds, as bits of a hexadecimal number."""
 _SENDER = "fusion-server"
 _log = logging.getLogger(__name__)
+
+
+class HomeMethod(NamedTuple):
+    """A method of FusionService that an agent's home answers."""
+
+    request: type[Message]
+    response: type[Message]
+    is_stream: bool
+
+
+AT_HOME = {
+    method.name: HomeMethod(
+        GetMessageClass(method.input_type), GetMessageClass(method.output_type), method.client_streaming
+    )
+    for method in pb.DESCRIPTOR.services_by_name["FusionService"].methods
+    if not method.server_streaming
+}
+
+
+async def _stream_of(request: Message) -> AsyncIterator[Message]:
+    yield request
 
 
 class RegionServicer(region_pb_grpc.RegionServiceServicer):
@@ -155,50 +178,21 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         async for response in local.GetUpdateDigests(request, context):
             yield response
 
-    async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
-        """Join at the agent's home."""
-        return await self._at_home(request.agent_id).JoinSession(request, context)
+    async def CallHome(self, request: region_pb.CallHomeRequest, context: Any) -> region_pb.CallHomeResponse:
+        """Call a method for an agent whose home this server is."""
+        if request.method not in AT_HOME:
+            raise InvalidInputError(f"method: expected one of {', '.join(AT_HOME)}, got {quote_name(request.method)}")
+        own = AT_HOME[request.method].request.FromString(request.request)
+        response = await self.call_home(request.agent_id, request.method, own, context)
+        return region_pb.CallHomeResponse(response=response.SerializeToString())
 
-    async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
-        """Renew the lease at the agent's home."""
-        return await (await self._home_of(request.session_id)).KeepSession(request, context)
-
-    async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
-        """End the session at the agent's home."""
-        return await (await self._home_of(request.session_id)).LeaveSession(request, context)
-
-    async def ContributeKeyframes(
-        self, request_iterator: AsyncIterator[pb.ContributeKeyframesRequest], context: Any
-    ) -> pb.ContributeKeyframesResponse:
-        """Store keyframes at the agent's home."""
-        return await self._host.local().ContributeKeyframes(request_iterator, context)
-
-    async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
-        """Return a keyframe at the agent's home."""
-        return await self._at_home(request.agent_id).GetKeyframe(request, context)
-
-    async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
-        """Replace the agent's objects at its home."""
-        return await (await self._home_of(request.session_id)).ReportObjects(request, context)
-
-    async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
-        """Evict the agent at its home."""
-        return await self._at_home(request.agent_id).EvictAgent(request, context)
-
-    async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
-        """Let the agent join again at its home."""
-        return await self._at_home(request.agent_id).UnbanAgent(request, context)
-
-    def _at_home(self, agent_id: str) -> FusionServicer:
-        """Return the own servicer. Raises UnavailableError if this is not the agent's home."""
+    async def call_home(self, agent_id: str, method: str, request: Message, context: Any) -> Message:
+        """Return the answer of the own servicer. Raises UnavailableError if this is not the agent's home."""
         if not self._host.owned.is_home(agent_id):
             raise UnavailableError(f"server {self._host.server}: is not the home of this agent")
-        return self._host.local()
-
-    async def _home_of(self, session_id: str) -> FusionServicer:
-        """Return the own servicer. Raises SessionUnknownError, UnavailableError as `_at_home`."""
-        session = await asyncio.to_thread(self._host.local().engine.session, session_id)
-        return self._at_home(session.agent_id)
+        argument = _stream_of(request) if AT_HOME[method].is_stream else request
+        response: Message = await getattr(self._host.local(), method)(argument, context)
+        return response
 
     async def _state_slots(self, context: Any) -> None:
         slots = sum(1 << slot for slot in self._host.owned.slots)

@@ -114,7 +114,7 @@ def _retrieve_error(reading: asyncio.Future[_Message | None]) -> None:
 
 
 _log = logging.getLogger(__name__)
-_MAX_REPORTED_REJECTIONS = 1000
+MAX_REPORTED_REJECTIONS = 1000
 _WORKERS = 4
 _ALIGN_DELAY_S = 0.1
 """The messages of this time share one look at which frames are due."""
@@ -269,7 +269,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
                     await self._work(store_keyframe, self._engine, request, caller)
                 response.accepted += 1
             except (InvalidInputError, QuotaError) as error:
-                if len(response.rejected) >= _MAX_REPORTED_REJECTIONS:
+                if len(response.rejected) >= MAX_REPORTED_REJECTIONS:
                     raise
                 response.rejected.add(index=request.keyframe.index, reason=str(error))
         self._align_in_background()  # they may show where an unknown frame is

@@ -30,10 +30,10 @@ from gausslite.wire.server import Service
 from gausslite_fusion_server.contributions import Contributions
 from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_message, layer_from_message
 from gausslite_fusion_server.part_sender import PartSender
-from gausslite_fusion_server.peers import CALL_S, Peers, peer_errors
+from gausslite_fusion_server.peers import CALL_S, Peers
 from gausslite_fusion_server.region_host import RegionHost
-from gausslite_fusion_server.region_servicer import RegionServicer
-from gausslite_fusion_server.servicer import DrainGate
+from gausslite_fusion_server.region_servicer import AT_HOME, RegionServicer
+from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate
 from gausslite_fusion_server.shared_watch import SharedRevisions, SharedWatch
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
@@ -123,38 +123,15 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeKeyframesRequest], context: Any
     ) -> pb.ContributeKeyframesResponse:
         """Store keyframes at the agent's home."""
-        requests = self._gate.admit(request_iterator)
-        first = await anext(requests, None)
-        if first is None:
-            return pb.ContributeKeyframesResponse()
-        session = await self._session(first.session_id, Caller.of(context))
-
-        failures: list[GaussLiteError] = []
-
-        async def of_session() -> AsyncIterator[pb.ContributeKeyframesRequest]:
-            yield first
-            try:
-                async for request in requests:
-                    if request.session_id != first.session_id:
-                        raise InvalidInputError("session_id: expected that of the stream's first keyframe, got another")
-                    yield request
-            except GaussLiteError as error:
-                failures.append(error)
-                raise
-
-        server = self._home(session.agent_id)
-        if server == self._host.server:
-            return await self._regions.ContributeKeyframes(of_session(), context)
-        try:
-            with peer_errors(server):
-                call = self._peers.stub(server).ContributeKeyframes(of_session())
-                stored: pb.ContributeKeyframesResponse = await call
-                return stored
-        except asyncio.CancelledError:
-            # gRPC cancels a call whose requests raise, and loses the error
-            if failures:
-                raise failures[0] from None
-            raise
+        total, caller = pb.ContributeKeyframesResponse(), Caller.of(context)
+        async for request in self._gate.admit(request_iterator):
+            session = await self._session(request.session_id, caller)
+            response = await self._at_home(session.agent_id, "ContributeKeyframes", request, context)
+            total.accepted += response.accepted
+            total.rejected.extend(response.rejected)
+            if len(total.rejected) > MAX_REPORTED_REJECTIONS:
+                raise InvalidInputError(total.rejected[-1].reason)
+        return total
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
         """Return a stored keyframe of an agent, for a person."""
@@ -277,8 +254,9 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         server = await self._host.wait_for(functools.partial(self._home, agent_id))
         if server == self._host.server:
             await self._host.ready()
-            return await getattr(self._regions, method)(request, context)
-        return await self._peers.call(server, method, request)
+            return await self._regions.call_home(agent_id, method, request, context)
+        call = region_pb.CallHomeRequest(agent_id=agent_id, method=method, request=request.SerializeToString())
+        return AT_HOME[method].response.FromString((await self._peers.call(server, "CallHome", call)).response)
 
     async def _read_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
         if request.strategy == pb.FUSION_STRATEGY_REFINED:

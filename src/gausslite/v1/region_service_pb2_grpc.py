@@ -71,45 +71,10 @@ class RegionServiceStub(object):
                 request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsRequest.SerializeToString,
                 response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsResponse.FromString,
                 _registered_method=True)
-        self.JoinSession = channel.unary_unary(
-                '/gausslite.v1.RegionService/JoinSession',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.JoinSessionRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.JoinSessionResponse.FromString,
-                _registered_method=True)
-        self.KeepSession = channel.unary_unary(
-                '/gausslite.v1.RegionService/KeepSession',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.FromString,
-                _registered_method=True)
-        self.LeaveSession = channel.unary_unary(
-                '/gausslite.v1.RegionService/LeaveSession',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionResponse.FromString,
-                _registered_method=True)
-        self.ContributeKeyframes = channel.stream_unary(
-                '/gausslite.v1.RegionService/ContributeKeyframes',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesResponse.FromString,
-                _registered_method=True)
-        self.GetKeyframe = channel.unary_unary(
-                '/gausslite.v1.RegionService/GetKeyframe',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeResponse.FromString,
-                _registered_method=True)
-        self.ReportObjects = channel.unary_unary(
-                '/gausslite.v1.RegionService/ReportObjects',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsResponse.FromString,
-                _registered_method=True)
-        self.EvictAgent = channel.unary_unary(
-                '/gausslite.v1.RegionService/EvictAgent',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentResponse.FromString,
-                _registered_method=True)
-        self.UnbanAgent = channel.unary_unary(
-                '/gausslite.v1.RegionService/UnbanAgent',
-                request_serializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentResponse.FromString,
+        self.CallHome = channel.unary_unary(
+                '/gausslite.v1.RegionService/CallHome',
+                request_serializer=gausslite_dot_v1_dot_region__service__pb2.CallHomeRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_region__service__pb2.CallHomeResponse.FromString,
                 _registered_method=True)
 
 
@@ -165,51 +130,9 @@ class RegionServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
-    def JoinSession(self, request, context):
-        """As in FusionService, for the agents whose home this server is.
+    def CallHome(self, request, context):
+        """Call a method of FusionService for an agent whose home this server is.
         """
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
-    def KeepSession(self, request, context):
-        """Missing associated documentation comment in .proto file."""
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
-    def LeaveSession(self, request, context):
-        """Missing associated documentation comment in .proto file."""
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
-    def ContributeKeyframes(self, request_iterator, context):
-        """Missing associated documentation comment in .proto file."""
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
-    def GetKeyframe(self, request, context):
-        """Missing associated documentation comment in .proto file."""
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
-    def ReportObjects(self, request, context):
-        """Missing associated documentation comment in .proto file."""
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
-    def EvictAgent(self, request, context):
-        """Missing associated documentation comment in .proto file."""
-        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
-        context.set_details('Method not implemented!')
-        raise NotImplementedError('Method not implemented!')
-
-    def UnbanAgent(self, request, context):
-        """Missing associated documentation comment in .proto file."""
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
@@ -252,45 +175,10 @@ def add_RegionServiceServicer_to_server(servicer, server):
                     request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsRequest.FromString,
                     response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetUpdateDigestsResponse.SerializeToString,
             ),
-            'JoinSession': grpc.unary_unary_rpc_method_handler(
-                    servicer.JoinSession,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.JoinSessionRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.JoinSessionResponse.SerializeToString,
-            ),
-            'KeepSession': grpc.unary_unary_rpc_method_handler(
-                    servicer.KeepSession,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.SerializeToString,
-            ),
-            'LeaveSession': grpc.unary_unary_rpc_method_handler(
-                    servicer.LeaveSession,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionResponse.SerializeToString,
-            ),
-            'ContributeKeyframes': grpc.stream_unary_rpc_method_handler(
-                    servicer.ContributeKeyframes,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesResponse.SerializeToString,
-            ),
-            'GetKeyframe': grpc.unary_unary_rpc_method_handler(
-                    servicer.GetKeyframe,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeResponse.SerializeToString,
-            ),
-            'ReportObjects': grpc.unary_unary_rpc_method_handler(
-                    servicer.ReportObjects,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsResponse.SerializeToString,
-            ),
-            'EvictAgent': grpc.unary_unary_rpc_method_handler(
-                    servicer.EvictAgent,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentResponse.SerializeToString,
-            ),
-            'UnbanAgent': grpc.unary_unary_rpc_method_handler(
-                    servicer.UnbanAgent,
-                    request_deserializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentResponse.SerializeToString,
+            'CallHome': grpc.unary_unary_rpc_method_handler(
+                    servicer.CallHome,
+                    request_deserializer=gausslite_dot_v1_dot_region__service__pb2.CallHomeRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_region__service__pb2.CallHomeResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -494,7 +382,7 @@ class RegionService(object):
             _registered_method=True)
 
     @staticmethod
-    def JoinSession(request,
+    def CallHome(request,
             target,
             options=(),
             channel_credentials=None,
@@ -507,198 +395,9 @@ class RegionService(object):
         return grpc.experimental.unary_unary(
             request,
             target,
-            '/gausslite.v1.RegionService/JoinSession',
-            gausslite_dot_v1_dot_fusion__service__pb2.JoinSessionRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.JoinSessionResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def KeepSession(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/gausslite.v1.RegionService/KeepSession',
-            gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.KeepSessionResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def LeaveSession(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/gausslite.v1.RegionService/LeaveSession',
-            gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.LeaveSessionResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def ContributeKeyframes(request_iterator,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.stream_unary(
-            request_iterator,
-            target,
-            '/gausslite.v1.RegionService/ContributeKeyframes',
-            gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.ContributeKeyframesResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def GetKeyframe(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/gausslite.v1.RegionService/GetKeyframe',
-            gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.GetKeyframeResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def ReportObjects(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/gausslite.v1.RegionService/ReportObjects',
-            gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.ReportObjectsResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def EvictAgent(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/gausslite.v1.RegionService/EvictAgent',
-            gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.EvictAgentResponse.FromString,
-            options,
-            channel_credentials,
-            insecure,
-            call_credentials,
-            compression,
-            wait_for_ready,
-            timeout,
-            metadata,
-            _registered_method=True)
-
-    @staticmethod
-    def UnbanAgent(request,
-            target,
-            options=(),
-            channel_credentials=None,
-            call_credentials=None,
-            insecure=False,
-            compression=None,
-            wait_for_ready=None,
-            timeout=None,
-            metadata=None):
-        return grpc.experimental.unary_unary(
-            request,
-            target,
-            '/gausslite.v1.RegionService/UnbanAgent',
-            gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentRequest.SerializeToString,
-            gausslite_dot_v1_dot_fusion__service__pb2.UnbanAgentResponse.FromString,
+            '/gausslite.v1.RegionService/CallHome',
+            gausslite_dot_v1_dot_region__service__pb2.CallHomeRequest.SerializeToString,
+            gausslite_dot_v1_dot_region__service__pb2.CallHomeResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -51,15 +51,8 @@ class RegionServiceStub:
     """As in FusionService, for the voxels that this server owns."""
     GetSessionStatus: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]
     GetUpdateDigests: _grpc.UnaryStreamMultiCallable[_fusion_service_pb2.GetUpdateDigestsRequest, _fusion_service_pb2.GetUpdateDigestsResponse]
-    JoinSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.JoinSessionRequest, _fusion_service_pb2.JoinSessionResponse]
-    """As in FusionService, for the agents whose home this server is."""
-    KeepSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.KeepSessionRequest, _fusion_service_pb2.KeepSessionResponse]
-    LeaveSession: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]
-    ContributeKeyframes: _grpc.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]
-    GetKeyframe: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.GetKeyframeRequest, _fusion_service_pb2.GetKeyframeResponse]
-    ReportObjects: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.ReportObjectsRequest, _fusion_service_pb2.ReportObjectsResponse]
-    EvictAgent: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]
-    UnbanAgent: _grpc.UnaryUnaryMultiCallable[_fusion_service_pb2.UnbanAgentRequest, _fusion_service_pb2.UnbanAgentResponse]
+    CallHome: _grpc.UnaryUnaryMultiCallable[_region_service_pb2.CallHomeRequest, _region_service_pb2.CallHomeResponse]
+    """Call a method of FusionService for an agent whose home this server is."""
 
 @_typing.type_check_only
 class RegionServiceAsyncStub(RegionServiceStub):
@@ -80,15 +73,8 @@ class RegionServiceAsyncStub(RegionServiceStub):
     """As in FusionService, for the voxels that this server owns."""
     GetSessionStatus: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetSessionStatusRequest, _fusion_service_pb2.GetSessionStatusResponse]  # type: ignore[assignment]
     GetUpdateDigests: _aio.UnaryStreamMultiCallable[_fusion_service_pb2.GetUpdateDigestsRequest, _fusion_service_pb2.GetUpdateDigestsResponse]  # type: ignore[assignment]
-    JoinSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.JoinSessionRequest, _fusion_service_pb2.JoinSessionResponse]  # type: ignore[assignment]
-    """As in FusionService, for the agents whose home this server is."""
-    KeepSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.KeepSessionRequest, _fusion_service_pb2.KeepSessionResponse]  # type: ignore[assignment]
-    LeaveSession: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.LeaveSessionRequest, _fusion_service_pb2.LeaveSessionResponse]  # type: ignore[assignment]
-    ContributeKeyframes: _aio.StreamUnaryMultiCallable[_fusion_service_pb2.ContributeKeyframesRequest, _fusion_service_pb2.ContributeKeyframesResponse]  # type: ignore[assignment]
-    GetKeyframe: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.GetKeyframeRequest, _fusion_service_pb2.GetKeyframeResponse]  # type: ignore[assignment]
-    ReportObjects: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.ReportObjectsRequest, _fusion_service_pb2.ReportObjectsResponse]  # type: ignore[assignment]
-    EvictAgent: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.EvictAgentRequest, _fusion_service_pb2.EvictAgentResponse]  # type: ignore[assignment]
-    UnbanAgent: _aio.UnaryUnaryMultiCallable[_fusion_service_pb2.UnbanAgentRequest, _fusion_service_pb2.UnbanAgentResponse]  # type: ignore[assignment]
+    CallHome: _aio.UnaryUnaryMultiCallable[_region_service_pb2.CallHomeRequest, _region_service_pb2.CallHomeResponse]  # type: ignore[assignment]
+    """Call a method of FusionService for an agent whose home this server is."""
 
 class RegionServiceServicer(metaclass=_abc_1.ABCMeta):
     """Only servers call it: with certificates, the role `server`; without them, callers on the same machine."""
@@ -150,60 +136,11 @@ class RegionServiceServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_abc.Iterator[_fusion_service_pb2.GetUpdateDigestsResponse], _abc.AsyncIterator[_fusion_service_pb2.GetUpdateDigestsResponse]]: ...
 
     @_abc_1.abstractmethod
-    def JoinSession(
+    def CallHome(
         self,
-        request: _fusion_service_pb2.JoinSessionRequest,
+        request: _region_service_pb2.CallHomeRequest,
         context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.JoinSessionResponse, _abc.Awaitable[_fusion_service_pb2.JoinSessionResponse]]:
-        """As in FusionService, for the agents whose home this server is."""
-
-    @_abc_1.abstractmethod
-    def KeepSession(
-        self,
-        request: _fusion_service_pb2.KeepSessionRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.KeepSessionResponse, _abc.Awaitable[_fusion_service_pb2.KeepSessionResponse]]: ...
-
-    @_abc_1.abstractmethod
-    def LeaveSession(
-        self,
-        request: _fusion_service_pb2.LeaveSessionRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.LeaveSessionResponse, _abc.Awaitable[_fusion_service_pb2.LeaveSessionResponse]]: ...
-
-    @_abc_1.abstractmethod
-    def ContributeKeyframes(
-        self,
-        request_iterator: _MaybeAsyncIterator[_fusion_service_pb2.ContributeKeyframesRequest],
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.ContributeKeyframesResponse, _abc.Awaitable[_fusion_service_pb2.ContributeKeyframesResponse]]: ...
-
-    @_abc_1.abstractmethod
-    def GetKeyframe(
-        self,
-        request: _fusion_service_pb2.GetKeyframeRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.GetKeyframeResponse, _abc.Awaitable[_fusion_service_pb2.GetKeyframeResponse]]: ...
-
-    @_abc_1.abstractmethod
-    def ReportObjects(
-        self,
-        request: _fusion_service_pb2.ReportObjectsRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.ReportObjectsResponse, _abc.Awaitable[_fusion_service_pb2.ReportObjectsResponse]]: ...
-
-    @_abc_1.abstractmethod
-    def EvictAgent(
-        self,
-        request: _fusion_service_pb2.EvictAgentRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.EvictAgentResponse, _abc.Awaitable[_fusion_service_pb2.EvictAgentResponse]]: ...
-
-    @_abc_1.abstractmethod
-    def UnbanAgent(
-        self,
-        request: _fusion_service_pb2.UnbanAgentRequest,
-        context: _ServicerContext,
-    ) -> _typing.Union[_fusion_service_pb2.UnbanAgentResponse, _abc.Awaitable[_fusion_service_pb2.UnbanAgentResponse]]: ...
+    ) -> _typing.Union[_region_service_pb2.CallHomeResponse, _abc.Awaitable[_region_service_pb2.CallHomeResponse]]:
+        """Call a method of FusionService for an agent whose home this server is."""
 
 def add_RegionServiceServicer_to_server(servicer: RegionServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

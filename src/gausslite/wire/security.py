@@ -141,8 +141,7 @@ _PARSER, _AGENT, _FUSION, _REGION = (
 )
 _FOR_SERVERS = (
     *("StoreParts", "BeginAgent", "RemoveAgent", "ReadVoxels", "WatchFusedMap", "GetSessionStatus", "GetUpdateDigests"),
-    *("JoinSession", "KeepSession", "LeaveSession", "ContributeKeyframes", "GetKeyframe", "ReportObjects"),
-    *("EvictAgent", "UnbanAgent"),
+    "CallHome",
 )
 
 ROLES_OF_METHOD: Final = {
