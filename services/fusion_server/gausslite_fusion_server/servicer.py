@@ -63,51 +63,45 @@ class DrainGate:
     """Open until `close` is called. Use it on the event loop only."""
 
     def __init__(self) -> None:
-        self._closed = asyncio.Event()
-
-    @property
-    def is_open(self) -> bool:
-        """False after `close`."""
-        return not self._closed.is_set()
+        self.is_open = True
+        self._readings: set[asyncio.Future[Any]] = set()
 
     def close(self) -> None:
         """Refuse new calls and end the streams read through `admit`."""
-        self._closed.set()
+        self.is_open = False
+        for reading in self._readings:
+            reading.cancel()
 
     def require_open(self) -> None:
         """Raise UnavailableError if the server drains."""
-        if self._closed.is_set():
+        if not self.is_open:
             raise UnavailableError("fusion server: draining; try again in a moment")
 
     async def admit(self, requests: AsyncIterator[_Message]) -> AsyncIterator[_Message]:
         """Yield the requests of a stream. Raises UnavailableError when the gate closes, even between two requests."""
-        closing = asyncio.ensure_future(self._closed.wait())
-        try:
-            while True:
+        while True:
+            self.require_open()
+            reading = asyncio.ensure_future(_next(requests))
+            self._readings.add(reading)
+            reading.add_done_callback(self._end)
+            try:
+                request = await reading
+            except asyncio.CancelledError:
                 self.require_open()
-                reading = asyncio.ensure_future(_next(requests))
-                # a call that is cancelled during the wait never reads an invalid request's error
-                reading.add_done_callback(_retrieve_error)
-                await asyncio.wait([reading, closing], return_when=asyncio.FIRST_COMPLETED)
-                if not reading.done():
-                    reading.cancel()
-                    await asyncio.wait([reading])
-                    self.require_open()
-                request = reading.result()
-                if request is None:
-                    return
-                yield request
-        finally:
-            closing.cancel()
+                raise
+            if request is None:
+                return
+            yield request
+
+    def _end(self, reading: asyncio.Future[Any]) -> None:
+        self._readings.discard(reading)
+        if not reading.cancelled():
+            # a call that is cancelled during the wait never reads an invalid request's error
+            reading.exception()
 
 
 async def _next(requests: AsyncIterator[_Message]) -> _Message | None:
     return await anext(requests, None)
-
-
-def _retrieve_error(reading: asyncio.Future[_Message | None]) -> None:
-    if not reading.cancelled():
-        reading.exception()
 
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
