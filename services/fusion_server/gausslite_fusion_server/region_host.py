@@ -154,9 +154,7 @@ class RegionHost:
         store = self._slots.open_store()
         try:
             store.set_mission_config(self.settings.mission_config)
-            engine = FusionEngine(
-                store, self.settings, decode_keyframe=decode_frame, others=store, traffic=self.traffic
-            )
+            engine = FusionEngine(store, self.settings, decode_keyframe=decode_frame, traffic=self.traffic)
             if engine.moved_agents:
                 raise MismatchError(
                     f"server {self.server}: the frames of {', '.join(engine.moved_agents[:8])} differ from the fused "

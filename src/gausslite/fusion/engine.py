@@ -38,7 +38,7 @@ from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, SharedRows, require_storable
+from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.unknown_frames import Find, UnknownFrames, find_frame
 from gausslite.fusion.updates import (
@@ -69,8 +69,7 @@ class FusionEngine:
     Updates, sessions, keyframes, objects and the refined map persist with the store. first_revision must exceed the
     revisions from before a restart; by default it is the time in microseconds.
     decode_keyframe reads keyframes as they were received; a refinement and the search for an unknown frame need it. fit
-    and find compare two agents' maps. others: finds what the other servers of the store know; this engine then has the
-    store's part of the voxels. traffic: continues the counters of an earlier engine.
+    and find compare two agents' maps. traffic: continues the counters of an earlier engine.
     Raises MismatchError if the store belongs to another mission configuration, CodecError for damaged records,
     StorageError.
     """
@@ -83,24 +82,23 @@ class FusionEngine:
         decode_keyframe: FrameDecoder = no_decoder,
         fit: Fit = fit_frame,
         find: Find = find_frame,
-        others: SharedRows | None = None,
         traffic: TrafficLog | None = None,
     ) -> None:
         self.settings, self.grid, quotas = settings, settings.grid, settings.quotas
         self.storage, self.acknowledgements = StorageProbe(store), Acknowledgements()
         self.traffic = traffic or TrafficLog()
         self._lock, self._store = RLock(), store
-        self._members = Membership(store, settings, others)
+        self._members = Membership(store, settings)
         self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
         self._objects, self._merged_objects = TeamObjects(store), MergedObjects()
-        self._checks = UpdateChecks(store, quotas, MissionClock(store), others)
+        self._checks = UpdateChecks(store, quotas, MissionClock(store))
         self._alignments = FrameAlignments(store)
         self._votes = VoteInput(store, self._alignments, self.grid)
         self._aligner = FrameAligner(store, self._alignments, self._lock, self.grid, settings.alignment, fit)
         self._unknown_frames = UnknownFrames(store, self._alignments, self._aligner, self._keyframes, self._lock, find)
         first = time.time_ns() // 1000 if first_revision is None else first_revision
         # a refinement is of the whole map
-        refined = load_refinement(store) if others is None else None
+        refined = None if store.is_shared else load_refinement(store)
         self.maps = FusedMapLayers(self._votes, self._lock, self.grid, first, settings.max_removed_voxels, refined)
         parts = self._members.sessions, self._checks, self.traffic, self._keyframes, self._objects
         self._agents = AgentData(store, self._votes, self.maps, self._alignments, self._aligner, parts)

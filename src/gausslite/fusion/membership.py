@@ -21,7 +21,7 @@ from gausslite.domain.errors import (
 from gausslite.fusion.agent_data import is_earlier_map
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig, SessionRecord, SharedRows, reconcile
+from gausslite.fusion.store_values import MissionConfig, SessionRecord, reconcile
 
 _log = logging.getLogger(__name__)
 RECORD = "ban"
@@ -69,18 +69,12 @@ class SessionRegistry:
     """Opens, finds and ends sessions; they persist with the store. Not thread-safe; FusionEngine holds a lock.
 
     A lease lasts `lease_s` after the session's last use; clock_s: the time in seconds. Only a join with the token of
-    the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256. others: finds
-    the sessions that other servers of the store have opened; their leases are kept there.
+    the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256. Sessions that
+    other servers of the store have opened are valid here too; their leases are kept there.
     """
 
-    def __init__(
-        self,
-        store: FusionStore,
-        lease_s: float,
-        clock_s: Callable[[], float] = time.monotonic,
-        others: SharedRows | None = None,
-    ) -> None:
-        self._store, self._lease_s, self._clock_s, self._others = store, lease_s, clock_s, others
+    def __init__(self, store: FusionStore, lease_s: float, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._store, self._lease_s, self._clock_s = store, lease_s, clock_s
         self._elsewhere: dict[str, SessionRecord] = {}
         self._sessions = {session.session_id: session for session in store.sessions()}
         # in the order of the agents' first sessions; after a restart, each robot has a whole lease to come back
@@ -141,9 +135,7 @@ class SessionRegistry:
             error = NameInUseError(f"session: {_NAME_TAKEN}")
             error.retry_after_s = self._lease_s
             raise error
-        elsewhere = self._elsewhere.get(session_id)
-        if elsewhere is None and self._others is not None:
-            elsewhere = self._others.find_session(session_id)
+        elsewhere = self._elsewhere.get(session_id) or self._store.find_session(session_id)
         if elsewhere is None:
             raise SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
         self._elsewhere[session_id] = elsewhere
@@ -212,11 +204,11 @@ class Membership:
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
 
-    def __init__(self, store: FusionStore, settings: FusionSettings, others: SharedRows | None = None) -> None:
+    def __init__(self, store: FusionStore, settings: FusionSettings) -> None:
         self._store, self._settings = store, settings
         own, self._stored_config = settings.mission_config, store.mission_config()
         self._mission_config = reconcile(self._stored_config or own, own)
-        self.sessions = SessionRegistry(store, settings.lease_s, others=others)
+        self.sessions = SessionRegistry(store, settings.lease_s)
         self.bans = BanList(store)
         self._most_agents = len(self._agents())
 

@@ -18,8 +18,7 @@ from gausslite.domain.errors import StorageError
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
 from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots, slots_of
 from gausslite.fusion.store import Execute, FusionStore
-from gausslite.fusion.store_rows import SLOT_BITS, LogChange, data_checksum, require_intact
-from gausslite.fusion.store_values import SessionRecord
+from gausslite.fusion.store_rows import SLOT_BITS, LogChange, require_intact
 
 SCHEMA_VERSION = 3
 LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
@@ -87,7 +86,7 @@ class PostgresStore(FusionStore):
         """holder: of the locks of the `owned` slots."""
         super().__init__(slots_of)
         self._name = database_name(url)
-        self._owned, self._holder = owned, holder
+        self._owned, self._holder, self.is_shared = owned, holder, owned is not None
         # identify the content of the database: this opening, and the number of transactions since
         self._opening, self._commits = "", 0
         with ExitStack() as opened:
@@ -98,20 +97,6 @@ class PostgresStore(FusionStore):
             opened.callback(self._reader.close)
             self._reader.run(self._load)
             self._opened = opened.pop_all()
-
-    def find_session(self, session_id: str) -> SessionRecord | None:
-        """Return the open session of this id, whoever opened it."""
-        query = "SELECT session_id, agent_id FROM sessions WHERE session_id = ?"
-        return next((SessionRecord(*row) for row in self._read(query, (session_id,))), None)
-
-    def find_record(self, agent_id: str, name: str) -> bytes:
-        """Return a named record of an agent; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT data, checksum FROM records WHERE name = ? AND agent_id = ?"
-        for data, checksum in self._read(query, (name, agent_id)):
-            if data_checksum(agent_id, name, data) != checksum:
-                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
-            return bytes(data)
-        return b""
 
     def close(self) -> None:
         """Close the own connections; without owned slots, this frees the database for another server."""

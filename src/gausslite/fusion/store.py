@@ -48,6 +48,8 @@ class FusionStore(ABC):
     in common.
     """
 
+    is_shared = False
+    """Whether other servers have parts of it."""
     _config_key: str
     """The column of mission_config that has the value 1 in its only row."""
 
@@ -138,6 +140,11 @@ class FusionStore(ABC):
         rows = self._read("SELECT session_id, agent_id FROM sessions")
         return tuple(SessionRecord(*row) for row in sorted(rows) if self._is_home(row[1]))
 
+    def find_session(self, session_id: str) -> SessionRecord | None:
+        """Return the open session of this id, whichever server has opened it."""
+        query = "SELECT session_id, agent_id FROM sessions WHERE session_id = ?"
+        return next((SessionRecord(*row) for row in self._read(query, (session_id,))), None)
+
     def save_session(self, session: SessionRecord) -> None:
         """Store a session; it replaces any other session of the same agent."""
         self._write_row("sessions", ("agent_id",), ("session_id",), (session.agent_id, session.session_id))
@@ -169,12 +176,8 @@ class FusionStore(ABC):
 
     def keyframe(self, agent_id: str, index: int) -> bytes:
         """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ?"
-        for data, checksum in self._read(query, (agent_id, index)):
-            if data_checksum(agent_id, index, data) != checksum:
-                raise self._damaged(f"keyframe {index} of agent {agent_id!r}")
-            return bytes(data)
-        return b""
+        query = "SELECT agent_id, data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ?"
+        return self._intact(index, self._read(query, (agent_id, index))).get(agent_id, b"")
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
         """Store a named record of an agent; it replaces the earlier one."""
@@ -183,11 +186,22 @@ class FusionStore(ABC):
 
     def records(self, name: str) -> dict[str, bytes]:
         """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
-        rows = self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,))
+        return self._intact(name, self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,)))
+
+    def find_record(self, agent_id: str, name: str) -> bytes:
+        """Return a named record of an agent; empty if it does not exist. Raises StorageError for a damaged one."""
+        query = "SELECT agent_id, data, checksum FROM records WHERE name = ? AND agent_id = ?"
+        return self._intact(name, self._read(query, (name, agent_id))).get(agent_id, b"")
+
+    def _intact(self, name: str | int, rows: Iterable[tuple[str, bytes, int]]) -> dict[str, bytes]:
+        """Return the data of each agent. Raises StorageError for a damaged row."""
+        found = {}
         for agent_id, data, checksum in rows:
             if data_checksum(agent_id, name, data) != checksum:
-                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
-        return {agent_id: data for agent_id, data, _ in rows}
+                kind = f"record {name!r}" if isinstance(name, str) else f"keyframe {name}"
+                raise self._damaged(f"{kind} of agent {agent_id!r}")
+            found[agent_id] = bytes(data)
+        return found
 
     @abstractmethod
     def close(self) -> None:

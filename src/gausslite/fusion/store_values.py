@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Int32, Int64, UInt32, UInt64
@@ -129,19 +128,6 @@ class AgentTotals:
 def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
     """Return a sum that cannot wrap around."""
     return sum(values.tolist())
-
-
-@runtime_checkable
-class SharedRows(Protocol):
-    """What several servers of one store know of an agent, whichever of them wrote it."""
-
-    def find_session(self, session_id: str) -> SessionRecord | None:
-        """Return the open session of this id. Raises StorageError."""
-        ...
-
-    def find_record(self, agent_id: str, name: str) -> bytes:
-        """Return a named record of an agent; empty if it does not exist. Raises StorageError."""
-        ...
 
 
 def require_storable(update: StoredSubset) -> None:

@@ -30,7 +30,7 @@ from gausslite.domain.errors import (
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import PutOutcome, SharedRows
+from gausslite.fusion.store_values import PutOutcome
 
 MAX_SEQ_STEP = 1 << 32
 """An honest agent counts its messages; a larger step would let one message use up all later numbers."""
@@ -59,14 +59,11 @@ def require_own(agent_id: str, named: str, grid: VoxelGrid, expected: VoxelGrid)
 class UpdateChecks:
     """Knows when each agent first joined. Not thread-safe; FusionEngine holds a lock.
 
-    The first joins persist with the store. clock_s: the mission's time in seconds. others: finds the first joins at
-    other servers of the store.
+    The first joins persist with the store, those at its other servers too. clock_s: the mission's time in seconds.
     """
 
-    def __init__(
-        self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float], others: SharedRows | None = None
-    ) -> None:
-        self._store, self._quotas, self._clock_s, self._others = store, quotas, clock_s, others
+    def __init__(self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float]) -> None:
+        self._store, self._quotas, self._clock_s = store, quotas, clock_s
         self._first_joined_s = {agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(RECORD).items()}
 
     def record_join(self, agent_id: str) -> None:
@@ -99,10 +96,10 @@ class UpdateChecks:
     def _kappa_bound(self, agent_id: str) -> int:
         """Return the largest plausible kappa: the iterations before the first join, and those since then."""
         now_s = self._clock_s()
-        if agent_id not in self._first_joined_s and self._others is not None:
-            stored = self._others.find_record(agent_id, RECORD)
+        if agent_id not in self._first_joined_s:
+            stored = self._store.find_record(agent_id, RECORD)
             self._first_joined_s[agent_id] = _JOINED.unpack(stored)[0] if stored else now_s
-        elapsed_s = max(0.0, now_s - self._first_joined_s.get(agent_id, now_s))
+        elapsed_s = max(0.0, now_s - self._first_joined_s[agent_id])
         return self._quotas.kappa_at_join + int(self._quotas.kappa_per_second * elapsed_s)
 
 
