@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 import grpc
 
@@ -23,8 +23,9 @@ from gausslite_fusion_server.contributions import StoredCount
 from gausslite_fusion_server.region_servicer import SLOTS_KEY
 
 CALL_S = 30.0
+READ_S = 600.0
+"""Of a part of the map."""
 _BATCH_BYTES = 1 << 20
-_Answer = TypeVar("_Answer")
 
 
 @contextmanager
@@ -69,42 +70,27 @@ class Peers:
         with peer_errors(server):
             return await getattr(self.stub(server), method)(request, timeout=CALL_S)
 
-    async def ask_all(
-        self, servers: Iterable[str], ask: Callable[[str], tuple[Any, Awaitable[_Answer]]]
-    ) -> dict[str, _Answer]:
-        """Return the answer of each server; ask: returns the call to one and its answer.
+    async def call_all(
+        self, servers: Iterable[str], method: str, request: Any, timeout_s: float = CALL_S
+    ) -> dict[str, Any]:
+        """Return the answer of each server to a unary call, or all its answers to a streaming call.
 
         Raises UnavailableError unless the answers hold for all slots together, and the errors of the servers.
         """
 
-        async def answer_of(server: str) -> tuple[frozenset[int], _Answer]:
+        async def answer_of(server: str) -> tuple[frozenset[int], Any]:
             with peer_errors(server):
-                call, answer = ask(server)
-                result = await answer
-                return await stated_slots(call), result
+                call = getattr(self.stub(server), method)(request, timeout=timeout_s)
+                if isinstance(call, grpc.aio.UnaryUnaryCall):
+                    answer = await call
+                else:
+                    answer = [response async for response in call]
+                return await stated_slots(call), answer
 
         names = list(servers)
         results = await asyncio.gather(*map(answer_of, names))
         require_all(slots for slots, _ in results)
         return {name: answer for name, (_, answer) in zip(names, results, strict=True)}
-
-    async def call_all(self, servers: Iterable[str], method: str, request: Any) -> dict[str, Any]:
-        """Return the answer of each server to a unary call. Raises as `ask_all`."""
-
-        def ask(server: str) -> tuple[Any, Awaitable[Any]]:
-            call = getattr(self.stub(server), method)(request, timeout=CALL_S)
-            return call, call
-
-        return await self.ask_all(servers, ask)
-
-    async def read_all(self, servers: Iterable[str], method: str, request: Any) -> dict[str, list[Any]]:
-        """Return all answers of each server to a streaming call. Raises as `ask_all`."""
-
-        def ask(server: str) -> tuple[Any, Awaitable[list[Any]]]:
-            call = getattr(self.stub(server), method)(request, timeout=20 * CALL_S)
-            return call, _read(call)
-
-        return await self.ask_all(servers, ask)
 
     async def send_part(self, server: str, session_id: str, part: StoredSubset) -> StoredCount:
         """Send a part of a message to its owner; returns when it is durable. Raises what the owner raised."""
@@ -119,10 +105,6 @@ class Peers:
             await stream.close()
         for channel in self._channels.values():
             await channel.close(None)
-
-
-async def _read(call: Any) -> list[Any]:
-    return [response async for response in call]
 
 
 class _PartStream:

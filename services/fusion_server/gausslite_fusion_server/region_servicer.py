@@ -127,10 +127,11 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
     async def BeginAgent(self, request: region_pb.BeginAgentRequest, context: Any) -> region_pb.BeginAgentResponse:
         """Note that an agent has joined at its home."""
         engine = self._host.local().engine
-        if request.fresh_map and self._host.owned.is_home(request.agent_id):
+        fresh_map = request.fresh_map and request.home != self._host.server
+        if fresh_map and self._host.owned.is_home(request.agent_id):
             raise UnavailableError(f"server {self._host.server}: has become the home of this agent; join again")
         await self._state_slots(context)
-        highest = await asyncio.to_thread(engine.begin_elsewhere, request.agent_id, request.fresh_map)
+        highest = await asyncio.to_thread(engine.begin_elsewhere, request.agent_id, fresh_map)
         return region_pb.BeginAgentResponse(highest_update_seq=highest)
 
     async def RemoveAgent(self, request: region_pb.RemoveAgentRequest, context: Any) -> region_pb.RemoveAgentResponse:

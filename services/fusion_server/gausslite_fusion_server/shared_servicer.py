@@ -30,7 +30,7 @@ from gausslite.wire.server import Service
 from gausslite_fusion_server.contributions import Contributions
 from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_message, layer_from_message
 from gausslite_fusion_server.part_sender import PartSender
-from gausslite_fusion_server.peers import CALL_S, Peers
+from gausslite_fusion_server.peers import READ_S, Peers
 from gausslite_fusion_server.region_host import RegionHost
 from gausslite_fusion_server.region_servicer import AT_HOME, RegionServicer
 from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate
@@ -76,17 +76,16 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
                 "sent; localise the robot in the mission's frame"
             )
         response: pb.JoinSessionResponse = await self._at_home(request.agent_id, "JoinSession", request, context)
-        home, highest = self._host.owners.home(request.agent_id), response.highest_update_seq
-        begin = functools.partial(self._begin, request, home)
-        answers = await self._peers.ask_all(self._host.owners.servers, begin)
-        response.highest_update_seq = max([highest, *(answer.highest_update_seq for answer in answers.values())])
+        begin = region_pb.BeginAgentRequest(
+            agent_id=request.agent_id, fresh_map=request.fresh_map, home=self._home(request.agent_id)
+        )
+        response.highest_update_seq = max(response.highest_update_seq, await self._begin(begin))
         return response
 
-    def _begin(self, request: pb.JoinSessionRequest, home: str | None, server: str) -> tuple[Any, Any]:
-        fresh_map = request.fresh_map and server != home
-        begin = region_pb.BeginAgentRequest(agent_id=request.agent_id, fresh_map=fresh_map)
-        call = self._peers.stub(server).BeginAgent(begin, timeout=CALL_S)
-        return call, call
+    async def _begin(self, begin: region_pb.BeginAgentRequest) -> int:
+        """Tell all owners that an agent has joined; returns its highest update_seq."""
+        answers = await self._peers.call_all(self._host.owners.servers, "BeginAgent", begin)
+        return max(int(answer.highest_update_seq) for answer in answers.values())
 
     async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
         """Renew the agent's lease; return what identifies the stored updates."""
@@ -94,9 +93,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         response: pb.KeepSessionResponse = await self._at_home(session.agent_id, "KeepSession", request, context)
         highest = self._sender.highest_acknowledged(session)
         if highest is None:
-            begin = region_pb.BeginAgentRequest(agent_id=session.agent_id)
-            answers = await self._peers.call_all(self._host.owners.servers, "BeginAgent", begin)
-            highest = max(answer.highest_update_seq for answer in answers.values())
+            highest = await self._begin(region_pb.BeginAgentRequest(agent_id=session.agent_id))
             self._sender.note_acknowledged(session, highest)
         response.highest_update_seq = max(response.highest_update_seq, highest)
         return response
@@ -106,7 +103,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
         """Return the digests of the agent's stored updates."""
         await self._session(request.session_id, Caller.of(context))
-        answers = await self._peers.read_all(self._host.owners.servers, "GetUpdateDigests", request)
+        answers = await self._peers.call_all(self._host.owners.servers, "GetUpdateDigests", request, READ_S)
         digests = TileDigests.sum_of(digests_from_messages(blocks) for blocks in answers.values())
         for block in digests_to_messages(digests):
             with read_deadline():
@@ -261,7 +258,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
     async def _read_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
         if request.strategy == pb.FUSION_STRATEGY_REFINED:
             _refuse("refined map")
-        answers = await self._peers.read_all(self._host.owners.servers, "ReadVoxels", request)
+        answers = await self._peers.call_all(self._host.owners.servers, "ReadVoxels", request, READ_S)
         return await asyncio.to_thread(_merge, [block.block.subset for own in answers.values() for block in own])
 
 

@@ -137,17 +137,22 @@ class BeginAgentRequest(_message.Message):
 
     AGENT_ID_FIELD_NUMBER: _builtins.int
     FRESH_MAP_FIELD_NUMBER: _builtins.int
+    HOME_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     fresh_map: _builtins.bool
+    """At other servers than its home, which has begun it with the join."""
+    home: _builtins.str
+    """The address of the server where the agent has joined."""
     def __init__(
         self,
         *,
         agent_id: _builtins.str = ...,
         fresh_map: _builtins.bool = ...,
+        home: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "fresh_map", b"fresh_map"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "fresh_map", b"fresh_map", "home", b"home"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
