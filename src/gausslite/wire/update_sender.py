@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from threading import Lock
 from typing import Literal
 
 import numpy as np
@@ -17,60 +16,12 @@ from gausslite.config.option import option
 from gausslite.config.values import read_numbers
 from gausslite.datasets.folder import pose_from_quaternion
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError, QuotaError, UnavailableError
-from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import UNKNOWN, FusionClient, Session
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 
 _log = logging.getLogger(__name__)
-
-
-class ObjectOutbox:
-    """Holds one report; a newer one replaces it. Thread-safe."""
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._latest: ObjectReport | None = None
-        self._sent: ObjectReport | None = None
-
-    def put(self, report: ObjectReport) -> bool:
-        """Replace the report; returns whether it has to be sent."""
-        with self._lock:
-            self._latest = report
-            return self._latest != self._sent
-
-    @property
-    def latest(self) -> ObjectReport | None:
-        """The latest report, sent or not."""
-        return self._latest
-
-    @property
-    def pending(self) -> ObjectReport | None:
-        """The latest report if the server does not have it."""
-        with self._lock:
-            return None if self._latest == self._sent else self._latest
-
-    def send(self, client: FusionClient, session_id: str) -> int:
-        """Send the report if the server does not have it; returns the bytes. Raises GaussLiteError.
-
-        A rejected report is dropped, because the map does not depend on it.
-        """
-        report, sent_bytes = self.pending, 0
-        if report is None:
-            return 0
-        try:
-            sent_bytes = client.report_objects(session_id, report)
-        except InvalidInputError as error:
-            _log.warning("uplink: the report of objects is dropped: %s", error)
-        with self._lock:
-            self._sent = report
-        return sent_bytes
-
-    def mark_unsent(self) -> None:
-        """Note that the server has lost the report."""
-        with self._lock:
-            self._sent = None
 
 
 def read_rigid_transform(text: str) -> Float64[ndarray, "4 4"]:
@@ -209,17 +160,10 @@ class UpdateSender:
         return list(self._requests(due, session, sent)), sent
 
     def send(self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, SentPart]) -> None:
-        """Send the messages and handle their outcomes. Raises the error that needs a retry, UnavailableError."""
-        error = self._exchange(requests, sent)
-        if error is not None:
-            raise error
-        if sent:
-            raise UnavailableError(f"{self._client}: the stream ended before {len(sent)} subsets were answered")
+        """Send the messages on one stream and handle their outcomes.
 
-    def _exchange(
-        self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, SentPart]
-    ) -> GaussLiteError | None:
-        """Send on one stream and handle the outcomes; returns the last error that needs a retry."""
+        Raises the last error that needs a retry, UnavailableError.
+        """
         error_to_retry: GaussLiteError | None = None
         try:
             for response in self._client.contribute(requests, self._deadline_s):
@@ -231,7 +175,12 @@ class UpdateSender:
             for unanswered in sent.values():
                 self._drop(unanswered.batch, str(error))
             sent.clear()
-        return error_to_retry
+        if error_to_retry is None and sent:
+            error_to_retry = UnavailableError(
+                f"{self._client}: the stream ended before {len(sent)} subsets were answered"
+            )
+        if error_to_retry is not None:
+            raise error_to_retry
 
     def _requests(
         self, due: SpoolBatch, session: Session, sent: dict[int, SentPart]

@@ -34,7 +34,7 @@ from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.security import TokenBucket
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch, SpooledKeyframe
-from gausslite.wire.update_sender import ObjectOutbox, UpdateSender, UplinkCounters, UplinkSettings
+from gausslite.wire.update_sender import UpdateSender, UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
 _MIN_INTERVAL_S = 0.02
@@ -68,7 +68,9 @@ class Uplink:
         self._draining = self._closing = False
         self._drain_limit_s = math.inf
         self._sent_keyframes: set[int] = set()
-        self._objects = ObjectOutbox()
+        # the latest report of objects, and the one that the server has
+        self._report: ObjectReport | None = None
+        self._sent_report: ObjectReport | None = None
         self._frame_message = ""
         # guards the counters and flags; waited on by the thread and by drain
         self._changed = threading.Condition()
@@ -91,9 +93,9 @@ class Uplink:
 
     def report_objects(self, report: ObjectReport) -> None:
         """Send the agent's task and objects with the next round; a newer report replaces one that waits."""
-        if self._objects.put(report):
-            with self._changed:
-                self._changed.notify_all()
+        with self._changed:
+            self._report = report
+            self._changed.notify_all()
 
     def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
         """Queue a selected keyframe; replaced: index of the one that it replaces. Raises StorageError."""
@@ -159,7 +161,7 @@ class Uplink:
         return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
 
     def _has_pending(self) -> bool:
-        return self._objects.pending is not None or self._spool.pending_voxels + self._spool.pending_keyframes > 0
+        return self._has_report or self._spool.pending_voxels + self._spool.pending_keyframes > 0
 
     def _run(self) -> None:
         try:
@@ -200,14 +202,14 @@ class Uplink:
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
         due = self._spool.next_round(max_bytes, resend_threshold)
-        if due is None and self._objects.pending is None:
+        if due is None and not self._has_report:
             return False
         is_new_session = self._session is None
         session = self._join_if_needed()
         if is_new_session:
             # the comparison of digests may have added updates
             due = self._spool.next_round(max_bytes, resend_threshold)
-        self._token_bucket.spend(self._objects.send(self._client, session.session_id))
+        self._send_report(session)
         if due is None:
             return True
         if due.voxels is not None:
@@ -234,7 +236,7 @@ class Uplink:
     def _forget_session(self) -> None:
         """Join again with the next round, and send objects again; digests find the other updates."""
         self._session = None
-        self._objects.mark_unsent()
+        self._sent_report = None
 
     def _resend_missing(self, session: Session) -> None:
         """If the server may have lost updates, compare digests and mark as unsent what differs."""
@@ -247,6 +249,22 @@ class Uplink:
         )
         if len(acknowledged.tiles):
             _log.warning("uplink: %s lacks some of what it had; %d voxels are sent again", self._client, resent)
+
+    @property
+    def _has_report(self) -> bool:
+        return self._report != self._sent_report
+
+    def _send_report(self, session: Session) -> None:
+        """Send the report of objects if the server does not have it; a rejected one is dropped."""
+        report = self._report
+        if report is None or report == self._sent_report:
+            return
+        try:
+            self._token_bucket.spend(self._client.report_objects(session.session_id, report))
+        except InvalidInputError as error:
+            # the map does not depend on it
+            _log.warning("uplink: the report of objects is dropped: %s", error)
+        self._sent_report = report
 
     def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
         requests, sent = self._sender.encode(due, session)
@@ -273,7 +291,7 @@ class Uplink:
         if self._session is None:
             # a robot with a new map cannot send tombstones for the updates of its earlier map
             fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
-            report, frame = self._objects.latest, self._settings.world_frame
+            report, frame = self._report, self._settings.world_frame
             task = None if report is None else report.graph
             session = self._client.join(self._agent_id, self._grid, frame, fresh, task, self._settings.declared_frame)
             self._resend_missing(session)
