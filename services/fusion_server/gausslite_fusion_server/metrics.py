@@ -21,33 +21,21 @@ from gausslite.wire.channel import host_and_port
 _log = logging.getLogger(__name__)
 
 
-class _AgentMetric(NamedTuple):
-    name: str
-    help_text: str
-    is_counter: bool
-    value: Callable[[AgentContribution], float]
-
-
-_OF_AGENTS = (
-    _AgentMetric("joined", "1 while the agent has a session", False, lambda each: each.joined),
-    _AgentMetric("voxels", "voxels that the agent has contributed", False, lambda each: each.voxels),
-    _AgentMetric("gaussians", "Gaussians that the agent has contributed", False, lambda each: each.gaussians),
-    _AgentMetric("won_voxels", "voxels of the fused map that the agent won", False, lambda each: each.won_voxels),
-    _AgentMetric("keyframes", "stored keyframes of the agent", False, lambda each: each.keyframes),
-    _AgentMetric(
-        "last_seen_seconds",
-        "time of the last message since the epoch",
-        False,
-        lambda each: each.traffic.last_seen_ns / 1e9,
-    ),
-    _AgentMetric("roi_bytes", "received bytes of the task's region", True, lambda each: each.traffic.roi_bytes),
-    _AgentMetric("handover_bytes", "received bytes of handovers", True, lambda each: each.traffic.handover_bytes),
-    _AgentMetric("subsets_accepted", "messages stored", True, lambda each: each.traffic.subsets_accepted),
-    _AgentMetric("subsets_stale", "messages without news", True, lambda each: each.traffic.subsets_stale),
-    _AgentMetric("subsets_rejected", "messages refused", True, lambda each: each.traffic.subsets_rejected),
+_OF_AGENTS: tuple[tuple[str, str, Callable[[AgentContribution], float]], ...] = (
+    ("joined", "1 while the agent has a session", lambda each: each.joined),
+    ("voxels", "voxels that the agent has contributed", lambda each: each.voxels),
+    ("gaussians", "Gaussians that the agent has contributed", lambda each: each.gaussians),
+    ("won_voxels", "voxels of the fused map that the agent won", lambda each: each.won_voxels),
+    ("keyframes", "stored keyframes of the agent", lambda each: each.keyframes),
+    ("last_seen_seconds", "time of the last message since the epoch", lambda each: each.traffic.last_seen_ns / 1e9),
 )
-
-
+_COUNTERS_OF_AGENTS: tuple[tuple[str, str, Callable[[AgentContribution], float]], ...] = (
+    ("roi_bytes", "received bytes of the task's region", lambda each: each.traffic.roi_bytes),
+    ("handover_bytes", "received bytes of handovers", lambda each: each.traffic.handover_bytes),
+    ("subsets_accepted", "messages stored", lambda each: each.traffic.subsets_accepted),
+    ("subsets_stale", "messages without news", lambda each: each.traffic.subsets_stale),
+    ("subsets_rejected", "messages refused", lambda each: each.traffic.subsets_rejected),
+)
 _OF_MISSION: tuple[tuple[str, str, Callable[[MissionStatus, bool], float]], ...] = (
     ("revision", "revision of the fused map", lambda status, _: status.revision),
     ("fused_voxels", "voxels of the fused map", lambda status, _: status.fused_voxels),
@@ -110,12 +98,12 @@ class MissionCollector:
                 of_share = CounterMetricFamily(f"gausslite_fusion_{name}", help_text, labels=["mission"])
                 of_share.add_metric([mission_id], count)
                 yield of_share
-        for metric in _OF_AGENTS:
-            kind = CounterMetricFamily if metric.is_counter else GaugeMetricFamily
-            family = kind(f"gausslite_agent_{metric.name}", metric.help_text, labels=["mission", "agent"])
-            for agent in status.agents:
-                family.add_metric([mission_id, agent.agent_id], metric.value(agent))
-            yield family
+        for kind, metrics in ((GaugeMetricFamily, _OF_AGENTS), (CounterMetricFamily, _COUNTERS_OF_AGENTS)):
+            for name, help_text, of_agent in metrics:
+                family = kind(f"gausslite_agent_{name}", help_text, labels=["mission", "agent"])
+                for agent in status.agents:
+                    family.add_metric([mission_id, agent.agent_id], of_agent(agent))
+                yield family
 
 
 @contextmanager

@@ -36,7 +36,6 @@ class PartSender:
         self._host, self._regions, self._peers, self._grid = host, regions, peers, grid
         self._queue = UpdateQueue()
         self._decoder = ThreadPoolExecutor(1, "decode")
-        self._decoded: dict[PendingUpdate, Future[StoredSubset]] = {}
         self._highest: dict[str, tuple[str, int]] = {}
         self._waiting_bytes: Counter[str | None] = Counter()
         self.received = self.sent = 0
@@ -74,27 +73,20 @@ class PartSender:
 
     async def _decode(self, session: SessionRecord, message: bytes) -> StoredSubset:
         update = PendingUpdate(session.session_id, session.agent_id, message)
-        decoded = self._decoded[update] = Future()
-        # a call that is cancelled keeps its turn
-        decoded.set_running_or_notify_cancel()
-        try:
-            self._queue.add(update)
-        except UnavailableError:
-            del self._decoded[update]
-            raise
+        self._queue.add(update)
         # one turn for each message, for the one that is next then
         self._decoder.submit(self._decode_next)
-        return await asyncio.wrap_future(decoded)
+        subset: StoredSubset = await asyncio.wrap_future(update.future)
+        return subset
 
     def _decode_next(self) -> None:
         [update] = self._queue.take(1)
-        decoded = self._decoded.pop(update)
         try:
             assert isinstance(update.message, bytes)
-            decoded.set_result(decode_own(update.message, update.agent_id, self._grid))
+            update.future.set_result(decode_own(update.message, update.agent_id, self._grid))
         except Exception as error:
             # reaches the call; this thread decodes the messages of all agents
-            decoded.set_exception(error)
+            update.future.set_exception(error)
         finally:
             self._queue.put_back(update, is_done=True)
 

@@ -164,7 +164,7 @@ class UpdateLog:
         for slot, part in zip(slots, parts, strict=True):
             size, data = _size(part), part.to_row()
             numbers.append(self._next_number(slot, size))
-            change.rows.append((numbers[-1], agent_id, row_checksum(numbers[-1], agent_id, data), data))
+            change.rows.append((numbers[-1], agent_id, data_checksum(agent_id, numbers[-1], data), data))
             change.sizes.append(size)
         table = join_elements([part.voxels for part in parts])
         rows = np.repeat(np.array(numbers, np.int64), [len(part) for part in parts])
@@ -261,12 +261,7 @@ def require_intact(rows: Iterable[UpdateRow], damaged: Callable[[str], StorageEr
 def is_intact(row: UpdateRow) -> bool:
     """Return whether a row has its checksum."""
     number, agent_id, checksum, data = row
-    return row_checksum(number, agent_id, data) == checksum
-
-
-def row_checksum(number: int, agent_id: str, data: bytes) -> int:
-    """Return the CRC32C of a row."""
-    return data_checksum(agent_id, number, data)
+    return data_checksum(agent_id, number, data) == checksum
 
 
 def data_checksum(owner: str, name: str | int, data: bytes) -> int:

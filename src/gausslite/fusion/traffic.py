@@ -6,7 +6,7 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from threading import Lock
 
 from gausslite.domain.checks import quote_name
@@ -122,14 +122,8 @@ class TrafficCounters:
 
     def plus(self, newer: TrafficCounters) -> TrafficCounters:
         """Return the sums, with last_seen_ns of the newer counters."""
-        return TrafficCounters(
-            newer.last_seen_ns,
-            self.roi_bytes + newer.roi_bytes,
-            self.handover_bytes + newer.handover_bytes,
-            self.subsets_accepted + newer.subsets_accepted,
-            self.subsets_stale + newer.subsets_stale,
-            self.subsets_rejected + newer.subsets_rejected,
-        )
+        counts = zip(astuple(self)[1:], astuple(newer)[1:], strict=True)
+        return TrafficCounters(newer.last_seen_ns, *(own + more for own, more in counts))
 
 
 class TrafficLog:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from threading import Lock, RLock
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
@@ -116,12 +117,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True, eq=False)
 class PendingUpdate:
-    """A message that waits for its commit, encoded or as it is stored. `outcomes` has those of the stored slices."""
+    """A message that waits for its commit, encoded or as it is stored. `outcomes` has those of the stored slices.
+
+    future: has its outcome, or its content where it is only decoded.
+    """
 
     session_id: str
     agent_id: str
     message: bytes | StoredSubset
-    future: Future[PutOutcome] = field(default_factory=Future)
+    future: Future[Any] = field(default_factory=Future)
     next_voxel: int = 0
     outcomes: list[PutOutcome] = field(default_factory=list)
     queued_s: float = field(default_factory=time.monotonic)

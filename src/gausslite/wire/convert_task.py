@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -222,7 +222,8 @@ def _relation_from_message(message: task_pb2.Relation) -> Relation:
 
 
 _ROLES = {ObjectRole.TARGET: objects_pb2.OBJECT_ROLE_TARGET, ObjectRole.ANCHOR: objects_pb2.OBJECT_ROLE_ANCHOR}
-_CONVERT_OBJECTS_ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}
+_OBJECT_ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}
+_OBSERVER = tuple(field.name for field in fields(ObjectObserver))
 
 
 def object_to_message(landmark: ObjectLandmark, observers: Sequence[ObjectObserver] = ()) -> objects_pb2.ObjectLandmark:
@@ -238,14 +239,7 @@ def object_to_message(landmark: ObjectLandmark, observers: Sequence[ObjectObserv
         first_seen_ns=landmark.first_seen_ns,
         last_seen_ns=landmark.last_seen_ns,
         observers=[
-            objects_pb2.ObjectObserver(
-                agent_id=observer.agent_id,
-                object_id=observer.object_id,
-                target=observer.target,
-                confidence=observer.confidence,
-                first_seen_ns=observer.first_seen_ns,
-                last_seen_ns=observer.last_seen_ns,
-            )
+            objects_pb2.ObjectObserver(**{name: getattr(observer, name) for name in _OBSERVER})
             for observer in observers
         ],
     )
@@ -253,7 +247,7 @@ def object_to_message(landmark: ObjectLandmark, observers: Sequence[ObjectObserv
 
 def object_from_message(message: objects_pb2.ObjectLandmark) -> ObjectLandmark:
     """Decode an object without its observers. Raises InvalidInputError."""
-    role = _CONVERT_OBJECTS_ROLE_BY_NUMBER.get(message.role)
+    role = _OBJECT_ROLE_BY_NUMBER.get(message.role)
     if role is None:
         raise InvalidInputError(f"object role: expected TARGET or ANCHOR, got {message.role}")
     centroid = message.centroid_m
@@ -271,17 +265,7 @@ def object_from_message(message: objects_pb2.ObjectLandmark) -> ObjectLandmark:
 
 def team_object_from_message(message: objects_pb2.ObjectLandmark) -> TeamObject:
     """Decode an object of the team. Raises InvalidInputError."""
-    observers = tuple(
-        ObjectObserver(
-            observer.agent_id,
-            observer.object_id,
-            observer.target,
-            observer.confidence,
-            observer.first_seen_ns,
-            observer.last_seen_ns,
-        )
-        for observer in message.observers
-    )
+    observers = tuple(ObjectObserver(*(getattr(own, name) for name in _OBSERVER)) for own in message.observers)
     return TeamObject(object_from_message(message), observers)
 
 
