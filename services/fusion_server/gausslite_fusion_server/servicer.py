@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -133,7 +132,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         # one thread each: a comparison of frames or a rendering must not delay the acknowledgements
         self._aligner = ThreadPoolExecutor(1, "align")
         self._background = ThreadPoolExecutor(1, "background")
-        self._aligning, self._align_again, self._align_pause_s = False, False, _ALIGN_DELAY_S
+        self._aligning: asyncio.Task[None] | None = None
+        self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
         self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
@@ -154,6 +154,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def drain(self) -> None:
         """End every open stream and every later call with UNAVAILABLE."""
         self._gate.close()
+        if self._aligning is not None:
+            self._aligning.cancel()
         self._map_changes.notify()
 
     @property
@@ -398,39 +400,29 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         return ExportedFile(ply_bytes(batch.gaussians, self._engine.mission_config.given_world_frame))
 
     def _align_in_background(self) -> None:
-        """Compare an agent's frame soon, unless a comparison is pending or running. Use on the event loop."""
+        """Compare the frames that are due soon, unless that is pending or running. Use on the event loop."""
         self._align_again = True
-        if not self._aligning:
-            self._aligning = True
-            asyncio.get_running_loop().call_later(self._align_pause_s, self._align)
+        if self._gate.is_open and (self._aligning is None or self._aligning.done()):
+            self._aligning = asyncio.create_task(self._align())
 
-    def _align(self) -> None:
-        if not self._gate.is_open:
-            return
-        self._align_again = False
-        future = asyncio.get_running_loop().run_in_executor(self._aligner, self._align_due)
-        future.add_done_callback(self._after_aligning)
-
-    def _align_due(self) -> bool:
-        start_s = time.monotonic()
-        try:
-            return self._engine.align_due(at_most=1)
-        finally:
-            self._align_pause_s = max(_ALIGN_DELAY_S, _ALIGN_PAUSE * (time.monotonic() - start_s))
+    async def _align(self) -> None:
+        """Compare one agent after the other, with pauses, until none is due."""
+        loop, pause_s = asyncio.get_running_loop(), self._align_pause_s
+        while self._align_again and self._gate.is_open:
+            await asyncio.sleep(pause_s)
+            # messages that arrive meanwhile set it again
+            self._align_again, start_s, is_changed = False, loop.time(), True
+            try:
+                is_changed = await loop.run_in_executor(self._aligner, self._engine.align_due, 1)
+                pause_s = max(_ALIGN_DELAY_S, _ALIGN_PAUSE * (loop.time() - start_s))
+            except Exception as error:
+                # an agent may have been compared before
+                _log.error("frames are not compared, again in %.0f s: %s", _ALIGN_RETRY_S, error)
+                pause_s = _ALIGN_RETRY_S
+            self._align_pause_s = pause_s
             self._align_again |= self._engine.is_alignment_due
-
-    def _after_aligning(self, future: asyncio.Future[bool]) -> None:
-        self._aligning = False
-        if future.cancelled() or not self._gate.is_open:
-            return
-        if future.exception() is not None:
-            _log.error("frames are not compared, again in %.0f s: %s", _ALIGN_RETRY_S, future.exception())
-            self._align_pause_s = _ALIGN_RETRY_S
-        if future.exception() is not None or future.result():
-            self._map_changes.notify()
-        if self._align_again:
-            # messages that arrived meanwhile, or the next agent
-            self._align_in_background()
+            if is_changed:
+                self._map_changes.notify()
 
     async def _work(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
         """Run the function in a worker thread. Raises UnavailableError if the server drains."""

@@ -268,9 +268,6 @@ def _decode(data: bytes) -> FrameAlignment:
     """Decode a stored alignment. Raises CodecError."""
     try:
         value = json.loads(data)
-        if "against" not in value:
-            # of an earlier version: what it estimated is estimated again
-            return FrameAlignment(int(value["order"]), declared=_matrix(value["declared"]))
         fit = None if value["fit"] is None else FrameFit.from_json(value["fit"])
         if fit is not None:
             require_rigid("stored motion", fit.motion)
@@ -282,8 +279,7 @@ def _decode(data: bytes) -> FrameAlignment:
             str(value["message"]),
             declared=_matrix(value["declared"]),
             against=tuple(str(name) for name in value["against"]),
-            # absent in records of an earlier version
-            is_unknown=bool(value.get("is_unknown")),
+            is_unknown=bool(value["is_unknown"]),
         )
     except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
         raise CodecError(f"alignment: expected the JSON of an alignment, got other bytes ({error})") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +20,9 @@ from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_v
 from gausslite.fusion.alignment import Fit, FrameFit, SurfaceSamples, fit_frame
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import (
-    RECORD,
     AlignmentSettings,
     AlignmentState,
     FrameAlignment,
-    FrameAlignments,
 )
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings
@@ -396,15 +393,6 @@ def test_a_declared_frame_is_used_and_can_be_refined() -> None:
     engine.align_due()
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
     assert surface_error_m(engine.maps.voted_map("bee").gaussians.means_m) < 0.005
-
-
-def test_an_estimate_of_an_earlier_version_is_made_again_and_a_declared_frame_stays() -> None:
-    store, declared = MemoryStore(), wrong_frame((5.0, 0.0, 0.0))
-    earlier = {"order": 3, "state": "quarantined", "segments": [], "message": "", "fit": {"T": [], "rest": []}}
-    store.save_record("bee", RECORD, json.dumps(earlier | {"declared": declared.reshape(-1).tolist()}).encode())
-    alignment = FrameAlignments(store).get("bee")
-    assert (alignment.order, alignment.state, alignment.fit) == (3, AlignmentState.UNKNOWN, None)
-    assert np.array_equal(alignment.T_fused_agent, declared)
 
 
 def test_a_keyframe_that_a_declared_frame_moves_out_of_range_is_left_out() -> None:
