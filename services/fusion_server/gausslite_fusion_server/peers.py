@@ -1,31 +1,29 @@
-"""Call the other servers of a mission: single calls, calls to all owners at once, and streams of parts of messages."""
+"""Call the other servers of a mission: one of them, or all owners at once."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
-from collections import deque
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import grpc
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.errors import GaussLiteError, UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.fusion.regions import ALL_SLOTS
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
 from gausslite.wire.channel import open_async_channel
 from gausslite.wire.security import Tls
-from gausslite.wire.status import error_from_reason, from_rpc_error
+from gausslite.wire.status import from_rpc_error
 from gausslite_fusion_server.contributions import StoredCount
 from gausslite_fusion_server.region_servicer import SLOTS_KEY
 
 CALL_S = 30.0
 READ_S = 600.0
 """Of a part of the map."""
-_BATCH_BYTES = 1 << 20
 
 
 @contextmanager
@@ -57,7 +55,6 @@ class Peers:
     def __init__(self, tls: Tls | None) -> None:
         self._tls = tls
         self._channels: dict[str, grpc.aio.Channel] = {}
-        self._streams: dict[str, _PartStream] = {}
 
     def stub(self, server: str) -> Any:
         """Return the methods of a server."""
@@ -94,95 +91,19 @@ class Peers:
 
     async def send_part(self, server: str, session_id: str, part: StoredSubset) -> StoredCount:
         """Send a part of a message to its owner; returns when it is durable. Raises what the owner raised."""
-        stream = self._streams.get(server)
-        if stream is None or stream.has_ended:
-            stream = self._streams[server] = _PartStream(server, self.stub(server))
-        return await stream.send(session_id, part)
+        request = region_pb.StorePartRequest(
+            session_id=session_id,
+            agent_id=part.agent_id,
+            message_seq=part.message_seq,
+            update_seq=part.update_seq,
+            voxels=part.voxels.to_row(),
+        )
+        with peer_errors(server):
+            # the end of the connection ends the wait
+            stored = await self.stub(server).StorePart(request)
+        return StoredCount(stored.accepted_voxels, stored.stale_voxels)
 
     async def close(self) -> None:
         """Close the connections; open calls end."""
-        for stream in self._streams.values():
-            await stream.close()
         for channel in self._channels.values():
             await channel.close(None)
-
-
-class _PartStream:
-    """One stream to one server for the parts of all agents; what waits while a write is busy goes as one message."""
-
-    def __init__(self, server: str, stub: Any) -> None:
-        self._server = server
-        self._waiting: deque[region_pb.SubsetPart] = deque()
-        self._woken = asyncio.Event()
-        self._numbers = itertools.count()
-        self._outcomes: dict[int, asyncio.Future[StoredCount]] = {}
-        self.has_ended = self._is_closing = False
-        self._call = stub.StoreParts(self._requests())
-        self._reading = asyncio.create_task(self._read())
-
-    async def send(self, session_id: str, part: StoredSubset) -> StoredCount:
-        number = next(self._numbers)
-        self._waiting.append(
-            region_pb.SubsetPart(
-                number=number,
-                session_id=session_id,
-                agent_id=part.agent_id,
-                message_seq=part.message_seq,
-                update_seq=part.update_seq,
-                voxels=part.voxels.to_row(),
-            )
-        )
-        self._woken.set()
-        outcome: asyncio.Future[StoredCount] = asyncio.get_running_loop().create_future()
-        self._outcomes[number] = outcome
-        try:
-            return await outcome
-        finally:
-            del self._outcomes[number]
-
-    async def close(self) -> None:
-        self._is_closing = True
-        self._woken.set()
-        self._call.cancel()
-        await self._reading
-
-    async def _requests(self) -> AsyncIterator[region_pb.StorePartsRequest]:
-        while not self._is_closing:
-            await self._woken.wait()
-            self._woken.clear()
-            while self._waiting:
-                size, parts = 0, []
-                while self._waiting and size < _BATCH_BYTES:
-                    parts.append(self._waiting.popleft())
-                    size += len(parts[-1].voxels)
-                yield region_pb.StorePartsRequest(parts=parts)
-
-    async def _read(self) -> None:
-        error: GaussLiteError = UnavailableError(f"server {self._server}: has ended the stream of parts")
-        try:
-            with peer_errors(self._server):
-                async for response in self._call:
-                    for outcome in response.outcomes:
-                        self._end(outcome)
-        except GaussLiteError as raised:
-            error = raised
-        except asyncio.CancelledError:
-            # the call is cancelled by `close`, not this task
-            if not self._is_closing:
-                raise
-        finally:
-            # whatever ended it: else the parts, and those of later streams, would wait for ever
-            self.has_ended = self._is_closing = True
-            self._woken.set()
-            for waiting in self._outcomes.values():
-                if not waiting.done():
-                    waiting.set_exception(error)
-
-    def _end(self, outcome: region_pb.PartOutcome) -> None:
-        waiting = self._outcomes.get(outcome.number)
-        if waiting is None or waiting.done():
-            return
-        if outcome.reason:
-            waiting.set_exception(error_from_reason(outcome.reason, outcome.message))
-        else:
-            waiting.set_result(StoredCount(outcome.accepted_voxels, outcome.stale_voxels))

@@ -13,7 +13,7 @@ from google.protobuf.message_factory import GetMessageClass
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.codec.subset_codec import SubsetCoding, encode_subset, split_batch
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, UnavailableError
+from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import region_service_pb2 as region_pb
@@ -21,7 +21,6 @@ from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
 from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.map_changes import BLOCK_BYTES, read_deadline
 from gausslite.wire.server import Service
-from gausslite.wire.status import code_and_reason
 from gausslite_fusion_server.contributions import StoredCount
 from gausslite_fusion_server.messages import select_map
 from gausslite_fusion_server.region_host import RegionHost
@@ -82,47 +81,13 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         self.stored += 1
         return count
 
-    async def StoreParts(
-        self, request_iterator: AsyncIterator[region_pb.StorePartsRequest], context: Any
-    ) -> AsyncIterator[region_pb.StorePartsResponse]:
-        """Store parts of messages; those that are done together are answered together."""
-        done: asyncio.Queue[region_pb.PartOutcome | None] = asyncio.Queue()
-        tasks: set[asyncio.Task[None]] = set()
-
-        async def read() -> None:
-            async for request in request_iterator:
-                for part in request.parts:
-                    task = asyncio.create_task(self._store(part, done))
-                    tasks.add(task)
-                    task.add_done_callback(tasks.discard)
-            await asyncio.gather(*tasks)
-            done.put_nowait(None)
-
-        reading = asyncio.create_task(read())
-        reading.add_done_callback(lambda _: done.put_nowait(None))
-        try:
-            while (outcome := await done.get()) is not None:
-                outcomes = [outcome]
-                while not done.empty() and (further := done.get_nowait()) is not None:
-                    outcomes.append(further)
-                yield region_pb.StorePartsResponse(outcomes=outcomes)
-        finally:
-            reading.cancel()
-
-    async def _store(self, part: region_pb.SubsetPart, done: asyncio.Queue[region_pb.PartOutcome | None]) -> None:
-        outcome = region_pb.PartOutcome(number=part.number)
-        try:
-            voxels = StoredVoxels.from_row(part.voxels)
-            _require_codes_of(self._host.settings.grid, voxels)
-            subset = StoredSubset(part.agent_id, part.message_seq, part.update_seq, voxels)
-            outcome.accepted_voxels, outcome.stale_voxels, _ = await self.store_part(part.session_id, subset)
-        except GaussLiteError as error:
-            outcome.reason, outcome.message = code_and_reason(error)[1], str(error)
-        except Exception as error:
-            # without an outcome the sender, and its agent, would wait for ever
-            _log.exception("a part of a message of agent %s is not stored", quote_name(part.agent_id))
-            outcome.reason, outcome.message = code_and_reason(GaussLiteError())[1], f"{type(error).__name__}: {error}"
-        done.put_nowait(outcome)
+    async def StorePart(self, request: region_pb.StorePartRequest, context: Any) -> region_pb.StorePartResponse:
+        """Store a part of a message."""
+        voxels = StoredVoxels.from_row(request.voxels)
+        _require_codes_of(self._host.settings.grid, voxels)
+        part = StoredSubset(request.agent_id, request.message_seq, request.update_seq, voxels)
+        count = await self.store_part(request.session_id, part)
+        return region_pb.StorePartResponse(accepted_voxels=count.accepted, stale_voxels=count.stale)
 
     async def BeginAgent(self, request: region_pb.BeginAgentRequest, context: Any) -> region_pb.BeginAgentResponse:
         """Note that an agent has joined at its home."""

@@ -110,12 +110,6 @@ OPTIONS = Program.of(
     *(ServerSettings, TlsFiles),
     flags="listen store mission world-frame voxel-size view metrics log-format tls-cert tls-key tls-ca",
     defaults={"frame-alignment": AlignmentSettings()},
-    removed={
-        "max-missions": "start one server for each mission",
-        "shards": "a PostgreSQL database holds what one file cannot",
-        "vote": "the vote has one rule",
-        "traces": "the package opentelemetry-instrumentation-grpc traces calls",
-    },
 )
 
 

@@ -25,33 +25,29 @@ _sym_db = _symbol_database.Default()
 from gausslite.v1 import fusion_service_pb2 as gausslite_dot_v1_dot_fusion__service__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!gausslite/v1/region_service.proto\x12\x0cgausslite.v1\x1a!gausslite/v1/fusion_service.proto\"<\n\x11StorePartsRequest\x12\'\n\x05parts\x18\x01 \x03(\x0b\x32\x18.gausslite.v1.SubsetPart\"{\n\nSubsetPart\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x12\n\nsession_id\x18\x02 \x01(\t\x12\x10\n\x08\x61gent_id\x18\x03 \x01(\t\x12\x13\n\x0bmessage_seq\x18\x04 \x01(\x04\x12\x12\n\nupdate_seq\x18\x05 \x01(\x04\x12\x0e\n\x06voxels\x18\x06 \x01(\x0c\"A\n\x12StorePartsResponse\x12+\n\x08outcomes\x18\x01 \x03(\x0b\x32\x19.gausslite.v1.PartOutcome\"m\n\x0bPartOutcome\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x17\n\x0f\x61\x63\x63\x65pted_voxels\x18\x02 \x01(\r\x12\x14\n\x0cstale_voxels\x18\x03 \x01(\r\x12\x0e\n\x06reason\x18\x04 \x01(\t\x12\x0f\n\x07message\x18\x05 \x01(\t\"F\n\x11\x42\x65ginAgentRequest\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\x11\n\tfresh_map\x18\x02 \x01(\x08\x12\x0c\n\x04home\x18\x03 \x01(\t\"0\n\x12\x42\x65ginAgentResponse\x12\x1a\n\x12highest_update_seq\x18\x01 \x01(\x04\"&\n\x12RemoveAgentRequest\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\"%\n\x13RemoveAgentResponse\x12\x0e\n\x06voxels\x18\x01 \x01(\x04\"D\n\x0f\x43\x61llHomeRequest\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\x0e\n\x06method\x18\x02 \x01(\t\x12\x0f\n\x07request\x18\x03 \x01(\x0c\"$\n\x10\x43\x61llHomeResponse\x12\x10\n\x08response\x18\x01 \x01(\x0c\x32\xd2\x05\n\rRegionService\x12S\n\nStoreParts\x12\x1f.gausslite.v1.StorePartsRequest\x1a .gausslite.v1.StorePartsResponse(\x01\x30\x01\x12O\n\nBeginAgent\x12\x1f.gausslite.v1.BeginAgentRequest\x1a .gausslite.v1.BeginAgentResponse\x12R\n\x0bRemoveAgent\x12 .gausslite.v1.RemoveAgentRequest\x1a!.gausslite.v1.RemoveAgentResponse\x12X\n\nReadVoxels\x12#.gausslite.v1.ExportFusedMapRequest\x1a#.gausslite.v1.WatchFusedMapResponse0\x01\x12Z\n\rWatchFusedMap\x12\".gausslite.v1.WatchFusedMapRequest\x1a#.gausslite.v1.WatchFusedMapResponse0\x01\x12\x61\n\x10GetSessionStatus\x12%.gausslite.v1.GetSessionStatusRequest\x1a&.gausslite.v1.GetSessionStatusResponse\x12\x63\n\x10GetUpdateDigests\x12%.gausslite.v1.GetUpdateDigestsRequest\x1a&.gausslite.v1.GetUpdateDigestsResponse0\x01\x12I\n\x08\x43\x61llHome\x12\x1d.gausslite.v1.CallHomeRequest\x1a\x1e.gausslite.v1.CallHomeResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n!gausslite/v1/region_service.proto\x12\x0cgausslite.v1\x1a!gausslite/v1/fusion_service.proto\"q\n\x10StorePartRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x10\n\x08\x61gent_id\x18\x02 \x01(\t\x12\x13\n\x0bmessage_seq\x18\x03 \x01(\x04\x12\x12\n\nupdate_seq\x18\x04 \x01(\x04\x12\x0e\n\x06voxels\x18\x05 \x01(\x0c\"B\n\x11StorePartResponse\x12\x17\n\x0f\x61\x63\x63\x65pted_voxels\x18\x01 \x01(\r\x12\x14\n\x0cstale_voxels\x18\x02 \x01(\r\"F\n\x11\x42\x65ginAgentRequest\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\x11\n\tfresh_map\x18\x02 \x01(\x08\x12\x0c\n\x04home\x18\x03 \x01(\t\"0\n\x12\x42\x65ginAgentResponse\x12\x1a\n\x12highest_update_seq\x18\x01 \x01(\x04\"&\n\x12RemoveAgentRequest\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\"%\n\x13RemoveAgentResponse\x12\x0e\n\x06voxels\x18\x01 \x01(\x04\"D\n\x0f\x43\x61llHomeRequest\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\x0e\n\x06method\x18\x02 \x01(\t\x12\x0f\n\x07request\x18\x03 \x01(\x0c\"$\n\x10\x43\x61llHomeResponse\x12\x10\n\x08response\x18\x01 \x01(\x0c\x32\xcb\x05\n\rRegionService\x12L\n\tStorePart\x12\x1e.gausslite.v1.StorePartRequest\x1a\x1f.gausslite.v1.StorePartResponse\x12O\n\nBeginAgent\x12\x1f.gausslite.v1.BeginAgentRequest\x1a .gausslite.v1.BeginAgentResponse\x12R\n\x0bRemoveAgent\x12 .gausslite.v1.RemoveAgentRequest\x1a!.gausslite.v1.RemoveAgentResponse\x12X\n\nReadVoxels\x12#.gausslite.v1.ExportFusedMapRequest\x1a#.gausslite.v1.WatchFusedMapResponse0\x01\x12Z\n\rWatchFusedMap\x12\".gausslite.v1.WatchFusedMapRequest\x1a#.gausslite.v1.WatchFusedMapResponse0\x01\x12\x61\n\x10GetSessionStatus\x12%.gausslite.v1.GetSessionStatusRequest\x1a&.gausslite.v1.GetSessionStatusResponse\x12\x63\n\x10GetUpdateDigests\x12%.gausslite.v1.GetUpdateDigestsRequest\x1a&.gausslite.v1.GetUpdateDigestsResponse0\x01\x12I\n\x08\x43\x61llHome\x12\x1d.gausslite.v1.CallHomeRequest\x1a\x1e.gausslite.v1.CallHomeResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gausslite.v1.region_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_STOREPARTSREQUEST']._serialized_start=86
-  _globals['_STOREPARTSREQUEST']._serialized_end=146
-  _globals['_SUBSETPART']._serialized_start=148
-  _globals['_SUBSETPART']._serialized_end=271
-  _globals['_STOREPARTSRESPONSE']._serialized_start=273
-  _globals['_STOREPARTSRESPONSE']._serialized_end=338
-  _globals['_PARTOUTCOME']._serialized_start=340
-  _globals['_PARTOUTCOME']._serialized_end=449
-  _globals['_BEGINAGENTREQUEST']._serialized_start=451
-  _globals['_BEGINAGENTREQUEST']._serialized_end=521
-  _globals['_BEGINAGENTRESPONSE']._serialized_start=523
-  _globals['_BEGINAGENTRESPONSE']._serialized_end=571
-  _globals['_REMOVEAGENTREQUEST']._serialized_start=573
-  _globals['_REMOVEAGENTREQUEST']._serialized_end=611
-  _globals['_REMOVEAGENTRESPONSE']._serialized_start=613
-  _globals['_REMOVEAGENTRESPONSE']._serialized_end=650
-  _globals['_CALLHOMEREQUEST']._serialized_start=652
-  _globals['_CALLHOMEREQUEST']._serialized_end=720
-  _globals['_CALLHOMERESPONSE']._serialized_start=722
-  _globals['_CALLHOMERESPONSE']._serialized_end=758
-  _globals['_REGIONSERVICE']._serialized_start=761
-  _globals['_REGIONSERVICE']._serialized_end=1483
+  _globals['_STOREPARTREQUEST']._serialized_start=86
+  _globals['_STOREPARTREQUEST']._serialized_end=199
+  _globals['_STOREPARTRESPONSE']._serialized_start=201
+  _globals['_STOREPARTRESPONSE']._serialized_end=267
+  _globals['_BEGINAGENTREQUEST']._serialized_start=269
+  _globals['_BEGINAGENTREQUEST']._serialized_end=339
+  _globals['_BEGINAGENTRESPONSE']._serialized_start=341
+  _globals['_BEGINAGENTRESPONSE']._serialized_end=389
+  _globals['_REMOVEAGENTREQUEST']._serialized_start=391
+  _globals['_REMOVEAGENTREQUEST']._serialized_end=429
+  _globals['_REMOVEAGENTRESPONSE']._serialized_start=431
+  _globals['_REMOVEAGENTRESPONSE']._serialized_end=468
+  _globals['_CALLHOMEREQUEST']._serialized_start=470
+  _globals['_CALLHOMEREQUEST']._serialized_end=538
+  _globals['_CALLHOMERESPONSE']._serialized_start=540
+  _globals['_CALLHOMERESPONSE']._serialized_end=576
+  _globals['_REGIONSERVICE']._serialized_start=579
+  _globals['_REGIONSERVICE']._serialized_end=1294
 # @@protoc_insertion_point(module_scope)

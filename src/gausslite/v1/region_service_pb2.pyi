@@ -6,10 +6,8 @@ What the servers of one mission ask each other: each owns a part of the voxels a
 SPDX-License-Identifier: Apache-2.0
 """
 
-from collections import abc as _abc
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from google.protobuf.internal import containers as _containers
 import builtins as _builtins
 import sys
 import typing as _typing
@@ -22,39 +20,14 @@ else:
 DESCRIPTOR: _descriptor.FileDescriptor
 
 @_typing.final
-class StorePartsRequest(_message.Message):
+class StorePartRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
-    PARTS_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def parts(self) -> _containers.RepeatedCompositeFieldContainer[Global___SubsetPart]: ...
-    def __init__(
-        self,
-        *,
-        parts: _abc.Iterable[Global___SubsetPart] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["parts", b"parts"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___StorePartsRequest: _TypeAlias = StorePartsRequest  # noqa: Y015
-
-@_typing.final
-class SubsetPart(_message.Message):
-    """The voxels of one message that one server owns."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    NUMBER_FIELD_NUMBER: _builtins.int
     SESSION_ID_FIELD_NUMBER: _builtins.int
     AGENT_ID_FIELD_NUMBER: _builtins.int
     MESSAGE_SEQ_FIELD_NUMBER: _builtins.int
     UPDATE_SEQ_FIELD_NUMBER: _builtins.int
     VOXELS_FIELD_NUMBER: _builtins.int
-    number: _builtins.int
-    """Chosen by the caller, for the outcome."""
     session_id: _builtins.str
     agent_id: _builtins.str
     message_seq: _builtins.int
@@ -64,7 +37,6 @@ class SubsetPart(_message.Message):
     def __init__(
         self,
         *,
-        number: _builtins.int = ...,
         session_id: _builtins.str = ...,
         agent_id: _builtins.str = ...,
         message_seq: _builtins.int = ...,
@@ -73,63 +45,33 @@ class SubsetPart(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "message_seq", b"message_seq", "number", b"number", "session_id", b"session_id", "update_seq", b"update_seq", "voxels", b"voxels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "message_seq", b"message_seq", "session_id", b"session_id", "update_seq", b"update_seq", "voxels", b"voxels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___SubsetPart: _TypeAlias = SubsetPart  # noqa: Y015
+Global___StorePartRequest: _TypeAlias = StorePartRequest  # noqa: Y015
 
 @_typing.final
-class StorePartsResponse(_message.Message):
+class StorePartResponse(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
-    OUTCOMES_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def outcomes(self) -> _containers.RepeatedCompositeFieldContainer[Global___PartOutcome]: ...
-    def __init__(
-        self,
-        *,
-        outcomes: _abc.Iterable[Global___PartOutcome] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["outcomes", b"outcomes"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___StorePartsResponse: _TypeAlias = StorePartsResponse  # noqa: Y015
-
-@_typing.final
-class PartOutcome(_message.Message):
-    DESCRIPTOR: _descriptor.Descriptor
-
-    NUMBER_FIELD_NUMBER: _builtins.int
     ACCEPTED_VOXELS_FIELD_NUMBER: _builtins.int
     STALE_VOXELS_FIELD_NUMBER: _builtins.int
-    REASON_FIELD_NUMBER: _builtins.int
-    MESSAGE_FIELD_NUMBER: _builtins.int
-    number: _builtins.int
     accepted_voxels: _builtins.int
     stale_voxels: _builtins.int
-    reason: _builtins.str
-    """Empty if the part is stored; else the ErrorInfo reason and one line of text."""
-    message: _builtins.str
     def __init__(
         self,
         *,
-        number: _builtins.int = ...,
         accepted_voxels: _builtins.int = ...,
         stale_voxels: _builtins.int = ...,
-        reason: _builtins.str = ...,
-        message: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["accepted_voxels", b"accepted_voxels", "message", b"message", "number", b"number", "reason", b"reason", "stale_voxels", b"stale_voxels"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["accepted_voxels", b"accepted_voxels", "stale_voxels", b"stale_voxels"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___PartOutcome: _TypeAlias = PartOutcome  # noqa: Y015
+Global___StorePartResponse: _TypeAlias = StorePartResponse  # noqa: Y015
 
 @_typing.final
 class BeginAgentRequest(_message.Message):

@@ -36,10 +36,10 @@ class RegionServiceStub(object):
         Args:
             channel: A grpc.Channel.
         """
-        self.StoreParts = channel.stream_stream(
-                '/gausslite.v1.RegionService/StoreParts',
-                request_serializer=gausslite_dot_v1_dot_region__service__pb2.StorePartsRequest.SerializeToString,
-                response_deserializer=gausslite_dot_v1_dot_region__service__pb2.StorePartsResponse.FromString,
+        self.StorePart = channel.unary_unary(
+                '/gausslite.v1.RegionService/StorePart',
+                request_serializer=gausslite_dot_v1_dot_region__service__pb2.StorePartRequest.SerializeToString,
+                response_deserializer=gausslite_dot_v1_dot_region__service__pb2.StorePartResponse.FromString,
                 _registered_method=True)
         self.BeginAgent = channel.unary_unary(
                 '/gausslite.v1.RegionService/BeginAgent',
@@ -82,9 +82,8 @@ class RegionServiceServicer(object):
     """Only servers call it: with certificates, the role `server`; without them, callers on the same machine.
     """
 
-    def StoreParts(self, request_iterator, context):
-        """Store the parts of messages whose voxels this server owns. Each part has one outcome; outcomes may overtake each
-        other. UNAVAILABLE as the reason of an outcome: the voxels belong to another server now, or nobody yet.
+    def StorePart(self, request, context):
+        """Store the voxels of a message that this server owns. UNAVAILABLE: they belong to another server now, or nobody yet.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -140,10 +139,10 @@ class RegionServiceServicer(object):
 
 def add_RegionServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
-            'StoreParts': grpc.stream_stream_rpc_method_handler(
-                    servicer.StoreParts,
-                    request_deserializer=gausslite_dot_v1_dot_region__service__pb2.StorePartsRequest.FromString,
-                    response_serializer=gausslite_dot_v1_dot_region__service__pb2.StorePartsResponse.SerializeToString,
+            'StorePart': grpc.unary_unary_rpc_method_handler(
+                    servicer.StorePart,
+                    request_deserializer=gausslite_dot_v1_dot_region__service__pb2.StorePartRequest.FromString,
+                    response_serializer=gausslite_dot_v1_dot_region__service__pb2.StorePartResponse.SerializeToString,
             ),
             'BeginAgent': grpc.unary_unary_rpc_method_handler(
                     servicer.BeginAgent,
@@ -193,7 +192,7 @@ class RegionService(object):
     """
 
     @staticmethod
-    def StoreParts(request_iterator,
+    def StorePart(request,
             target,
             options=(),
             channel_credentials=None,
@@ -203,12 +202,12 @@ class RegionService(object):
             wait_for_ready=None,
             timeout=None,
             metadata=None):
-        return grpc.experimental.stream_stream(
-            request_iterator,
+        return grpc.experimental.unary_unary(
+            request,
             target,
-            '/gausslite.v1.RegionService/StoreParts',
-            gausslite_dot_v1_dot_region__service__pb2.StorePartsRequest.SerializeToString,
-            gausslite_dot_v1_dot_region__service__pb2.StorePartsResponse.FromString,
+            '/gausslite.v1.RegionService/StorePart',
+            gausslite_dot_v1_dot_region__service__pb2.StorePartRequest.SerializeToString,
+            gausslite_dot_v1_dot_region__service__pb2.StorePartResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -37,10 +37,8 @@ class RegionServiceStub:
     def __new__(cls, channel: _grpc.Channel) -> _Self: ...
     @_typing.overload
     def __new__(cls, channel: _aio.Channel) -> RegionServiceAsyncStub: ...
-    StoreParts: _grpc.StreamStreamMultiCallable[_region_service_pb2.StorePartsRequest, _region_service_pb2.StorePartsResponse]
-    """Store the parts of messages whose voxels this server owns. Each part has one outcome; outcomes may overtake each
-    other. UNAVAILABLE as the reason of an outcome: the voxels belong to another server now, or nobody yet.
-    """
+    StorePart: _grpc.UnaryUnaryMultiCallable[_region_service_pb2.StorePartRequest, _region_service_pb2.StorePartResponse]
+    """Store the voxels of a message that this server owns. UNAVAILABLE: they belong to another server now, or nobody yet."""
     BeginAgent: _grpc.UnaryUnaryMultiCallable[_region_service_pb2.BeginAgentRequest, _region_service_pb2.BeginAgentResponse]
     """An agent has joined at its home."""
     RemoveAgent: _grpc.UnaryUnaryMultiCallable[_region_service_pb2.RemoveAgentRequest, _region_service_pb2.RemoveAgentResponse]
@@ -59,10 +57,8 @@ class RegionServiceAsyncStub(RegionServiceStub):
     """Only servers call it: with certificates, the role `server`; without them, callers on the same machine."""
 
     def __init__(self, channel: _aio.Channel) -> None: ...
-    StoreParts: _aio.StreamStreamMultiCallable[_region_service_pb2.StorePartsRequest, _region_service_pb2.StorePartsResponse]  # type: ignore[assignment]
-    """Store the parts of messages whose voxels this server owns. Each part has one outcome; outcomes may overtake each
-    other. UNAVAILABLE as the reason of an outcome: the voxels belong to another server now, or nobody yet.
-    """
+    StorePart: _aio.UnaryUnaryMultiCallable[_region_service_pb2.StorePartRequest, _region_service_pb2.StorePartResponse]  # type: ignore[assignment]
+    """Store the voxels of a message that this server owns. UNAVAILABLE: they belong to another server now, or nobody yet."""
     BeginAgent: _aio.UnaryUnaryMultiCallable[_region_service_pb2.BeginAgentRequest, _region_service_pb2.BeginAgentResponse]  # type: ignore[assignment]
     """An agent has joined at its home."""
     RemoveAgent: _aio.UnaryUnaryMultiCallable[_region_service_pb2.RemoveAgentRequest, _region_service_pb2.RemoveAgentResponse]  # type: ignore[assignment]
@@ -80,14 +76,12 @@ class RegionServiceServicer(metaclass=_abc_1.ABCMeta):
     """Only servers call it: with certificates, the role `server`; without them, callers on the same machine."""
 
     @_abc_1.abstractmethod
-    def StoreParts(
+    def StorePart(
         self,
-        request_iterator: _MaybeAsyncIterator[_region_service_pb2.StorePartsRequest],
+        request: _region_service_pb2.StorePartRequest,
         context: _ServicerContext,
-    ) -> _typing.Union[_abc.Iterator[_region_service_pb2.StorePartsResponse], _abc.AsyncIterator[_region_service_pb2.StorePartsResponse]]:
-        """Store the parts of messages whose voxels this server owns. Each part has one outcome; outcomes may overtake each
-        other. UNAVAILABLE as the reason of an outcome: the voxels belong to another server now, or nobody yet.
-        """
+    ) -> _typing.Union[_region_service_pb2.StorePartResponse, _abc.Awaitable[_region_service_pb2.StorePartResponse]]:
+        """Store the voxels of a message that this server owns. UNAVAILABLE: they belong to another server now, or nobody yet."""
 
     @_abc_1.abstractmethod
     def BeginAgent(

@@ -140,7 +140,7 @@ _PARSER, _AGENT, _FUSION, _REGION = (
     f"/gausslite.v1.{name}Service/" for name in ("Parser", "Agent", "Fusion", "Region")
 )
 _FOR_SERVERS = (
-    *("StoreParts", "BeginAgent", "RemoveAgent", "ReadVoxels", "WatchFusedMap", "GetSessionStatus", "GetUpdateDigests"),
+    *("StorePart", "BeginAgent", "RemoveAgent", "ReadVoxels", "WatchFusedMap", "GetSessionStatus", "GetUpdateDigests"),
     "CallHome",
 )
 

@@ -25,6 +25,8 @@ from waiting import wait_until
 from gausslite.codec.ply import gaussians_from_ply, ply_bytes
 from gausslite.codec.subset_codec import decode_stored, encode_subset
 from gausslite.domain.errors import (
+    CodecError,
+    GaussLiteError,
     InvalidInputError,
     MismatchError,
     NameInUseError,
@@ -50,11 +52,12 @@ from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
-from gausslite.v1.region_service_pb2 import RemoveAgentRequest, StorePartsRequest, SubsetPart
+from gausslite.v1.region_service_pb2 import RemoveAgentRequest, StorePartRequest
 from gausslite.v1.region_service_pb2_grpc import RegionServiceStub
 from gausslite.wire.channel import open_channel
 from gausslite.wire.clients import Export
 from gausslite.wire.convert import MapUpdate, frame_to_message
+from gausslite.wire.status import from_rpc_error
 from gausslite_bench.async_calls import UpdateStreams
 
 pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
@@ -414,7 +417,7 @@ def test_with_certificates_only_servers_call_each_other(postgres: PostgresServer
         assert "the roles server" in refused.value.details()
 
 
-def test_a_part_that_cannot_be_stored_has_an_outcome_and_no_effect(
+def test_a_part_that_cannot_be_stored_is_refused_without_effect(
     postgres: PostgresServer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with sharing_servers(postgres.new_database(), folder, 1) as [server]:
@@ -424,24 +427,26 @@ def test_a_part_that_cannot_be_stored_has_an_outcome_and_no_effect(
         voxels = decode_stored(encode_subset(second, GRID))[0].voxels
         good, reversed_keys = voxels.to_row(), voxels.take(np.arange(len(voxels))[::-1]).to_row()
         parts = [
-            SubsetPart(number=number, session_id=sessions[name], agent_id="ant", update_seq=seq, voxels=row)
-            for number, (name, seq, row) in enumerate(
-                [
-                    ("ant", 2, good[:-1]),
-                    ("ant", 2, np.float64(np.nan).tobytes() + good[8:]),
-                    ("ant", 2, np.float64(0.5).tobytes() + good[8:]),
-                    ("ant", 2, reversed_keys),
-                    ("bee", 2, good),
-                    ("ant", 2**64 - 1, good),
-                ]
-            )
+            StorePartRequest(session_id=sessions[name], agent_id="ant", update_seq=seq, voxels=row)
+            for name, seq, row in [
+                ("ant", 2, good[:-1]),
+                ("ant", 2, np.float64(np.nan).tobytes() + good[8:]),
+                ("ant", 2, np.float64(0.5).tobytes() + good[8:]),
+                ("ant", 2, reversed_keys),
+                ("bee", 2, good),
+                ("ant", 2**64 - 1, good),
+            ]
         ]
         with open_channel(server.address, None) as channel:
-            answers = RegionServiceStub(channel).StoreParts(iter([StorePartsRequest(parts=parts)]), timeout=20.0)
-            reasons = {outcome.number: outcome.reason for answer in answers for outcome in answer.outcomes}
-            wrong_numbers = {0: "STORAGE", 1: "CODEC", 2: "CODEC", 3: "CODEC", 4: "NOT_PERMITTED", 5: "INVALID_INPUT"}
-            assert reasons == wrong_numbers
+            stub = RegionServiceStub(channel)
+
+            def refusal(part: StorePartRequest) -> type[GaussLiteError]:
+                with pytest.raises(grpc.RpcError) as refused:
+                    stub.StorePart(part, timeout=20.0)
+                return type(from_rpc_error(refused.value, ""))
+
+            wrong = [StorageError, CodecError, CodecError, CodecError, NotPermittedError, InvalidInputError]
+            assert [refusal(part) for part in parts] == wrong
             assert server.client.export(Export()) == offline({"ant": [first]})
             monkeypatch.setattr(server.share.regions, "store_part", None)  # an error that nobody expects
-            answers = RegionServiceStub(channel).StoreParts(iter([StorePartsRequest(parts=parts[4:5])]), timeout=20.0)
-            assert [outcome.reason for answer in answers for outcome in answer.outcomes] == ["INTERNAL"]
+            assert refusal(parts[4]) is GaussLiteError
