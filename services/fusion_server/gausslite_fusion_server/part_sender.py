@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.errors import GaussLiteError, UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import Acknowledgements
@@ -114,7 +114,8 @@ class PartSender:
         while True:
             changed, owners = self._host.changes.subscribe(), self._host.owners
             parts = [item for part in waiting for item in owners.split(part)]
-            results = await _all([self._store_part(owner, session_id, part) for owner, part in parts])
+            calls = (self._store_part(owner, session_id, part) for owner, part in parts)
+            results = await asyncio.gather(*calls, return_exceptions=True)
             unavailable = None
             waiting = []
             for (owner, part), result in zip(parts, results, strict=True):
@@ -130,7 +131,8 @@ class PartSender:
                 return StoredCount(accepted, stale, "" if largest_owner == self._host.server else largest_owner)
             if loop.time() > end_s:
                 raise unavailable
-            await _wait_at_most(changed, _RETRY_S if owners is self._host.owners else 0.0)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(changed.wait(), _RETRY_S if owners is self._host.owners else 0.0)
 
     async def _store_part(self, owner: str | None, session_id: str, part: StoredSubset) -> StoredCount:
         if owner is None:
@@ -139,21 +141,3 @@ class PartSender:
             return await self._regions.store_part(session_id, part)
         self.sent += 1
         return await self._peers.send_part(owner, session_id, part)
-
-
-async def _all(calls: Sequence[Coroutine[Any, Any, StoredCount]]) -> list[StoredCount | BaseException]:
-    """Return the result or the error of each call."""
-    if len(calls) > 1:
-        return await asyncio.gather(*calls, return_exceptions=True)
-    try:
-        # the usual case, without a task
-        return [await calls[0]]
-    except GaussLiteError as error:
-        return [error]
-
-
-async def _wait_at_most(event: asyncio.Event, timeout_s: float) -> None:
-    try:
-        await asyncio.wait_for(event.wait(), timeout_s)
-    except TimeoutError:
-        return

@@ -7,6 +7,7 @@ so that a servicer's method only decodes, calls and encodes. No client message c
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import logging
 import os
@@ -75,7 +76,8 @@ class ReadinessWatch:
                 # calls that fail meanwhile must not shorten the interval
                 await asyncio.sleep(_RETRY_S)
             else:
-                await _wait_at_most(self._woken, _RETRY_S)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._woken.wait(), _RETRY_S)
             is_due = self._woken.is_set() or self._failing_since_s is not None or time.monotonic() >= next_check_s
             self._woken.clear()
             try:
@@ -109,13 +111,6 @@ class ReadinessWatch:
             _log.info("%s is SERVING again after %.0f s", self._service, time.monotonic() - self._failing_since_s)
             self._failing_since_s = None
             await self._set_serving(True)
-
-
-async def _wait_at_most(event: asyncio.Event, timeout_s: float) -> None:
-    try:
-        await asyncio.wait_for(event.wait(), timeout_s)
-    except TimeoutError:
-        return
 
 
 _LAST_CALLS_S = 1.0
