@@ -54,7 +54,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     message = request.keyframe
     # before any image is decoded: its header must then state the camera's size
     pixels = message.camera.width_px * message.camera.height_px
-    engine.settings.quotas.keyframe_limits.require_within(message.index, pixels, message.ByteSize())
+    engine.settings.quotas.require_keyframe(message.index, pixels, message.ByteSize())
     # decoded here to refuse invalid images; stored as received, which needs less space
     frame = frame_from_message(message)
     region_from_png(message.region_png, frame.camera)

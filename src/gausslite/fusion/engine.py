@@ -89,7 +89,7 @@ class FusionEngine:
         self.traffic = traffic or TrafficLog()
         self._lock, self._store = RLock(), store
         self._members = Membership(store, settings)
-        self._keyframes = KeyframePool(store, quotas.keyframe_limits, decode_keyframe)
+        self._keyframes = KeyframePool(store, quotas, decode_keyframe)
         self._objects, self._merged_objects = TeamObjects(store), MergedObjects()
         self._checks = UpdateChecks(store, quotas, MissionClock(store))
         self._alignments = FrameAlignments(store)

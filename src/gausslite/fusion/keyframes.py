@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, QuotaError
+from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError
 from gausslite.domain.frame import MAX_COORDINATE_M, Frame
+from gausslite.fusion.limits import Quotas
 from gausslite.fusion.store import FusionStore
 
 ORDER_RECORD = "keyframe-order"
@@ -45,25 +46,6 @@ class EncodedKeyframe:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class KeyframeLimits:
-    """The limits of one agent's keyframes."""
-
-    frames: int = 64
-    pixels: int = 1920 * 1080
-    bytes_in_all: int = 64 << 20
-
-    def __post_init__(self) -> None:
-        if min(self.frames, self.pixels, self.bytes_in_all) < 1:
-            raise InvalidInputError(f"keyframe limits: expected at least 1, got {self}")
-
-    def require_within(self, index: int, pixels: int, size_bytes: int) -> None:
-        """Raise QuotaError if one keyframe exceeds the limits; needs no decoded image."""
-        for unit, value, limit in (("pixels", pixels, self.pixels), ("bytes", size_bytes, self.bytes_in_all)):
-            if value > limit:
-                raise QuotaError(f"keyframe {index}: expected at most {limit} {unit}, got {value}")
-
-
 class _Stored(NamedTuple):
     capture_time_ns: int
     size_bytes: int
@@ -77,9 +59,9 @@ class KeyframePool:
     are in memory. Not thread-safe; FusionEngine holds a lock.
     """
 
-    def __init__(self, store: FusionStore, limits: KeyframeLimits, decode: FrameDecoder = no_decoder) -> None:
+    def __init__(self, store: FusionStore, quotas: Quotas, decode: FrameDecoder = no_decoder) -> None:
         """Raises CodecError for a damaged record, StorageError."""
-        self._store, self._limits, self._decode = store, limits, decode
+        self._store, self._quotas, self._decode = store, quotas, decode
         self._stored = _in_order(store.keyframe_sizes(), store.records(ORDER_RECORD))
 
     def __len__(self) -> int:
@@ -90,7 +72,7 @@ class KeyframePool:
 
         An empty `selected` deletes none. Raises QuotaError if this keyframe alone exceeds a limit, StorageError.
         """
-        self._limits.require_within(keyframe.index, keyframe.pixels, len(keyframe.data))
+        self._quotas.require_keyframe(keyframe.index, keyframe.pixels, len(keyframe.data))
         self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data)
         stored = self._stored.setdefault(keyframe.agent_id, {})
         before = stored.get(keyframe.index)
@@ -135,9 +117,9 @@ class KeyframePool:
         """Return the keyframes received last that are within the limits together, in their order."""
         kept: list[int] = []
         spent_bytes = 0
-        for index in list(reversed(stored))[: self._limits.frames]:
+        for index in list(reversed(stored))[: self._quotas.keyframes_per_agent]:
             spent_bytes += stored[index].size_bytes
-            if spent_bytes > self._limits.bytes_in_all:
+            if spent_bytes > self._quotas.keyframe_bytes_per_agent:
                 break
             kept.append(index)
         return {index: stored[index] for index in reversed(kept)}

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, fields
 from gausslite.config.option import option
 from gausslite.config.values import VOXEL_SIZE
 from gausslite.domain.checks import require_identifier, require_name
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frames import AlignmentSettings
-from gausslite.fusion.keyframes import KeyframeLimits
 from gausslite.fusion.store_values import MissionConfig
 
 DEFAULT_LEASE_S = 60.0
@@ -46,15 +45,17 @@ class Quotas:
     kappa_at_join: int = 120_000
     kappa_per_second: int = 200
 
-    @property
-    def keyframe_limits(self) -> KeyframeLimits:
-        """The limits of one agent's keyframes."""
-        return KeyframeLimits(self.keyframes_per_agent, self.keyframe_pixels, self.keyframe_bytes_per_agent)
-
     def __post_init__(self) -> None:
         for quota in fields(self):
             if getattr(self, quota.name) < 1:
                 raise InvalidInputError(f"quota {quota.name}: expected at least 1, got {getattr(self, quota.name)}")
+
+    def require_keyframe(self, index: int, pixels: int, size_bytes: int) -> None:
+        """Raise QuotaError if one keyframe exceeds the limits; needs no decoded image."""
+        limits = ("pixels", pixels, self.keyframe_pixels), ("bytes", size_bytes, self.keyframe_bytes_per_agent)
+        for unit, value, limit in limits:
+            if value > limit:
+                raise QuotaError(f"keyframe {index}: expected at most {limit} {unit}, got {value}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,8 @@ from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.fusion.keyframes import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframeLimits, KeyframePool
+from gausslite.fusion.keyframes import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframePool
+from gausslite.fusion.limits import Quotas
 from gausslite.fusion.refinement import RefineProgress, RefineSettings, refine
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.mapping.settings import ONLINE_RATES, DensitySettings
@@ -151,7 +152,7 @@ def encoded(agent_id: str, index: int, data: bytes = b"", time_ns: int | None = 
 
 def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> None:
     store = MemoryStore()
-    limits = KeyframeLimits(2, 18 * 24, bytes_in_all=9)
+    limits = Quotas(keyframes_per_agent=2, keyframe_pixels=18 * 24, keyframe_bytes_per_agent=9)
     pool = KeyframePool(store, limits)
     for index, data in ((3, b"first"), (1, b"1"), (2, b"2"), (3, b"again")):
         pool.add(encoded("ant", index, data))
@@ -166,14 +167,14 @@ def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> 
     assert len(pool) == 1
     assert {name: list(sizes) for name, sizes in store.keyframe_sizes().items()} == {"aardvark": [7]}
     with pytest.raises(QuotaError, match="at most 1 pixels"):
-        KeyframePool(store, KeyframeLimits(pixels=1)).add(encoded("ant", 1))
+        KeyframePool(store, Quotas(keyframe_pixels=1)).add(encoded("ant", 1))
     with pytest.raises(InvalidInputError, match="expected at least 1"):
-        KeyframeLimits(frames=0)
+        Quotas(keyframes_per_agent=0)
 
 
 @pytest.mark.parametrize("restarts", [False, True])
 def test_the_newest_keyframe_is_of_the_second_mission_whose_indices_begin_again(restarts: bool, tmp_path: Path) -> None:
-    limits = KeyframeLimits(frames=4)
+    limits = Quotas(keyframes_per_agent=4)
     store = SqliteStore(tmp_path / "store.sqlite")
     pool = KeyframePool(store, limits)
     for index in (7, 8, 9):
@@ -197,17 +198,17 @@ def test_the_newest_keyframe_is_of_the_second_mission_whose_indices_begin_again(
 
 def test_a_keyframe_stored_without_its_place_is_the_newest_and_a_damaged_order_is_named() -> None:
     store = MemoryStore()
-    KeyframePool(store, KeyframeLimits()).add(encoded("ant", 5, b"5"))
+    KeyframePool(store, Quotas()).add(encoded("ant", 5, b"5"))
     # the server was killed before it stored the order
     store.save_keyframe("ant", 2, b"2")
-    assert KeyframePool(store, KeyframeLimits()).find("ant") == b"2"
+    assert KeyframePool(store, Quotas()).find("ant") == b"2"
     store.save_record("ant", ORDER_RECORD, b"{")
     with pytest.raises(CodecError, match="stored order of keyframes"):
-        KeyframePool(store, KeyframeLimits())
+        KeyframePool(store, Quotas())
 
 
 def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> None:
-    store, limits = MemoryStore(), KeyframeLimits(frames=64, bytes_in_all=10)
+    store, limits = MemoryStore(), Quotas(keyframe_bytes_per_agent=10)
     for index in (1, 2, 3):
         KeyframePool(store, limits).add(encoded("ant", index, b"1234"))
     assert KeyframePool(store, limits).indices("ant") == (2, 3)
@@ -216,7 +217,7 @@ def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> 
 
 
 def test_keyframes_that_are_not_selected_are_deleted() -> None:
-    pool = KeyframePool(MemoryStore(), KeyframeLimits(4, 18 * 24))
+    pool = KeyframePool(MemoryStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24))
     for index in (1, 2, 3):
         pool.add(encoded("ant", index))
     pool.add(encoded("ant", 9), selected=(2, 5))
@@ -224,7 +225,7 @@ def test_keyframes_that_are_not_selected_are_deleted() -> None:
 
 
 def test_a_damaged_keyframe_is_named() -> None:
-    pool = KeyframePool(MemoryStore(), KeyframeLimits(4, 18 * 24), decode_frame)
+    pool = KeyframePool(MemoryStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24), decode_frame)
     pool.add(encoded("ant", 1, b"\xff\xff"))
     with pytest.raises(CodecError, match="expected an EncodedFrame"):
         pool.decode(pool.read(pool.names()))
