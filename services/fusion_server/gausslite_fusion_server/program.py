@@ -9,16 +9,17 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.fusion import store_maintenance
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fit_process import FitProcess
-from gausslite.fusion.refinement import rasterizer_of_backend
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import StoreReport
 from gausslite.process import Sibling, print_message, sibling
+from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
@@ -129,7 +130,7 @@ async def _serve(settings: ServerSettings) -> None:
     store = _open_store(settings)
     with contextlib.closing(store), contextlib.closing(FitProcess()) as fit:
         engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, fit=fit, find=fit.find)
-        refinement = RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer))
+        refinement = RefinementWorker(settings.refine, partial(choose_rasterizer, settings.rasterizer))
         servicer = FusionServicer(engine, refinement)
         try:
             await _serve_mission(settings, engine, servicer)

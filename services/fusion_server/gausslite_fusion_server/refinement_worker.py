@@ -12,7 +12,6 @@ from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings, refine
-from gausslite.render.rasterizer import Rasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.views import ChangeNotifier
 
@@ -22,13 +21,9 @@ class RefinementWorker:
 
     def __init__(self, settings: RefineSettings, create_rasterizer: CreateRasterizer) -> None:
         self._settings = settings
-        self._create_rasterizer = create_rasterizer
+        self.create_rasterizer = create_rasterizer
         self._worker = ThreadPoolExecutor(1, "refine")
         self._busy = False
-
-    def create_rasterizer(self) -> Rasterizer:
-        """Return a rasterizer of the refinement's backend. Raises KernelError."""
-        return self._create_rasterizer()
 
     async def run(self, engine: FusionEngine, request: pb.RefineFusedMapRequest) -> AsyncIterator[RefineProgress]:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
@@ -53,7 +48,7 @@ class RefinementWorker:
 
         def work() -> None:
             gaussians, keyframes, revision = engine.refinement_input()
-            refined = refine(gaussians, keyframes, self._create_rasterizer(), settings, report_progress)
+            refined = refine(gaussians, keyframes, self.create_rasterizer(), settings, report_progress)
             if not cancelled.is_set():
                 engine.store_refined(refined, revision)
 

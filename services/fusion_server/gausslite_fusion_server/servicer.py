@@ -122,7 +122,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     """Serves one fused map. All work runs in threads, so that the event loop always answers health checks."""
 
     def __init__(self, engine: FusionEngine, refinement_worker: RefinementWorker) -> None:
-        self._engine = engine
+        self.engine = engine
         self._refinement_worker = refinement_worker
         self._workers = ThreadPoolExecutor(_WORKERS, "fusion")
         # one thread: messages that arrive during a commit wait for the next one and share it
@@ -147,8 +147,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         return Service(
             pb.DESCRIPTOR.services_by_name["FusionService"].full_name,
             functools.partial(pb_grpc.add_FusionServiceServicer_to_server, self),
-            self._engine.storage.check,
-            self._engine.acknowledgements.check,
+            self.engine.storage.check,
+            self.engine.acknowledgements.check,
         )
 
     def drain(self) -> None:
@@ -158,17 +158,12 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             self._aligning.cancel()
         self._map_changes.notify()
 
-    @property
-    def engine(self) -> FusionEngine:
-        """The engine of the map that is served."""
-        return self._engine
-
     async def _store_message(self, session: SessionRecord, message: bytes) -> StoredCount:
-        return await self._commit_queued(functools.partial(self._engine.enqueue_update, session, message))
+        return await self._commit_queued(functools.partial(self.engine.enqueue_update, session, message))
 
     async def store_part(self, session_id: str, part: StoredSubset) -> StoredCount:
         """Store a decoded message, or a part of one. Raises UnavailableError, and as FusionEngine.contribute."""
-        return await self._commit_queued(functools.partial(self._engine.enqueue_part, session_id, part))
+        return await self._commit_queued(functools.partial(self.engine.enqueue_part, session_id, part))
 
     async def _commit_queued(self, enqueue: Callable[[], Future[PutOutcome]]) -> StoredCount:
         self._gate.require_open()
@@ -182,7 +177,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def publish_changes(self) -> None:
         """Wake the watchers, and look which frames are due. Use it on the event loop."""
         self._map_changes.notify()
-        if self._engine.settings.alignment is not None:
+        if self.engine.settings.alignment is not None:
             self._align_in_background()
 
     def _commit_soon(self) -> None:
@@ -193,7 +188,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     def _commit(self) -> None:
         self._commit_is_due = False
-        self._engine.commit_updates()
+        self.engine.commit_updates()
 
     def close(self) -> None:
         """Wait until the work in threads has ended."""
@@ -211,39 +206,39 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         task = graph_from_message(request.task) if request.HasField("task") else None
         declared_frame_from_message(request)
         async with self._joins:
-            joined = await self._work(self._engine.join, request.agent_id, requested, request.fresh_map, request.token)
-        await self._work(declare_frame, self._engine, request)
+            joined = await self._work(self.engine.join, request.agent_id, requested, request.fresh_map, request.token)
+        await self._work(declare_frame, self.engine, request)
         if task is not None:
-            report = ObjectReport(task, self._engine.reported_objects(request.agent_id, task))
-            await self._work(self._engine.report_objects, joined.session.session_id, report)
+            report = ObjectReport(task, self.engine.reported_objects(request.agent_id, task))
+            await self._work(self.engine.report_objects, joined.session.session_id, report)
         self._map_changes.notify()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,
             highest_update_seq=joined.highest_update_seq,
             fused_revision=joined.fused_revision,
-            grid=grid_to_message(self._engine.grid),
+            grid=grid_to_message(self.engine.grid),
             max_subset_bytes=MAX_SUBSET_BYTES,
-            max_gaussians=self._engine.settings.quotas.gaussians_per_agent,
+            max_gaussians=self.engine.settings.quotas.gaussians_per_agent,
             keyframes=joined.keyframes,
-            max_keyframes=self._engine.settings.quotas.keyframes_per_agent,
-            incarnation_id=self._engine.incarnation_id,
+            max_keyframes=self.engine.settings.quotas.keyframes_per_agent,
+            incarnation_id=self.engine.incarnation_id,
         )
 
     async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
         """Renew the agent's lease; return what identifies the stored updates."""
-        agent_id = agent_of_session(self._engine, request.session_id, Caller.of(context))
+        agent_id = agent_of_session(self.engine, request.session_id, Caller.of(context))
         return pb.KeepSessionResponse(
-            highest_update_seq=self._engine.highest_update_seq(agent_id),
-            incarnation_id=self._engine.incarnation_id,
-            alignment=alignment_to_message(self._engine.alignment(agent_id)),
+            highest_update_seq=self.engine.highest_update_seq(agent_id),
+            incarnation_id=self.engine.incarnation_id,
+            alignment=alignment_to_message(self.engine.alignment(agent_id)),
         )
 
     async def GetUpdateDigests(
         self, request: pb.GetUpdateDigestsRequest, context: Any
     ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
         """Return the digests of the agent's stored updates."""
-        agent_of_session(self._engine, request.session_id, Caller.of(context))
-        for block in digests_to_messages(await self._work(self._engine.stored_digests, request.session_id)):
+        agent_of_session(self.engine, request.session_id, Caller.of(context))
+        for block in digests_to_messages(await self._work(self.engine.stored_digests, request.session_id)):
             with read_deadline():
                 yield block
 
@@ -262,7 +257,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         async for request in self._gate.admit(request_iterator):
             try:
                 async with self._keyframes:
-                    await self._work(store_keyframe, self._engine, request, caller)
+                    await self._work(store_keyframe, self.engine, request, caller)
                 response.accepted += 1
             except (InvalidInputError, QuotaError) as error:
                 if len(response.rejected) >= MAX_REPORTED_REJECTIONS:
@@ -273,26 +268,26 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
         """Return a stored keyframe of an agent, for a person."""
-        self._engine.require_mission(request.mission_id)
-        return await self._work(read_keyframe, self._engine, request)
+        self.engine.require_mission(request.mission_id)
+        return await self._work(read_keyframe, self.engine, request)
 
     async def WatchFusedMap(
         self, request: pb.WatchFusedMapRequest, context: Any
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the map, then its changes. A slow watcher gets several changes as one; nothing is queued."""
-        self._engine.require_mission(request.mission_id)
+        self.engine.require_mission(request.mission_id)
         region = box_from_message(request.region) if request.HasField("region") else None
         if request.exclude_agent_id:
             require_identifier("exclude_agent_id", request.exclude_agent_id)
         watched = WatchedPart(layer_from_message(request.layer), region, request.exclude_agent_id)
-        reader = FusedMapReader(self._engine, watched, self._encoded_parts)
+        reader = FusedMapReader(self.engine, watched, self._encoded_parts)
 
         async def read(_since_revision: int) -> FusedMapReader:
             return reader
 
         def revision() -> int:
             self._gate.require_open()
-            return self._engine.maps.revision(watched.layer)
+            return self.engine.maps.revision(watched.layer)
 
         async for block in follow(read, revision, request.since_revision, self._map_changes, self._work):
             yield pb.WatchFusedMapResponse(block=block)
@@ -302,9 +297,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.RefineFusedMapResponse]:
         """Refine the fused map and report progress; closing the stream cancels the refinement."""
         self._gate.require_open()
-        self._engine.require_mission(request.mission_id)
+        self.engine.require_mission(request.mission_id)
         response = pb.RefineFusedMapResponse()
-        async for progress in self._refinement_worker.run(self._engine, request):
+        async for progress in self._refinement_worker.run(self.engine, request):
             self._gate.require_open()
             response = pb.RefineFusedMapResponse(
                 iteration=progress.iteration,
@@ -321,7 +316,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request: pb.ExportFusedMapRequest, context: Any
     ) -> AsyncIterator[pb.ExportFusedMapResponse]:
         """Send a map as the bytes of a PLY file."""
-        self._engine.require_mission(request.mission_id)
+        self.engine.require_mission(request.mission_id)
         async with self._exports:
             exported = await self._work(self._export, request)
         with exported:
@@ -332,24 +327,24 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
         """Replace the agent's task graph and objects."""
-        agent_of_session(self._engine, request.session_id, Caller.of(context))
-        await self._work(self._engine.report_objects, request.session_id, report_from_message(request))
+        agent_of_session(self.engine, request.session_id, Caller.of(context))
+        await self._work(self.engine.report_objects, request.session_id, report_from_message(request))
         return pb.ReportObjectsResponse()
 
     async def QueryObjects(self, request: pb.QueryObjectsRequest, context: Any) -> pb.QueryObjectsResponse:
         """Return the team's objects that a noun names, or all."""
-        self._engine.require_mission(request.mission_id)
+        self.engine.require_mission(request.mission_id)
         async with self._queries:
             return await self._work(self._find_objects, request.noun)
 
     def _find_objects(self, noun: str) -> pb.QueryObjectsResponse:
-        found = self._engine.query_objects(noun)
+        found = self.engine.query_objects(noun)
         return pb.QueryObjectsResponse(objects=[object_to_message(one.landmark, one.observers) for one in found])
 
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
         """Render a layer of the map from a camera pose."""
         self._gate.require_open()
-        self._engine.require_mission(request.mission_id)
+        self.engine.require_mission(request.mission_id)
         camera = camera_from_message(request.camera)
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
         layer = layer_from_message(request.layer)
@@ -358,11 +353,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
-        self._engine.require_mission(request.mission_id)
-        status = await self._work(self._engine.status)
+        self.engine.require_mission(request.mission_id)
+        status = await self._work(self.engine.status)
         return pb.GetSessionStatusResponse(
             mission_id=status.mission_config.mission_id,
-            grid=grid_to_message(self._engine.grid),
+            grid=grid_to_message(self.engine.grid),
             world_frame=status.mission_config.world_frame,
             fused_revision=status.revision,
             fused_gaussians=status.fused_gaussians,
@@ -375,29 +370,29 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
         """End a session; with `forget` the agent's updates are deleted."""
-        agent_of_session(self._engine, request.session_id, Caller.of(context))
-        revision = await self._work(self._engine.leave, request.session_id, request.forget)
+        agent_of_session(self.engine, request.session_id, Caller.of(context))
+        revision = await self._work(self.engine.leave, request.session_id, request.forget)
         self.publish_changes()
         return pb.LeaveSessionResponse(fused_revision=revision)
 
     async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
         """End an agent's session and delete its data; with `ban` its later joins are refused."""
-        self._engine.require_mission(request.mission_id)
-        voxels = await self._work(self._engine.evict, request.agent_id, request.ban)
+        self.engine.require_mission(request.mission_id)
+        voxels = await self._work(self.engine.evict, request.agent_id, request.ban)
         self.publish_changes()
         _log.warning("agent %s: %s, data of %d voxels deleted", request.agent_id, _evicted(request), voxels)
-        return pb.EvictAgentResponse(fused_revision=self._engine.revision, voxels=voxels)
+        return pb.EvictAgentResponse(fused_revision=self.engine.revision, voxels=voxels)
 
     async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
         """Let a banned agent join again."""
-        self._engine.require_mission(request.mission_id)
-        await self._work(self._engine.unban, request.agent_id)
+        self.engine.require_mission(request.mission_id)
+        await self._work(self.engine.unban, request.agent_id)
         _log.warning("agent %s: may join again", request.agent_id)
         return pb.UnbanAgentResponse()
 
     def _export(self, request: pb.ExportFusedMapRequest) -> ExportedFile:
-        batch = select_map(self._engine, request)
-        return ExportedFile(ply_bytes(batch.gaussians, self._engine.mission_config.given_world_frame))
+        batch = select_map(self.engine, request)
+        return ExportedFile(ply_bytes(batch.gaussians, self.engine.mission_config.given_world_frame))
 
     def _align_in_background(self) -> None:
         """Compare the frames that are due soon, unless that is pending or running. Use on the event loop."""
@@ -413,14 +408,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             # messages that arrive meanwhile set it again
             self._align_again, start_s, is_changed = False, loop.time(), True
             try:
-                is_changed = await loop.run_in_executor(self._aligner, self._engine.align_due, 1)
+                is_changed = await loop.run_in_executor(self._aligner, self.engine.align_due, 1)
                 pause_s = max(_ALIGN_DELAY_S, _ALIGN_PAUSE * (loop.time() - start_s))
             except Exception as error:
                 # an agent may have been compared before
                 _log.error("frames are not compared, again in %.0f s: %s", _ALIGN_RETRY_S, error)
                 pause_s = _ALIGN_RETRY_S
             self._align_pause_s = pause_s
-            self._align_again |= self._engine.is_alignment_due
+            self._align_again |= self.engine.is_alignment_due
             if is_changed:
                 self._map_changes.notify()
 

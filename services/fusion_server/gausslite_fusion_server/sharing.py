@@ -7,11 +7,12 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.postgres_regions import SharedSlots
-from gausslite.fusion.refinement import rasterizer_of_backend
+from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.server import Service
 from gausslite_fusion_server.metrics import MessageCounts
 from gausslite_fusion_server.part_sender import PartSender
@@ -71,7 +72,9 @@ async def open_share(settings: ServerSettings, peer_address: str) -> AsyncIterat
     _log.info("server %s: shares its mission; frames of agents are used as they are (trust)", peer_address)
 
     def create_servicer(engine: FusionEngine) -> FusionServicer:
-        return FusionServicer(engine, RefinementWorker(settings.refine, rasterizer_of_backend(settings.rasterizer)))
+        return FusionServicer(
+            engine, RefinementWorker(settings.refine, partial(choose_rasterizer, settings.rasterizer))
+        )
 
     fusion = shared_settings(settings.fusion)
     host, peers = RegionHost(slots, fusion, create_servicer), Peers(settings.tls)

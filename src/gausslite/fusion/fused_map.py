@@ -146,7 +146,6 @@ class FusedMapChanges:
     """The voxels of a layer that changed up to `revision`, and the keys of those that became empty."""
 
     revision: int
-    snapshot: bool
     won: WonVoxels
     removed: Int64[ndarray, " e"]
 
@@ -217,7 +216,7 @@ class FusedMapLayers:
                 keys = np.array(sorted(self._tiles_of(layer).all_keys()), np.int64)
             won = self._won_voxels(layer, keys)
             removed = np.setdiff1d(keys, won.batch.keys) if since_revision else np.zeros(0, np.int64)
-            return FusedMapChanges(log.revision, since_revision == 0, won, removed)
+            return FusedMapChanges(log.revision, won, removed)
 
     def voted_map(self, only_agent: str = "") -> VoxelBatch:
         """Return the fused map, or its voxels that one agent wins."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -29,7 +28,6 @@ from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mapping.density import densify, prune
 from gausslite.mapping.settings import REFINE_RATES, DensitySettings
 from gausslite.mapping.splat_table import SplatTable
-from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import (
     ROW_WIDTH,
     AdamSettings,
@@ -91,11 +89,6 @@ class RefineProgress:
 
 CreateRasterizer = Callable[[], Rasterizer]
 """Creates the rasterizer of a refinement when it starts: a server without refinements needs no kernels."""
-
-
-def rasterizer_of_backend(name: str) -> CreateRasterizer:
-    """Return a function that creates the backend of this name, see `choose_rasterizer`."""
-    return partial(choose_rasterizer, name)
 
 
 ProgressCallback = Callable[[RefineProgress], bool]
