@@ -137,54 +137,43 @@ def encode_mask(mask: Bool[ndarray, "h w"], compression: int = PNG_COMPRESSION) 
 
 def decode_mask(data: bytes, width_px: int, height_px: int) -> Bool[ndarray, "h w"]:
     """Decode a mask of exactly this size. Raises InvalidInputError."""
-    import cv2
-
-    _require_size("mask", data, width_px, height_px)
-    image = _decode(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.shape != (height_px, width_px) or image.dtype != np.uint8:
-        raise InvalidInputError("mask: expected a one-channel PNG of up to 8 bits, got something else")
-    return image > 0
+    shape = height_px, width_px
+    return _decode("mask", data, shape, np.uint8, "a one-channel PNG of up to 8 bits") > 0
 
 
 def decode_colour(data: bytes, width_px: int, height_px: int) -> UInt8[ndarray, "h w 3"]:
     """Decode colour of exactly this size. Raises InvalidInputError."""
     import cv2
 
-    _require_size("frame colour", data, width_px, height_px)
-    image = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or image.shape != (height_px, width_px, 3) or image.dtype != np.uint8:
-        raise InvalidInputError("frame colour: expected an 8-bit JPEG or PNG, got damaged bytes")
-    return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    bgr = _decode("frame colour", data, (height_px, width_px, 3), np.uint8, "an 8-bit JPEG or PNG")
+    return np.ascontiguousarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def decode_depth(data: bytes, width_px: int, height_px: int) -> Float32[ndarray, "h w"]:
     """Decode depth in metres of exactly this size. Raises InvalidInputError."""
+    shape = height_px, width_px
+    depth_mm = _decode("frame depth_png", data, shape, np.uint16, "a one-channel 16-bit PNG")
+    return (depth_mm.astype(np.float64) / _MM_PER_M).astype(np.float32)
+
+
+def _decode(name: str, data: bytes, shape: tuple[int, ...], dtype: type[np.integer[Any]], expected: str) -> ndarray:
+    """Return an image of exactly this shape and type; its channels are as OpenCV has them. Raises InvalidInputError."""
     import cv2
 
-    _require_size("frame depth_png", data, width_px, height_px)
-    image = _decode(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.shape != (height_px, width_px) or image.dtype != np.uint16:
-        raise InvalidInputError("frame depth_png: expected a one-channel 16-bit PNG, got something else")
-    return (image.astype(np.float64) / _MM_PER_M).astype(np.float32)
-
-
-def _require_size(name: str, data: bytes, width_px: int, height_px: int) -> None:
-    size = image_size(data)
+    size, wanted = image_size(data), shape[1::-1]
     if size is None:
         raise InvalidInputError(f"{name}: expected a JPEG or PNG, got {len(data)} bytes of something else")
-    if size != (width_px, height_px):
-        raise InvalidInputError(f"{name}: expected the camera's {width_px}x{height_px}, got {size[0]}x{size[1]}")
+    if size != wanted:
+        raise InvalidInputError(f"{name}: expected the camera's {wanted[0]}x{wanted[1]}, got {size[0]}x{size[1]}")
     if not has_whole_chunks(data):
         raise InvalidInputError(f"{name}: expected a whole PNG, got damaged bytes: a chunk ends outside of them")
-
-
-def _decode(data: bytes, flags: int) -> ndarray | None:
-    import cv2
-
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if len(shape) == 3 else cv2.IMREAD_UNCHANGED
     try:
         image: ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
-        return None
+        image = None
+    if image is None or image.shape != shape or image.dtype != dtype:
+        raise InvalidInputError(f"{name}: expected {expected}, got something else or damaged bytes")
     return image
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Final
+from enum import StrEnum
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -32,22 +33,23 @@ from gausslite.domain.task import (
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2, geometry_pb2, objects_pb2, task_pb2
 from gausslite.wire.convert import box_from_message, box_to_message
 
+_Named = TypeVar("_Named", bound=StrEnum)
 _MAX_POINTED: Final = 64
 """Points and boxes of a task in all; a region grows around each of them, on the thread that maps frames."""
-_PREDICATE_NUMBERS = {predicate: task_pb2.Predicate.Value(f"PREDICATE_{predicate.name}") for predicate in Predicate}
+
+
+def _numbers(kind: Any, values: Iterable[_Named]) -> dict[_Named, Any]:
+    """Return the number of each value in a protobuf enumeration, whose names begin with its own."""
+    prefix = kind.Name(0).removesuffix("UNSPECIFIED")
+    return {value: kind.Value(f"{prefix}{value.name}") for value in values}
+
+
+_PREDICATE_NUMBERS = _numbers(task_pb2.Predicate, Predicate)
+_ROLE_NUMBERS = _numbers(task_pb2.TargetRole, TargetRole)
+_SUPERLATIVE_NUMBERS: dict[Any, Any] = {None: 0, **_numbers(task_pb2.Superlative, Superlative)}
 _PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
-_ROLE_NUMBERS = {role: task_pb2.TargetRole.Value(f"TARGET_ROLE_{role.name}") for role in TargetRole}
-_ROLE_BY_NUMBER = {
-    task_pb2.TARGET_ROLE_UNSPECIFIED: TargetRole.OBJECT,
-    **{number: role for role, number in _ROLE_NUMBERS.items()},
-}
-_SUPERLATIVE_NUMBERS = {
-    superlative: task_pb2.Superlative.Value(f"SUPERLATIVE_{superlative.name}") for superlative in Superlative
-}
-_SUPERLATIVE_BY_NUMBER = {
-    task_pb2.SUPERLATIVE_UNSPECIFIED: None,
-    **{number: superlative for superlative, number in _SUPERLATIVE_NUMBERS.items()},
-}
+_ROLE_BY_NUMBER = {0: TargetRole.OBJECT, **{number: role for role, number in _ROLE_NUMBERS.items()}}
+_SUPERLATIVE_BY_NUMBER = {number: superlative for superlative, number in _SUPERLATIVE_NUMBERS.items()}
 
 
 def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
@@ -74,9 +76,7 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
             task_pb2.ObjectAttributes(
                 name=attribute.name,
                 colour=attribute.colour or "",
-                superlative=task_pb2.SUPERLATIVE_UNSPECIFIED
-                if attribute.superlative is None
-                else _SUPERLATIVE_NUMBERS[attribute.superlative],
+                superlative=_SUPERLATIVE_NUMBERS[attribute.superlative],
             )
             for attribute in graph.attributes
         ],
@@ -195,19 +195,14 @@ def _point_from_message(name: str, message: geometry_pb2.Point) -> PointM:
 
 
 def _require_known_numbers(message: task_pb2.TaskGraph) -> None:
-    for relation in message.relations:
-        if relation.predicate not in _PREDICATE_BY_NUMBER:
-            raise TaskError(
-                f"task relation: expected one of {', '.join(Predicate)}, got predicate {relation.predicate}"
-            )
-    for role in message.roles:
-        if role not in _ROLE_BY_NUMBER:
-            raise TaskError(f"task roles: expected one of {', '.join(TargetRole)}, got role {role}")
-    for attribute in message.attributes:
-        if attribute.superlative not in _SUPERLATIVE_BY_NUMBER:
-            raise TaskError(
-                f"task attributes: expected one of {', '.join(Superlative)}, got superlative {attribute.superlative}"
-            )
+    for name, kind, numbers, known in (
+        ("relation", Predicate, [relation.predicate for relation in message.relations], _PREDICATE_BY_NUMBER),
+        ("roles", TargetRole, message.roles, _ROLE_BY_NUMBER),
+        ("attributes", Superlative, [own.superlative for own in message.attributes], _SUPERLATIVE_BY_NUMBER),
+    ):
+        for number in numbers:
+            if number not in known:
+                raise TaskError(f"task {name}: expected one of {', '.join(kind)}, got {kind.__name__} {number}")
 
 
 def _relation_from_message(message: task_pb2.Relation) -> Relation:
