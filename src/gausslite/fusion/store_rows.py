@@ -1,10 +1,10 @@
 """The rows of a store: a log of voxel updates, which of them are in use, and when to write them anew.
 
 A message adds one row for each tile with voxels that it replaces; no row ever changes. The index names the row that has
-a voxel's latest update. Rows are numbered in segments. If more than half of all rows is outdated, the segment with the
-smallest part in use is emptied: its voxels in use move to new rows, and the next transaction deletes its rows. So each
-transaction deletes only rows that the index no longer named before it, and a reader that has asked the index finds its
-rows, or asks again. After a crash the update with the highest (update_seq, row) is a voxel's latest.
+a voxel's latest update. A message to a tile of which more than half is outdated writes the agent's whole tile as one
+row, and the next transaction deletes the earlier ones. So each transaction deletes only rows that the index no longer
+named before it, and a reader that has asked the index finds its rows, or asks again. After a crash the update with the
+highest (update_seq, row) is a voxel's latest.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels, join_elements
 from gausslite.domain.errors import GaussLiteError, StorageError
-from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches
+from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of, tiles_of
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels
 from gausslite.fusion.store_values import PutOutcome, StoredScores
 
@@ -33,27 +33,31 @@ ReadRows = Callable[[Sequence[int]], Mapping[int, bytes]]
 """Returns the voxels of those of these rows that exist. Raises StorageError."""
 Places = tuple[Int64[ndarray, " _"], Int64[ndarray, " _"]]
 """Ascending keys of voxels, and the row of each."""
-SEGMENT_BITS = 16
-"""The other bits of a row's number name its segment."""
 SLOT_BITS = 48
-"""The bits from here on are the slot of the row's voxels; a segment has rows of one slot."""
+"""The bits of a row's number from here on are the slot of its voxels."""
 SlotsOf = Callable[[Int64[ndarray, " n"]], Int64[ndarray, " n"]]
 """Returns the slot of each voxel; those of a tile have the same."""
-_SEGMENT_UNITS = 1 << 14
-"""About 350 kB of Gaussians."""
-_SPARE_SEGMENTS = 4
+_SPARE_UNITS = 1 << 8
+"""About 5 kB of Gaussians, which may be outdated in each tile."""
 _VOXEL_UNITS = 2
 """The size of a voxel beside its Gaussians, in Gaussians."""
 _READ_ATTEMPTS = 20
 
 
 @dataclass(slots=True)
-class _Segment:
-    """Rows whose numbers have the same high bits; sizes in units of one Gaussian."""
+class _Tile:
+    """An agent's rows in a tile, and the size of its voxels in use; sizes in units of one Gaussian."""
 
-    rows: set[int] = field(default_factory=set)
-    total: int = 0
+    sizes: dict[int, int] = field(default_factory=dict)
     used: int = 0
+
+    @property
+    def is_outdated(self) -> bool:
+        return sum(self.sizes.values()) - self.used > max(self.used, _SPARE_UNITS)
+
+
+_TileName = tuple[str, int]
+"""An agent and a tile."""
 
 
 @dataclass(slots=True)
@@ -62,10 +66,10 @@ class LogChange:
 
     deleted: list[int] = field(default_factory=list)
     rows: list[UpdateRow] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
+    added: list[tuple[_TileName, int, int]] = field(default_factory=list)
+    emptied: list[tuple[_TileName, list[int]]] = field(default_factory=list)
     puts: list[tuple[str, Int64[ndarray, " _"], StoredScores]] = field(default_factory=list)
     outcomes: list[PutOutcome] = field(default_factory=list)
-    emptied: list[int] = field(default_factory=list)
 
 
 class UpdateLog:
@@ -74,21 +78,19 @@ class UpdateLog:
     def __init__(self, slots_of: SlotsOf = np.zeros_like) -> None:
         self.index = ScoreIndex()
         self._slots_of = slots_of
-        self._segments: dict[int, _Segment] = {}
-        # (agent, size) of every row, those of emptied segments included
-        self._rows: dict[int, tuple[str, int]] = {}
+        self._tiles: dict[_TileName, _Tile] = {}
         # deleted by the next transaction
         self._outdated: list[int] = []
-        self._total = self._used = 0
-        # of each slot: the last row's number, and the size of its segment
-        self._last: dict[int, tuple[int, int]] = {}
+        # the highest number of a row, without its slot
+        self._last = 0
 
     def load(self, rows: Iterable[UpdateRow]) -> None:
         """Read all rows of a store; they are intact."""
         tables: dict[str, list[tuple[int, NDArray[Any]]]] = {}
         for number, agent_id, _, data in rows:
             voxels = StoredVoxels.from_row(data)
-            self._add_row(number, agent_id, _size(voxels))
+            self._add_row((agent_id, tile_of(int(voxels.keys[0]))), number, _size(voxels))
+            self._last = max(self._last, number & ((1 << SLOT_BITS) - 1))
             tables.setdefault(agent_id, []).append((number, voxels.voxels.copy()))
         for agent_id, parts in tables.items():
             table = np.concatenate([own for _, own in parts])
@@ -96,54 +98,47 @@ class UpdateLog:
             order = np.lexsort((numbers, table["update_seqs"], table["keys"]))
             keys = table["keys"][order]
             latest = order[np.append(keys[1:] != keys[:-1], True)[: len(keys)]]
-            self._put([(agent_id, *_scores(table[latest], numbers[latest]))])
-        # numbers beyond all others, in segments of their own
-        self._last = {number >> SLOT_BITS: (number, _SEGMENT_UNITS) for number in sorted(self._rows)}
+            self._put(agent_id, *_scores(table[latest], numbers[latest]))
 
     def plan(self, updates: Sequence[StoredSubset], read: ReadRows) -> LogChange:
         """Return how to store messages of different agents, each completely. Raises StorageError."""
         change = LogChange(deleted=list(self._outdated))
-        self._empty_segments(change, read)
         for update in updates:
             newer = newer_voxels(self.index, update, lambda name, keys: self._stored(name, keys, read))
             keys = update.voxels.keys
             change.outcomes.append(PutOutcome(keys[newer], keys[~newer]))
             accepted = update.voxels if newer.all() else update.voxels.take(np.flatnonzero(newer))
-            self._add(change, update.agent_id, accepted)
+            parts = accepted.by_tile()
+            written = [row for part in parts for row in self._add(change, update.agent_id, part, read)]
+            if written:
+                table = join_elements([voxels.voxels for _, voxels in written])
+                numbers = np.array([number for number, _ in written], np.int64)
+                rows = np.repeat(numbers, [len(voxels) for _, voxels in written])
+                change.puts.append((update.agent_id, *_scores(table, rows)))
         return change
 
     def apply(self, change: LogChange) -> None:
         """Record a change whose transaction is committed."""
-        for number in change.deleted:
-            del self._rows[number]
-        for (number, agent_id, _, _), size in zip(change.rows, change.sizes, strict=True):
-            self._add_row(number, agent_id, size)
-        self._put(change.puts)
         self._outdated = []
-        for name in change.emptied:
-            segment = self._segments.pop(name)
-            self._total -= segment.total
-            self._outdated += sorted(segment.rows)
+        for name, numbers in change.emptied:
+            for number in numbers:
+                del self._tiles[name].sizes[number]
+            self._outdated += numbers
+        for name, number, size in change.added:
+            self._add_row(name, number, size)
+        for agent_id, keys, scores in change.puts:
+            self._put(agent_id, keys, scores)
 
     def rows_of(self, agent_id: str) -> list[int]:
-        """Return the numbers of all rows of an agent, outdated ones too."""
-        return [number for number, (name, _) in self._rows.items() if name == agent_id]
+        """Return the numbers of all rows of an agent, and of those that the next transaction deletes."""
+        own = (tile.sizes for (name, _), tile in self._tiles.items() if name == agent_id)
+        return [*itertools.chain.from_iterable(own), *self._outdated]
 
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " v"]:
-        """Record that the rows of an agent are deleted; returns the keys of its voxels, ascending."""
-        keys, _, _, counts, rows = self.index.columns(agent_id, None)
-        self._count_used(rows, counts, -1)
-        for number in self.rows_of(agent_id):
-            _, size = self._rows.pop(number)
-            segment = self._segments.get(number >> SEGMENT_BITS)
-            if segment is not None:
-                segment.rows.remove(number)
-                segment.total -= size
-                self._total -= size
-        self._segments = {name: segment for name, segment in self._segments.items() if segment.rows}
-        self._outdated = [number for number in self._outdated if number in self._rows]
-        self.index.remove_agent(agent_id)
-        return keys
+        """Record that `rows_of` an agent are deleted; returns the keys of its voxels, ascending."""
+        self._outdated = []
+        self._tiles = {name: tile for name, tile in self._tiles.items() if name[0] != agent_id}
+        return self.index.remove_agent(agent_id)
 
     def places(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> Places:
         """Return where the agent's updates of these voxels, or all, are."""
@@ -154,77 +149,40 @@ class UpdateLog:
         keys, rows = self.places(agent_id, keys)
         return _voxels_of(keys, rows, read(np.unique(rows).tolist()))
 
-    def _add(self, change: LogChange, agent_id: str, voxels: StoredVoxels) -> None:
-        """Add rows with these voxels, whose keys ascend."""
-        parts = voxels.by_tile()
-        if not parts:
-            return
-        numbers = []
-        slots = self._slots_of(np.array([part.voxels["keys"][0] for part in parts], np.int64)).tolist()
-        for slot, part in zip(slots, parts, strict=True):
-            size, data = _size(part), part.to_row()
-            numbers.append(self._next_number(slot, size))
-            change.rows.append((numbers[-1], agent_id, data_checksum(agent_id, numbers[-1], data), data))
-            change.sizes.append(size)
-        table = join_elements([part.voxels for part in parts])
-        rows = np.repeat(np.array(numbers, np.int64), [len(part) for part in parts])
-        change.puts.append((agent_id, *_scores(table, rows)))
+    def _add(
+        self, change: LogChange, agent_id: str, part: StoredVoxels, read: ReadRows
+    ) -> Iterator[tuple[int, StoredVoxels]]:
+        """Add a row with these voxels of a tile, and all others of the agent's tile if that is outdated; yields it."""
+        name = agent_id, tile_of(int(part.keys[0]))
+        own = self._tiles.get(name)
+        parts = {part.size_m: [part]}
+        if own is not None and own.is_outdated:
+            for number, data in read(sorted(own.sizes)).items():
+                voxels = StoredVoxels.from_row(data)
+                is_used = self.index.stored(agent_id, voxels.keys).rows == number
+                is_used &= ~np.isin(voxels.keys, part.keys)
+                if is_used.any():
+                    parts.setdefault(voxels.size_m, []).append(voxels.take(np.flatnonzero(is_used)))
+            change.emptied.append((name, sorted(own.sizes)))
+        slot = int(self._slots_of(part.keys[:1])[0]) << SLOT_BITS
+        for same_size in parts.values():
+            self._last += 1
+            number, voxels = slot + self._last, _in_order(StoredVoxels.concatenate(same_size))
+            data = voxels.to_row()
+            change.rows.append((number, agent_id, data_checksum(agent_id, number, data), data))
+            change.added.append((name, number, _size(voxels)))
+            yield number, voxels
 
-    def _empty_segments(self, change: LogChange, read: ReadRows) -> None:
-        """Move the voxels in use out of the segments with the smallest part in use, while too much is outdated."""
-        total, used = self._total, self._used
-        current = {number >> SEGMENT_BITS for number, _ in self._last.values()}
-        while total - used > max(used, _SPARE_SEGMENTS * _SEGMENT_UNITS):
-            others = (name for name in self._segments if name not in change.emptied and name not in current)
-            name = min(others, key=lambda name: self._segments[name].used / self._segments[name].total, default=None)
-            if name is None:
-                return
-            segment = self._segments[name]
-            if segment.used:
-                self._move(change, read(sorted(segment.rows)))
-            change.emptied.append(name)
-            total -= segment.total - segment.used
+    def _add_row(self, name: _TileName, number: int, size: int) -> None:
+        self._tiles.setdefault(name, _Tile()).sizes[number] = size
 
-    def _move(self, change: LogChange, rows: Mapping[int, bytes]) -> None:
-        parts: dict[tuple[str, float], list[StoredVoxels]] = {}
-        for number, data in rows.items():
-            agent_id, voxels = self._rows[number][0], StoredVoxels.from_row(data)
-            used = np.flatnonzero(self.index.stored(agent_id, voxels.keys).rows == number)
-            if len(used):
-                parts.setdefault((agent_id, voxels.size_m), []).append(voxels.take(used))
-        for (agent_id, _), own in parts.items():
-            voxels = StoredVoxels.concatenate(own)
-            self._add(change, agent_id, voxels.take(np.argsort(voxels.keys)))
-
-    def _next_number(self, slot: int, size: int) -> int:
-        number, filled = self._last.get(slot, (slot << SLOT_BITS, 0))
-        number += 1
-        if filled >= _SEGMENT_UNITS:
-            number, filled = ((number >> SEGMENT_BITS) + 1) << SEGMENT_BITS, 0
-        self._last[slot] = number, filled + size
-        return number
-
-    def _add_row(self, number: int, agent_id: str, size: int) -> None:
-        segment = self._segments.setdefault(number >> SEGMENT_BITS, _Segment())
-        segment.rows.add(number)
-        segment.total += size
-        self._total += size
-        self._rows[number] = agent_id, size
-
-    def _put(self, puts: Sequence[tuple[str, Int64[ndarray, " _"], StoredScores]]) -> None:
-        if not puts:
-            return
-        before = [self.index.put(agent_id, keys, scores) for agent_id, keys, scores in puts]
-        for scores, sign in ((before, -1), ([put[2] for put in puts], 1)):
-            rows, counts = (np.concatenate([getattr(own, name) for own in scores]) for name in ("rows", "counts"))
-            self._count_used(rows[rows >= 0], counts[rows >= 0], sign)
-
-    def _count_used(self, rows: Int64[ndarray, " k"], counts: NDArray[Any], sign: int) -> None:
-        names, places = np.unique(rows >> SEGMENT_BITS, return_inverse=True)
-        sizes = np.bincount(places, counts + float(_VOXEL_UNITS), len(names)).astype(np.int64) * sign
-        for name, size in zip(names.tolist(), sizes.tolist(), strict=True):
-            self._segments[name].used += size
-            self._used += size
+    def _put(self, agent_id: str, keys: Int64[ndarray, " k"], scores: StoredScores) -> None:
+        """Replace the totals of these voxels in the index, and the sizes in use in their tiles."""
+        before = self.index.put(agent_id, keys, scores)
+        sizes = (scores.counts + float(_VOXEL_UNITS)) - np.where(before.rows >= 0, before.counts + _VOXEL_UNITS, 0)
+        tiles, places = np.unique(tiles_of(keys), return_inverse=True)
+        for tile, size in zip(tiles.tolist(), np.bincount(places, sizes, len(tiles)).tolist(), strict=True):
+            self._tiles[agent_id, tile].used += int(size)
 
 
 def read_batches(

@@ -24,8 +24,7 @@ Latest = dict[str, dict[int, tuple[int, int, int, bytes]]]
 @pytest.fixture(params=["memory", "sqlite", "postgres"])
 def open_store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> OpenStore:
     """Opens a store that moves rows often."""
-    monkeypatch.setattr(store_rows, "_SEGMENT_UNITS", 60)
-    monkeypatch.setattr(store_rows, "_SPARE_SEGMENTS", 1)
+    monkeypatch.setattr(store_rows, "_SPARE_UNITS", 60)
     return opener(request.param, request)
 
 
@@ -114,7 +113,7 @@ def test_outdated_rows_are_deleted(open_store: OpenStore) -> None:
     log = store._log
     for seq in range(1, 80):
         store.put(make_subset("ant", seq, dict.fromkeys(range(seq % 3, 60, 3), 2), seed=seq))
-    held = sum(size for _, size in log._rows.values())
+    held = sum(sum(tile.sizes.values()) for tile in log._tiles.values())
     in_use = sum(2 + 2 for _ in range(60))
     assert held < 4 * in_use + 4 * 60
     store.close()
