@@ -34,7 +34,6 @@ from gausslite.domain.errors import (
     RevisionGoneError,
     SessionUnknownError,
     StorageError,
-    UnavailableError,
 )
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxel_changes import TileDigests
@@ -358,31 +357,6 @@ def test_a_server_refuses_what_an_owner_that_has_stopped_cannot_take(postgres: P
             process.kill()
             assert 0 < sum(stored) < len(names)
             assert all(f"MiB wait for {peer}" in refusal for refusal in refusals)
-
-
-def is_acknowledged(server: SharingServer, message: pb.ContributeSubsetsRequest) -> bool:
-    try:
-        return len(list(server.client.contribute([message], 20.0))) == 1
-    except (StorageError, UnavailableError):
-        return False
-
-
-def test_after_a_killed_database_the_servers_own_their_regions_again(postgres: PostgresServer, folder: Path) -> None:
-    subsets = [scattered("ant", seq, seq) for seq in range(1, 7)]
-    with sharing_servers(postgres.new_database(), folder, 2) as servers:
-        session = servers[0].client.join("ant", GRID).session_id
-        before = [server.share.host.owned.slots for server in servers]
-        list(servers[0].client.contribute([request(session, subset) for subset in subsets[:3]], 20.0))
-        postgres.kill()
-        with pytest.raises((StorageError, UnavailableError)):
-            list(servers[0].client.contribute([request(session, subsets[3])], 20.0))
-        postgres.start()
-        # an agent tries again
-        for subset in subsets[3:]:
-            wait_until(lambda subset=subset: is_acknowledged(servers[1], request(session, subset)))
-        wait_until_settled(servers)
-        assert [server.share.host.owned.slots for server in servers] == before
-        assert servers[0].client.export(Export()) == offline({"ant": subsets})
 
 
 def test_only_the_slots_of_a_server_that_ends_move() -> None:
