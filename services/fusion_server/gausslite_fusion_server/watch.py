@@ -41,11 +41,15 @@ class WatchedPart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedMapReader:
-    """Reads what one watcher wants; a tile is read when its block is due. The cache is that of all watchers."""
+    """Reads what one watcher wants; a tile is read when its block is due. The cache is that of all watchers.
+
+    since_revision: where the watcher begins; from there it gets all changes as one.
+    """
 
     engine: FusionEngine
     watched: WatchedPart
     cache: EncodedPartCache
+    since_revision: int = 0
 
     def snapshot(self) -> tuple[int, Parts]:
         """Return the current revision and the tiles of the layer, each as it is when it is read."""
@@ -54,9 +58,11 @@ class FusedMapReader:
 
     def changes(self, since_revision: int) -> tuple[int, Parts]:
         """Return the current revision and what changed since, or more. Raises RevisionGoneError."""
-        revision = self.engine.maps.revision(self.watched.layer)
-        if revision == since_revision:
+        newest = self.engine.maps.revision(self.watched.layer)
+        if newest == since_revision:
             return since_revision, ()
+        is_first = since_revision == self.since_revision
+        revision = newest if is_first else self.cache.step((self.watched, since_revision), newest)
 
         # the map is read once for all watchers that follow closely
         def encode() -> tuple[EncodedPart, ...]:

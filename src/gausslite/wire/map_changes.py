@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,8 @@ READ_DEADLINE_S = 60.0
 """For one message of at most a megabyte: 17 kB/s."""
 BLOCK_BYTES = 1 << 19
 _BUDGET_BYTES = 64 << 20
+_STEP_AGE_S = 1.0
+_STRIPES = 16
 EncodedPart = tuple[bytes, Provenance | None]
 """Voxels in the subset codec, and the agents that win them, None if the map has one agent."""
 Parts = Iterable[tuple[EncodedPart, ...]]
@@ -137,23 +140,37 @@ class EncodedPartCache:
     def __init__(self, budget_bytes: int = _BUDGET_BYTES) -> None:
         self._budget_bytes = budget_bytes
         self._lock = Lock()
+        # held while parts are encoded, so that several threads do not encode the same ones
+        self._encoding = [Lock() for _ in range(_STRIPES)]
+        self._steps: OrderedDict[Hashable, tuple[float, int]] = OrderedDict()
         self._parts: OrderedDict[Hashable, tuple[EncodedPart, ...]] = OrderedDict()
         self._held_bytes = 0
 
     def get(self, key: Hashable, encode: Callable[[], tuple[EncodedPart, ...]]) -> tuple[EncodedPart, ...]:
         """Return the parts of this key; encode them if they are not kept."""
-        with self._lock:
-            if key in self._parts:
-                self._parts.move_to_end(key)
-                return self._parts[key]
-        parts = encode()
-        with self._lock:
-            if key not in self._parts:
+        with self._encoding[hash(key) % _STRIPES]:
+            with self._lock:
+                if key in self._parts:
+                    self._parts.move_to_end(key)
+                    return self._parts[key]
+            parts = encode()
+            with self._lock:
                 self._parts[key] = parts
                 self._held_bytes += _size_bytes(parts)
-            while self._held_bytes > self._budget_bytes:
-                self._held_bytes -= _size_bytes(self._parts.popitem(last=False)[1])
-        return parts
+                while self._held_bytes > self._budget_bytes:
+                    self._held_bytes -= _size_bytes(self._parts.popitem(last=False)[1])
+            return parts
+
+    def step(self, start: Hashable, newest_revision: int) -> int:
+        """Return the revision to which the watchers go from here: the newest one, or that of a moment ago.
+
+        So watchers that follow closely stay together and share the parts, however fast the map changes.
+        """
+        now_s = time.monotonic()
+        with self._lock:
+            while self._steps and next(iter(self._steps.values()))[0] < now_s - _STEP_AGE_S:
+                self._steps.popitem(last=False)
+            return self._steps.setdefault(start, (now_s, newest_revision))[1]
 
 
 def _next_block(blocks: Iterator[MapBlock]) -> MapBlock | None:

@@ -147,21 +147,26 @@ def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:
 
 
 _NOTIFY_PAUSE_S = 0.1
+_SUBSCRIPTION_PAUSE_S = 0.005
+"""Serving a watcher takes about a millisecond, and it subscribes twice for each change."""
 
 
 class ChangeNotifier:
     """Subscribe, read the state, then wait on the subscription: so no change is missed. Use it on the event loop.
 
-    Subscribers wake together, at most every _NOTIFY_PAUSE_S, so that many of them read the same changes.
+    Subscribers wake together, at most every _NOTIFY_PAUSE_S and less often if they are many, so that they read the
+    same changes and leave most of the time to others.
     """
 
     def __init__(self) -> None:
         self._next_change = asyncio.Event()
         self._earliest_s = 0.0
+        self._subscriptions = 0
         self._is_due = False
 
     def subscribe(self) -> asyncio.Event:
         """Return an event that the next `notify` sets."""
+        self._subscriptions += 1
         return self._next_change
 
     def notify(self) -> None:
@@ -173,7 +178,9 @@ class ChangeNotifier:
 
     def _wake(self) -> None:
         self._is_due = False
-        self._earliest_s = asyncio.get_running_loop().time() + _NOTIFY_PAUSE_S
+        pause_s = max(_NOTIFY_PAUSE_S, _SUBSCRIPTION_PAUSE_S * self._subscriptions)
+        self._earliest_s = asyncio.get_running_loop().time() + pause_s
+        self._subscriptions = 0
         self._next_change.set()
         self._next_change = asyncio.Event()
 

@@ -97,6 +97,21 @@ def test_a_change_is_read_once_for_all_watchers(monkeypatch: pytest.MonkeyPatch)
     assert FusedMapLayers.changes.call_count == 1
 
 
+def test_watchers_that_follow_closely_share_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID), first_revision=1)
+    session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
+    cache, part = EncodedPartCache(), WatchedPart(MapLayer.VOTE)
+    early, late = (FusedMapReader(engine, part, cache) for _ in range(2))
+    before, _ = early.snapshot()
+    monkeypatch.setattr(FusedMapLayers, "changes", Mock(wraps=engine.maps.changes))
+    engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
+    revision, parts = early.changes(before)
+    engine.contribute(session, make_subset("ant", 2, {1: [1]}), GRID)
+    assert late.changes(before) == (revision, parts)
+    assert late.changes(revision) == early.changes(revision)
+    assert FusedMapLayers.changes.call_count == 2
+
+
 def test_watchers_wake_together_after_many_changes() -> None:
     async def run() -> None:
         changes, woken = ChangeNotifier(), []
