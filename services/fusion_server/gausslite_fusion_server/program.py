@@ -36,6 +36,8 @@ from gausslite_fusion_server.settings import (
     parse_maintenance,
 )
 
+_SWITCH_INTERVAL_S = 0.001
+
 
 def run_command(arguments: Sequence[str]) -> int:
     """Run one of MAINTENANCE_COMMANDS and print what it did.
@@ -124,6 +126,8 @@ def _open_store(settings: ServerSettings) -> FusionStore:
 
 
 async def _serve(settings: ServerSettings) -> None:
+    # an acknowledgement passes several threads, and each waits this long for one that computes
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     if settings.peer_address is not None:
         await _serve_share(settings, settings.peer_address)
         return

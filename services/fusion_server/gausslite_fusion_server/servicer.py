@@ -40,6 +40,7 @@ from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.contributions import Contributions, StoredCount
 from gausslite_fusion_server.messages import (
     ExportedFile,
+    PacedLock,
     agent_of_session,
     alignment_to_message,
     contribution_to_message,
@@ -140,7 +141,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         find = functools.partial(self._work, session_of, engine)
         self._contributions = Contributions(find, self._store_message, engine.traffic.record, RejectionLog(_log))
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
-        self._exports, self._keyframes, self._queries, self._joins = (asyncio.Semaphore(1) for _ in range(4))
+        self._exports, self._queries, self._joins, self._keyframes = *(asyncio.Lock() for _ in range(3)), PacedLock()
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
@@ -280,7 +281,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         if request.exclude_agent_id:
             require_identifier("exclude_agent_id", request.exclude_agent_id)
         watched = WatchedPart(layer_from_message(request.layer), region, request.exclude_agent_id)
-        reader = FusedMapReader(self.engine, watched, self._encoded_parts)
+        reader = FusedMapReader(self.engine, watched, self._encoded_parts, request.since_revision)
 
         async def read(_since_revision: int) -> FusedMapReader:
             return reader

@@ -107,8 +107,7 @@ class FusionEngine:
     @property
     def mission_config(self) -> MissionConfig:
         """The mission's configuration, with default names in place of empty ones."""
-        with self._lock:
-            return self._members.mission_config
+        return self._members.mission_config
 
     @property
     def incarnation_id(self) -> str:
@@ -182,6 +181,10 @@ class FusionEngine:
 
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
+        # each message asks, also on the event loop: it must not wait for the lock, which a slow disk holds
+        live = self._members.sessions.live(session_id)
+        if live is not None:
+            return live
         with self._lock:
             return self._members.sessions.get(session_id)
 
@@ -254,13 +257,11 @@ class FusionEngine:
 
         An empty `selected` deletes none. Raises QuotaError, StorageError.
         """
-        with self._lock:
-            self._keyframes.add(keyframe, selected)
+        self._keyframes.add(keyframe, selected)
 
     def encoded_keyframe(self, agent_id: str, index: int | None = None) -> tuple[bytes, tuple[int, ...]]:
         """Return a keyframe of the agent (see KeyframePool.find) and the indices of all. Raises InvalidInputError."""
-        with self._lock:
-            return self._keyframes.find(agent_id, index), self._keyframes.indices(agent_id)
+        return self._keyframes.find(agent_id, index), self._keyframes.indices(agent_id)
 
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""
@@ -317,8 +318,7 @@ class FusionEngine:
         """Return the fused map, all agents' keyframes, and the map's revision. Raises MismatchError if one is empty."""
         # before the map is read: what changes meanwhile counts as changed
         revision, gaussians = self.revision, self.maps.voted_map().gaussians
-        with self._lock:
-            names = self._keyframes.names()
+        names = self._keyframes.names()
         encoded = self._keyframes.read(names)
         if not encoded or len(gaussians) == 0:
             raise MismatchError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -56,12 +57,14 @@ class KeyframePool:
 
     The newest keyframe is the one that was received last: the indices and the clock of an agent begin again with each
     mission. One that is received again, because its pose was corrected, keeps its place. Only indices, times and sizes
-    are in memory. Not thread-safe; FusionEngine holds a lock.
+    are in memory. Thread-safe: a change waits for the disk, a question about indices never does.
     """
 
     def __init__(self, store: FusionStore, quotas: Quotas, decode: FrameDecoder = no_decoder) -> None:
         """Raises CodecError for a damaged record, StorageError."""
         self._store, self._quotas, self._decode = store, quotas, decode
+        # held by changes; they replace an agent's keyframes as a whole
+        self._changing = Lock()
         self._stored = _in_order(store.keyframe_sizes(), store.records(ORDER_RECORD))
 
     def __len__(self) -> int:
@@ -73,20 +76,21 @@ class KeyframePool:
         An empty `selected` deletes none. Raises QuotaError if this keyframe alone exceeds a limit, StorageError.
         """
         self._quotas.require_keyframe(keyframe.index, keyframe.pixels, len(keyframe.data))
-        self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data)
-        stored = self._stored.setdefault(keyframe.agent_id, {})
-        before = stored.get(keyframe.index)
-        if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
-            del stored[keyframe.index]
-        stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data))
-        kept = self._newest_within_limits(
-            {index: own for index, own in stored.items() if not selected or index in {*selected, keyframe.index}}
-        )
-        if len(kept) < len(stored):
-            self._store.remove_keyframes(keyframe.agent_id, sorted(stored.keys() - kept.keys()))
+        with self._changing:
+            self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data)
+            stored = dict(self._stored.get(keyframe.agent_id, {}))
+            before = stored.get(keyframe.index)
+            if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
+                del stored[keyframe.index]
+            stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data))
+            kept = self._newest_within_limits(
+                {index: own for index, own in stored.items() if not selected or index in {*selected, keyframe.index}}
+            )
+            if len(kept) < len(stored):
+                self._store.remove_keyframes(keyframe.agent_id, sorted(stored.keys() - kept.keys()))
             self._stored[keyframe.agent_id] = kept
-        order = [(index, own.capture_time_ns) for index, own in kept.items()]
-        self._store.save_record(keyframe.agent_id, ORDER_RECORD, json.dumps(order).encode())
+            order = [(index, own.capture_time_ns) for index, own in kept.items()]
+            self._store.save_record(keyframe.agent_id, ORDER_RECORD, json.dumps(order).encode())
 
     def count(self, agent_id: str) -> int:
         """Return the number of keyframes of this agent."""
@@ -111,7 +115,8 @@ class KeyframePool:
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete an agent's keyframes."""
-        self._store.remove_keyframes(agent_id, sorted(self._stored.pop(agent_id, ())))
+        with self._changing:
+            self._store.remove_keyframes(agent_id, sorted(self._stored.pop(agent_id, ())))
 
     def _newest_within_limits(self, stored: dict[int, _Stored]) -> dict[int, _Stored]:
         """Return the keyframes received last that are within the limits together, in their order."""
@@ -126,15 +131,15 @@ class KeyframePool:
 
     def names(self) -> list[tuple[str, int]]:
         """Return the agent id and the frame index of all keyframes, sorted."""
-        return [(agent_id, index) for agent_id in sorted(self._stored) for index in sorted(self._stored[agent_id])]
+        return [(agent_id, index) for agent_id, own in sorted(self._stored.items()) for index in sorted(own)]
 
     def read(self, names: Iterable[tuple[str, int]]) -> list[tuple[str, bytes]]:
-        """Return the agent id and the bytes of those of these keyframes that still exist; needs no lock."""
+        """Return the agent id and the bytes of those of these keyframes that still exist."""
         found = ((agent_id, self._store.keyframe(agent_id, index)) for agent_id, index in names)
         return [(agent_id, data) for agent_id, data in found if data]
 
     def decode(self, encoded: Iterable[tuple[str, bytes]]) -> list[AgentKeyframe]:
-        """Return these keyframes decoded; needs no lock. Raises CodecError for damaged ones."""
+        """Return these keyframes decoded. Raises CodecError for damaged ones."""
         try:
             return [AgentKeyframe(agent_id, self._decode(data)) for agent_id, data in encoded]
         except GaussLiteError as error:

@@ -118,6 +118,13 @@ class SessionRegistry:
         self._store.save_record(agent_id, TOKEN_RECORD, _hash(token))
         self._token_hashes[agent_id] = _hash(token)
 
+    def live(self, session_id: str) -> SessionRecord | None:
+        """Return the session if it was opened here, and renew its lease. Any thread may call it, without the lock."""
+        session = self._sessions.get(session_id)
+        if session is not None:
+            self._renew(session.agent_id)
+        return session
+
     def get(self, session_id: str) -> SessionRecord:
         """Return the session of this id and renew its lease.
 
@@ -125,9 +132,8 @@ class SessionRegistry:
         MismatchError if a second robot with the same token has joined: an agent never uses a session after it has
         joined again, and two such robots would end each other's sessions forever.
         """
-        session = self._sessions.get(session_id)
+        session = self.live(session_id)
         if session is not None:
-            self._renew(session.agent_id)
             return session
         if (session_id, True) in self._replaced:
             raise MismatchError(f"session: {_NAME_TAKEN}")

@@ -11,7 +11,7 @@ import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from threading import RLock
+from threading import Event, RLock, Thread
 from typing import Any
 
 from gausslite.domain.errors import StorageError
@@ -26,8 +26,9 @@ RESTORE_ADVICE = (
     "(gausslite-fusion-server verify --repair STORE), and the agents send again what is missing"
 )
 _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
-# 32 MiB: smaller logs are copied into the file so often that acknowledgements wait
-_CHECKPOINT_PAGES = 8192
+_CHECKPOINT_PERIOD_S, _FREE_ROUNDS = 4.0, 3
+# 256 MiB: only where the checkpoints in the background do not keep up
+_CHECKPOINT_PAGES = 65536
 _SCHEMA = """
 CREATE TABLE voxel_updates (
     number INTEGER PRIMARY KEY, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, voxels BLOB NOT NULL);
@@ -183,6 +184,47 @@ _INSERT = "INSERT INTO voxel_updates VALUES (?, ?, ?, ?)"
 SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM voxel_updates"
 """UpdateRows."""
 _SELECT_ROWS = f"{SELECT_UPDATES} WHERE number IN (SELECT value FROM json_each(?))"  # noqa: S608
+_CHECKPOINT = "PRAGMA wal_checkpoint(PASSIVE)"
+
+
+class _Checkpoints:
+    """Copies the log into the file every few seconds, in a thread: a commit that did so would wait for the disk."""
+
+    def __init__(self, path: Path, write_lock: RLock) -> None:
+        """write_lock: held by each commit."""
+        self._path, self._write_lock = path, write_lock
+        self._is_closed, self._has_commits = Event(), False
+        self._thread = Thread(target=self._run, name="checkpoints", daemon=True)
+        self._thread.start()
+
+    def note_commit(self) -> None:
+        """Say that the log has grown."""
+        self._has_commits = True
+
+    def close(self) -> None:
+        """Wait until the thread has ended."""
+        self._is_closed.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        with contextlib.closing(connect(self._path)) as db:
+            db.execute("PRAGMA synchronous = FULL")
+            while not self._is_closed.wait(_CHECKPOINT_PERIOD_S):
+                if self._has_commits:
+                    self._has_commits = False
+                    # what fails here fails in the next commit too, which says so
+                    with contextlib.suppress(sqlite3.Error):
+                        self._copy(db)
+
+    def _copy(self, db: sqlite3.Connection) -> None:
+        """Copy the log, then what was committed meanwhile, until little is left for a moment without commits.
+
+        The log begins anew only when all of it is in the file.
+        """
+        for _ in range(_FREE_ROUNDS):
+            db.execute(_CHECKPOINT)
+        with self._write_lock:
+            db.execute(_CHECKPOINT)
 
 
 class SqliteStore(FusionStore):
@@ -210,10 +252,14 @@ class SqliteStore(FusionStore):
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
             self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
+            self._checkpoints = None if path == _IN_MEMORY else _Checkpoints(path, self._write_lock)
             self._opened = opened.pop_all()
 
     def close(self) -> None:
         """Write the log into the file and close it."""
+        if self._checkpoints is not None:
+            # before the lock, for which its thread may wait
+            self._checkpoints.close()
         with self._write_lock, self._read_lock:
             self._opened.close()
 
@@ -257,6 +303,8 @@ class SqliteStore(FusionStore):
             try:
                 yield self._writer
                 self._writer.execute("COMMIT")
+                if self._checkpoints is not None:
+                    self._checkpoints.note_commit()
             except BaseException:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+from typing import Any
+
 import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, QuotaError, SessionUnknownError
+from gausslite.domain.objects import ObjectReport
+from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
@@ -119,3 +125,27 @@ def test_every_error_message_is_one_short_line() -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(SessionUnknownError, match="join again"):
         engine.session("gone")
+
+
+def test_a_slow_disk_delays_no_question_about_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    store, begun, released = MemoryStore(), Event(), Event()
+    engine = FusionEngine(store, FusionSettings(grid=GRID, mission_id="rescue"))
+    session = engine.join("ant", ANYTHING).session
+    save = store.save_record
+
+    def save_slowly(*arguments: Any) -> None:
+        begun.set()
+        assert released.wait(60)
+        save(*arguments)
+
+    monkeypatch.setattr(store, "save_record", save_slowly)
+    report = ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ())
+    with ThreadPoolExecutor(2) as threads:
+        reported = threads.submit(engine.report_objects, session.session_id, report)
+        assert begun.wait(60)
+        try:
+            found = threads.submit(lambda: (engine.session(session.session_id), engine.mission_config.mission_id))
+            assert found.result(30) == (session, "rescue")
+        finally:
+            released.set()
+        reported.result(60)

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from threading import Thread
 from unittest.mock import patch
@@ -375,6 +376,23 @@ def test_a_server_killed_while_it_creates_its_store_leaves_a_name_that_can_be_op
     alone.write_bytes(path.read_bytes())
     SqliteStore(alone).close()
     store.close()
+
+
+def test_the_log_is_copied_into_the_file_beside_the_commits_and_begins_anew(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    with patch("gausslite.fusion.sqlite_store._CHECKPOINT_PERIOD_S", 0.01), closing(SqliteStore(path)) as store:
+        written = 0
+        # below what a commit itself would copy
+        while written < 200 << 20:
+            store.save_keyframe("ant", 1, bytes(1 << 20))
+            written += 1 << 20
+            if path.with_name("store.sqlite-wal").stat().st_size < written:
+                break
+        else:
+            pytest.fail("the log has never begun anew")
+        store.save_keyframe("ant", 2, b"last")
+    with closing(SqliteStore(path)) as store:
+        assert (store.keyframe("ant", 1), store.keyframe("ant", 2)) == (bytes(1 << 20), b"last")
 
 
 def test_a_full_disk_refuses_the_message_and_keeps_earlier_ones(tmp_path: Path) -> None:
