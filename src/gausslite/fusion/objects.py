@@ -7,6 +7,7 @@ with those around them only, and the number of comparisons has a limit.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -38,6 +39,8 @@ _MIN_OVERLAP = 0.3
 _GROUP, _CROWD = 64, 1024
 """Landmarks that are compared pair by pair; in a crowd that space does not divide, only the first ones."""
 MAX_COMPARISONS = 2_000_000
+_PAIRS_AT_ONCE = 1 << 14
+_REUSE, _QUICK_S = 10.0, 0.02
 _CUT_SHARE = 1.5
 _NOUN_DISTANCE_M = 8 * MAX_OBJECT_COORDINATE_M
 """As if each noun had a space of its own."""
@@ -131,12 +134,15 @@ def _matching_pairs(landmarks: Sequence[ObjectLandmark], owner: Int64[ndarray, "
     numbers, distances = [np.zeros(0, np.int64)], [np.zeros(0)]
     for group in groups:
         later, earlier = np.tril_indices(len(group), -1)
-        i, j = group[later], group[earlier]
-        possible = (nouns[i] == nouns[j]) & (owner[i] != owner[j])
-        i, j = i[possible], j[possible]
-        distance, matches = match(i, j)
-        numbers.append((i * len(landmarks) + j)[matches])
-        distances.append(distance[matches])
+        # in small parts: an operation on a million pairs would hold the interpreter's lock for many milliseconds
+        for start in range(0, len(later), _PAIRS_AT_ONCE):
+            part = slice(start, start + _PAIRS_AT_ONCE)
+            i, j = group[later[part]], group[earlier[part]]
+            possible = (nouns[i] == nouns[j]) & (owner[i] != owner[j])
+            i, j = i[possible], j[possible]
+            distance, matches = match(i, j)
+            numbers.append((i * len(landmarks) + j)[matches])
+            distances.append(distance[matches])
     # a pair can be in several groups
     number, first = np.unique(np.concatenate(numbers), return_index=True)
     order = np.lexsort((number, np.concatenate(distances)[first]))
@@ -254,7 +260,11 @@ class TeamObjects:
 
 
 class MergedObjects:
-    """Keeps the merged objects until a report or a frame changes. Thread-safe."""
+    """Keeps the merged objects until a report or a frame changes. Thread-safe.
+
+    A merge that took more processor time than _QUICK_S is used for _REUSE times as long, whatever changes, so that
+    queries of a large team leave the processor to others.
+    """
 
     def __init__(self) -> None:
         # held while reports are merged, so that many queries at once merge once
@@ -262,15 +272,20 @@ class MergedObjects:
         self._reports: dict[str, ObjectReport] = {}
         self._frames: dict[str, Float64[ndarray, "4 4"]] = {}
         self._merged: tuple[TeamObject, ...] = ()
+        self._reused_until_s = 0.0
 
     def of(
         self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]]
     ) -> tuple[TeamObject, ...]:
         """Return `merge_objects` of these reports and frames."""
         with self._lock:
-            if not self._is_of(reports, frames):
+            if time.monotonic() >= self._reused_until_s and not self._is_of(reports, frames):
+                begin_s = time.thread_time()
                 self._merged = merge_objects(reports, frames)
                 self._reports, self._frames = reports, frames
+                spent_s = time.thread_time() - begin_s
+                if spent_s > _QUICK_S:
+                    self._reused_until_s = time.monotonic() + _REUSE * spent_s
             return self._merged
 
     def _is_of(self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]]) -> bool:
