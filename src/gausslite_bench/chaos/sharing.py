@@ -193,11 +193,22 @@ class _SharingRun:
             self.team.read()
         return time.monotonic() - begin_s
 
+    def _export(self) -> bytes:
+        """Return the fused map, also if regions still move after the last fault. Raises UnavailableError."""
+        end_s = time.monotonic() + _PROGRESS_S
+        with FusionClient(next(iter(self.servers.values())).address, deadline_s=60.0) as client:
+            while True:
+                try:
+                    return client.export(Export())
+                except UnavailableError:
+                    if time.monotonic() > end_s:
+                        raise
+                    threading.Event().wait(_POLL_S)
+
     def _finish(self, begin_s: float) -> SharingChaosResult:
         self.team.finish()
         offline = offline_map(self.team.acknowledged)
-        with FusionClient(next(iter(self.servers.values())).address, deadline_s=60.0) as client:
-            exported = client.export(Export())
+        exported = self._export()
         self._compare()
         logs = [server.log.read_text(errors="replace") for server in self.servers.values()]
         last = self.comparisons[-1]
