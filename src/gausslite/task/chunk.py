@@ -133,9 +133,9 @@ class ChunkBuffer:
         position = self.index + offset
         return self.tagged[position][0] if 0 <= position < len(self.tagged) else ""
 
-    def last_kind(self) -> ChunkKind | None:
-        """Return the kind of the latest complete chunk."""
-        return self.chunks[-1].kind if self.chunks else None
+    def last_kind(self, earlier: int = 0) -> ChunkKind | None:
+        """Return the kind of the latest complete chunk, or of an earlier one."""
+        return self.chunks[-1 - earlier].kind if len(self.chunks) > earlier else None
 
     def last_verb(self) -> str:
         """Return the latest verb of the sentence so far; empty without one."""

@@ -24,6 +24,9 @@ from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
 
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
+_OBJECT_TAGS: Final = OBJECT_START_TAGS | {Tag.PRONOUN, Tag.ANAPHOR}
+_NAMING: Final = word_set("label mark name call tag")
+_PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
 _MODIFIED_TAGS: Final = frozenset({Tag.NOUN, Tag.PARTICIPLE})
 
 
@@ -34,6 +37,7 @@ class VerbChunker:
         self._buffer = buffer
         self._after_modal = False
         self._relative_chunk: int | None = None
+        self.describes = False
 
     def relative(self, word: str) -> None:
         """Remember where a relative clause starts."""
@@ -48,11 +52,12 @@ class VerbChunker:
         continues = buffer.tag(-1) is Tag.RELATIVE and buffer.last_kind() is ChunkKind.CONJUNCTION  # "and which has"
         if (
             word in HAVE_FORMS
-            and (continues or buffer.last_kind() is ChunkKind.NOUN)
+            and (continues or buffer.last_kind() is ChunkKind.NOUN or (self.describes and buffer.word(-1) == "it"))
             and buffer.tag(1) in OBJECT_START_TAGS
         ):
             buffer.emit_preposition("near", current_place=True)
-        self._after_modal = is_modal(buffer.tagged, buffer.index) and buffer.last_kind() is ChunkKind.NOUN
+        if word != "be":  # "should be moved to the bench"
+            self._after_modal = is_modal(buffer.tagged, buffer.index) and buffer.last_kind() is ChunkKind.NOUN
 
     def verb(self, word: str) -> None:
         """Emit an instruction; a verb of a subordinate clause relates its object to its subject."""
@@ -74,11 +79,20 @@ class VerbChunker:
         elif is_required and self._subject_is_object():
             if base in verbs.BELONGING_VERBS:
                 buffer.emit(ChunkKind.SUBJECT_VERB, base)
+        elif (
+            base in verbs.BELONGING_VERBS
+            and word.startswith(base)
+            and subject in (Tag.NOUN, Tag.INDEFINITE, Tag.ANAPHOR, Tag.PARTICIPLE)
+            and not is_command(tagged, index)
+        ):
+            buffer.emit(ChunkKind.SUBJECT_VERB, base)
+        elif subject is Tag.CONJUNCTION and word != base and buffer.last_kind(1) is ChunkKind.NOUN:
+            buffer.chunks.pop()  # "which is near the window and opens to the hall"
+            if buffer.tag(1) in _OBJECT_TAGS:
+                self._subordinate_verb(base)
         elif subject not in SUBJECT_TAGS or is_wish or is_command(tagged, index):
             buffer.emit(ChunkKind.VERB, base)
-        elif base in verbs.BELONGING_VERBS and word.startswith(base) and subject not in (Tag.PRONOUN, Tag.RELATIVE):
-            buffer.emit(ChunkKind.SUBJECT_VERB, base)
-        elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.INDEFINITE) and buffer.tag(1) in OBJECT_START_TAGS | {Tag.PRONOUN}:
+        elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.INDEFINITE) and buffer.tag(1) in _OBJECT_TAGS:
             self._subordinate_verb(base)
         else:
             buffer.close()
@@ -102,6 +116,10 @@ class VerbChunker:
             buffer.close()  # "a cloth for wiping the table"
             if after in OBJECT_START_TAGS:
                 buffer.emit_preposition("purpose")
+        elif before is Tag.NOUN and verbs.base_of_ing(word) in _PASSING and verbs.verb_base(buffer.last_verb()) in verbs.GO_VERBS:
+            buffer.emit(ChunkKind.VERB, verbs.verb_base(word) or word)  # "walk along the hall keeping the wall"
+        elif before is Tag.CONJUNCTION and verbs.base_of_ing(word) in verbs.RESTING_VERBS and after is Tag.PREPOSITION:
+            buffer.chunks.pop()  # "the wrench, lying beside the toolbox"
         elif buffer.words or before in (Tag.NOUN, Tag.INDEFINITE, Tag.AUXILIARY, Tag.RELATIVE):
             self._gerund_after_noun(after)
         else:
@@ -119,8 +137,11 @@ class VerbChunker:
             buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
         elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
             pass  # "the coffee went cold"
-        elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN:
-            buffer.chunks.pop()  # "the toy my son dropped": the son is irrelevant
+        elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN and before is not Tag.AUXILIARY:
+            if verbs.base_of_ed(word) in _NAMING:
+                buffer.emit_preposition("purpose")  # "the drum labelled acid"
+            else:
+                buffer.chunks.pop()  # "the toy my son dropped": the son is irrelevant
         self._after_modal = False
 
     def _negated_verb(self, base: str) -> None:
@@ -133,7 +154,7 @@ class VerbChunker:
         """Remove the subject of a relative clause: the wife in "the mug (that) my wife uses"."""
         buffer = self._buffer
         buffer.close()
-        adjacent = buffer.determiner_at > 0 and buffer.tagged[buffer.determiner_at - 1][1] is Tag.NOUN
+        adjacent = buffer.determiner_at > 0 and buffer.tag(-1) is not Tag.RELATIVE and buffer.tagged[buffer.determiner_at - 1][1] is Tag.NOUN
         if finite and adjacent and [chunk.kind for chunk in buffer.chunks[-2:]] == [ChunkKind.NOUN, ChunkKind.NOUN]:
             buffer.chunks.pop()
         if self._relative_chunk is not None and self._relative_chunk == len(buffer.chunks) - 1:
@@ -215,7 +236,7 @@ class _Chunker:
         for index, (word, tag) in enumerate(buffer.tagged):
             buffer.index = index
             previous, clause = clause, self._clause_types.get(index, clause)
-            self._is_statement = clause is ClauseType.STATEMENT
+            self._is_statement = self._verbs.describes = clause is ClauseType.STATEMENT
             starts_request = previous is ClauseType.STATEMENT or self._starts_question(index)
             if tag is Tag.CONJUNCTION and clause is ClauseType.REQUEST and starts_request:
                 tag = Tag.CLAUSE_BREAK
@@ -239,6 +260,9 @@ class _Chunker:
         buffer = self._buffer
         if buffer.tag(-1) is Tag.NEGATION and buffer.last_kind() is ChunkKind.NOT_UNDERSTOOD:
             return  # "that is not rotten"
+        if buffer.last_kind() is ChunkKind.CONJUNCTION and buffer.last_kind(1) is ChunkKind.ATTRIBUTE:
+            if buffer.tag(-1) is Tag.CONJUNCTION and buffer.tag(1) not in NOUN_PHRASE_TAGS:
+                return  # "it is white and oval"
         # "the red and blue mugs": a lone adjective shares the noun of the next phrase
         if not buffer.words and buffer.last_kind() is ChunkKind.CONJUNCTION and len(buffer.chunks) >= 2:
             before = buffer.chunks[-2].noun
@@ -357,7 +381,8 @@ class _Chunker:
             if relation in _ROUTE_RELATIONS and buffer.chunks[-1].word in verbs.GO_VERBS:
                 buffer.emit_preposition("via", word)
             return
-        in_modifier = before is Tag.GERUND or buffer.tag(-2) is Tag.RELATIVE
+        is_finite = before is Tag.VERB and verbs.base_of_s(buffer.word(-1)) is not None  # "which door leads to"
+        in_modifier = before is Tag.GERUND or buffer.tag(-2) is Tag.RELATIVE or is_finite
         buffer.close()
         if relation == "to" and buffer.last_kind() is ChunkKind.NOUN:
             if in_modifier:
@@ -367,7 +392,8 @@ class _Chunker:
         if after is Tag.PREPOSITION or (after is Tag.GERUND and word in ("for", "by", "before", "after")):
             buffer.close()
             return
-        buffer.emit_preposition(relation, text, before in _LOCATION_TAGS, bounds)
+        is_required = buffer.last_kind() is ChunkKind.SUBJECT_VERB  # "should be stacked against the wall"
+        buffer.emit_preposition(relation, text, before in _LOCATION_TAGS and not is_required, bounds)
 
     def _particle(self, word: str) -> None:
         buffer = self._buffer

@@ -11,7 +11,7 @@ from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
 from gausslite.task.roles import RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
-from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS, PLACE_VERBS, SPEAKING_VERBS
+from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS, LEAVING_VERBS, PLACE_VERBS, SPEAKING_VERBS, TRAVEL_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is
@@ -22,6 +22,7 @@ _SPACE_PREPOSITIONS = frozenset(
 _PICTURING_VERBS = frozenset(
     {"take", "make", "get", "capture", "shoot", "draw", "snap", "record", "want", "need", "see"}
 )
+_THOSE_THERE = [ChunkKind.DEMONSTRATIVE, ChunkKind.PREPOSITION]
 _ADDRESSED_ROBOTS = (("drone",), ("rover",))
 
 
@@ -45,10 +46,11 @@ class GraphBuilder:
         self._avoids = False  # the negation itself means contact: "avoid touching"
         self._corrects = False
         self._negated_objects: list[str] = []
-        self._partitive: tuple[NounPhrase, str | None] | None = None  # "the largest" of "the largest of the boxes"
+        self._partitive: tuple[NounPhrase, str | None, bool] | None = None  # "the largest" of "the largest of the boxes"
         self._described: str | None = None  # the latest object, which an attribute may describe
         self._adjectives: list[NounPhrase] = []
         self._plurals: set[str] = set()
+        self._after_preposition: dict[str, list[str]] = {}  # the latest noun after each preposition
         self._following: Sequence[Chunk] = ()
 
     def add(self, before: Chunk | None, chunk: Chunk, following: Sequence[Chunk]) -> None:
@@ -136,7 +138,9 @@ class GraphBuilder:
         """Return True if "leave" excludes its object, as in "take the cups and leave the plates"."""
         rest = [chunk.kind for chunk in self._following if chunk.kind not in (ChunkKind.NOUN, ChunkKind.CONJUNCTION)]
         named = bool(self._following) and self._following[0].kind is ChunkKind.NOUN
-        contrasts = named and self._following[0].word in ("one", "ones")  # "leave the green ones on the vine"
+        # "leave the green ones on the vine", "leave those in the pots"
+        kinds = [chunk.kind for chunk in self._following[:2]]
+        contrasts = (named and self._following[0].word in ("one", "ones")) or kinds == _THOSE_THERE
         if contrasts or (named and before is not None and before.word == "but"):
             return True  # "but leave the plates on the table"
         return named and (not rest or rest[0] in (ChunkKind.CLAUSE_BREAK, ChunkKind.VERB))
@@ -164,10 +168,12 @@ class GraphBuilder:
         if not same_negation and clause_has_nouns:
             self._new_clause(chunk.word)
         else:
+            self._assigner.leave_context()
             self._clause.verb, self._clause.crosses = chunk.word, False
 
     def _new_clause(self, verb: str | None) -> None:
-        self._assigner.end_clause(verb)
+        next_verb = verb or next((chunk.word for chunk in self._following if chunk.kind is ChunkKind.VERB), None)
+        self._assigner.end_clause(verb, next_verb)
         self._pending = None
 
     @property
@@ -199,13 +205,20 @@ class GraphBuilder:
             named = (clause.objects or clause.referents)[-1:]
             if pending is not None and named:
                 self._place_negated(phrase_from_text(named[0]), pending)
+            elif pending is None and clause.objects:
+                for phrase in filter(self._draft.is_from_statement, clause.referents):
+                    self._draft.exclude(phrase)  # "I'm allergic to nuts, bring a snack without them"
             return
         if pending is None:
             clause.objects = clause.objects or list(clause.referents)
             self._described = next(reversed(clause.objects), self._described)
             if not clause.statement:
                 clause.by_pronoun = bool(clause.verb and clause.objects)
-                self._draft.confirm_targets(clause.objects)
+                self._draft.confirm_targets(clause.objects, self._assigner.role_of_object(""))
+            return
+        if clause.verb in TRAVEL_VERBS and not clause.objects and clause.referents:
+            for phrase in clause.referents:
+                self._assigner.assign_by_preposition(pending, phrase_from_text(phrase))
             return
         named, subjects = (clause.objects[:-1], clause.objects[-1:]) if clause.conjoined else (
             clause.referents or self._draft.targets[-2:-1], clause.objects
@@ -223,8 +236,10 @@ class GraphBuilder:
         if self._negated:
             self._negate_latest()
             return
-        if self._clause.verb is None and self._pending is None:
-            return
+        names_more = self._pending is None and after is not None and after.kind is ChunkKind.PREPOSITION
+        left = self._clause.verb in LEAVING_VERBS and bool(self._draft.context)  # "you are in a kitchen. leave it"
+        if left or (self._clause.verb is None and self._pending is None) or (names_more and self._clause.objects):
+            return  # "the tiles, especially those behind the toilet"
         self._draft.unnamed = self._draft.unnamed or word
         if self._pending is None:
             self._noun(before, phrase_from_text("object"), after)
@@ -235,13 +250,17 @@ class GraphBuilder:
             return
         conjoined = before is not None and before.kind is ChunkKind.CONJUNCTION
         self._clause.is_alternative = conjoined and before is not None and before.word == "or"
-        if conjoined and self._corrects and self._clause.nouns_since_negation:
-            self._negated = False  # "not the wooden spoon, the metal one"
+        contrasts = self._corrects or (before is not None and before.word == "but")
+        if conjoined and contrasts and self._clause.nouns_since_negation:
+            self._negated = False  # "not the wooden spoon, the metal one", "not the red one but the blue one"
         if noun.head in ("one", "ones"):
             if self._negated and len(noun.words) == 1:
                 self._negate_latest()  # "this mug, not that one"
                 return
             noun = self._resolve_one(noun)
+        excepts = after is not None and after.kind is ChunkKind.NEGATION and noun.text == "object"
+        if excepts and conjoined and self._clause.objects and self._pending is None:
+            return  # "bring me a snack, anything but chips"
         pending, self._pending = self._pending, None
         is_picture = bool(self._described) and (self._described or "").split()[-1] in lexicon.PICTURES
         if pending == "of" and not self._clause.skip_of_phrase and is_picture:
@@ -257,11 +276,11 @@ class GraphBuilder:
         ):
             noun = phrase_from_text(longer[0])  # "take the alarm clock and look at the clock"
         if self._partitive is not None and pending in (None, "of"):
-            (superlative, pending), self._partitive = self._partitive, None
+            (superlative, pending, conjoined), self._partitive = self._partitive, None
             noun = NounPhrase((*superlative.words, *noun.words), True)
         of_follows = after is not None and after.kind is ChunkKind.PREPOSITION and after.word == "of"
         if adjectives_only(noun.words) and not (of_follows and noun.head in lexicon.PLACES):
-            self._lone_adjectives(noun, pending, after)
+            self._lone_adjectives(noun, pending, conjoined, after)
             return
         if not _names_object(noun, pending, self._following, self._clause.verb):
             self._skip_noun(noun, pending, conjoined, after)
@@ -282,29 +301,33 @@ class GraphBuilder:
             if self._negated:
                 self._exclude(listed, pending)
             else:
+                if pending is not None and not lexicon.is_space(listed.words):
+                    self._after_preposition[self._clause.preposition] = [listed.text]
                 self._assigner.assign(listed, pending, conjoined, self._following)
                 self._described = listed.text
                 if self._alternative is not None:
                     self._assigner.assign_by_preposition(self._alternative, listed)
         self._alternative = None
 
-    def _lone_adjectives(self, noun: NounPhrase, pending: str | None, after: Chunk | None) -> None:
+    def _lone_adjectives(self, noun: NounPhrase, pending: str | None, conjoined: bool, after: Chunk | None) -> None:
         """Handle adjectives without a noun: "the red" and blue mugs, "the largest" of the boxes."""
         before_noun = after is not None and (after.kind is ChunkKind.NOUN or after.word == "of")
         if [chunk.kind for chunk in self._following[:2]] == [ChunkKind.CONJUNCTION, ChunkKind.NOUN]:
             self._adjectives.append(noun)
+        elif is_attribute(noun.head) and before_noun:
+            self._partitive = noun, pending, conjoined
         elif any(word in SUPERLATIVES for word in noun.words) and self._described is not None:
             self._describe(" ".join(word for word in noun.words if is_attribute(word)), negated=False)
-        elif is_attribute(noun.head) and before_noun:
-            self._partitive = noun, pending
 
     def _resolve_one(self, one: NounPhrase) -> NounPhrase:
         """Return the phrase with the latest object's noun in place of "one": "the blue one"."""
         clause = self._clause
         # "with the blue cloth, not with the yellow one"
-        replaced = clause.places if self._pending is not None and clause.terms.negated else []
+        replaced = clause.places if (self._pending and clause.terms.negated) or clause.last_relation == "with" else []
+        replaced = replaced or self._after_preposition.get(clause.preposition if self._pending else "", [])
         named = replaced or clause.objects or clause.referents or self._draft.targets or self._draft.excluded
-        named = named or ["object"]
+        ahead = [chunk.noun.text for chunk in self._following if chunk.noun and chunk.noun.head not in ("one", "ones")]
+        named = named or (ahead[:1] if self._negated else []) or ["object"]
         *adjectives, head = named[-1].split()
         nouns = [*(word for word in adjectives if not adjectives_only((word,))), head]
         same = phrase_from_text(" ".join(nouns))

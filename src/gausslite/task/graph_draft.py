@@ -97,9 +97,9 @@ class GraphDraft:
         """Return True if only a statement has named this object so far."""
         return phrase in self._statement_nouns
 
-    def confirm_targets(self, phrases: Sequence[str]) -> None:
+    def confirm_targets(self, phrases: Sequence[str], role: TargetRole = TargetRole.OBJECT) -> None:
         """Make objects of a statement full targets, because a later "it" refers to them."""
-        self.roles.update(dict.fromkeys(self._statement_nouns.intersection(phrases), TargetRole.OBJECT))
+        self.roles.update(dict.fromkeys(self._statement_nouns.intersection(phrases), role))
         self._statement_nouns.difference_update(phrases)
 
     def add_relation(self, terms: RelationTerms, targets: Sequence[str], anchor: str) -> None:

@@ -293,7 +293,7 @@ _IRREGULAR: Final = dict(
 )
 # words that singular() returns unchanged: plural in form only, or singular with a final s
 UNCHANGED: Final = word_set(
-    "scissors glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
+    "scissors forceps glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
     "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species thermos "
     "asbestos christmas canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls tights "
     "leggings clippers shears remains goods supplies premises outdoors upstairs downstairs"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from gausslite.domain.nouns import is_thing
 from gausslite.task import lexicon
 from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind
 from gausslite.task.clause_types import INABILITIES, WISHES
@@ -85,7 +86,7 @@ def _follows_noun_of_state(buffer: ChunkBuffer) -> bool:
 def _is_state(buffer: ChunkBuffer) -> bool:
     """Return True for an unknown word in "that is not rotten", unlike "that are not chairs"."""
     word = buffer.word(1)
-    return buffer.tag(1) is Tag.NOUN and word not in lexicon.NOUNS and singular(word) == word
+    return buffer.tag(1) is Tag.NOUN and word not in lexicon.NOUNS and singular(word) == word and not is_thing(word)
 
 
 def _opens_question(buffer: ChunkBuffer) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
+from gausslite.domain.nouns import is_thing
 from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon, verbs
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, phrase_from_text
@@ -45,7 +46,7 @@ class RoleAssigner:
         """Change the description of an object that the sentence has named."""
         self._relations.rename(phrase, new)
 
-    def end_clause(self, verb: str | None) -> None:
+    def end_clause(self, verb: str | None, next_verb: str | None) -> None:
         """Start another clause. The places of a clause without objects ("look under the bed") become targets.
 
         In "in the kitchen, find the mug" the place belongs to the following clause.
@@ -54,7 +55,7 @@ class RoleAssigner:
         if self._searches_for_referent():
             self._search_places_for_referents(before)
         elif not before.statement:  # "walk between the columns and stop at the altar"
-            self._make_places_targets(passes=before.verb in _PASSING_VERBS and verb in verbs.TRAVEL_VERBS)
+            self._make_places_targets(passes=before.verb in _PASSING_VERBS and next_verb in verbs.TRAVEL_VERBS)
         self._relations.clause = Clause(verb=verb, referents=before.objects or before.referents)
         self.clause.pending_places, self.clause.follows_statement = before.pending_places, before.statement
 
@@ -78,6 +79,15 @@ class RoleAssigner:
         if self.clause.verb is not None:
             self._make_places_targets()
 
+    def leave_context(self) -> None:
+        """Make rooms and places before the verb context: "on the second floor, go to the office"."""
+        places, self.clause.pending_places = self.clause.pending_places, []
+        for terms, noun in places:
+            if terms.relation == "inside" and lexicon.is_space(noun.words):
+                self._draft.add_context(noun.text)
+            else:
+                self.clause.pending_places.append((terms, noun))
+
     def _make_places_targets(self, passes: bool = False) -> None:
         pending_places, self.clause.pending_places = self.clause.pending_places, []
         going = self.clause.verb in verbs.TRAVEL_VERBS
@@ -100,7 +110,7 @@ class RoleAssigner:
             elif self._is_recipient(following):
                 self._add_destination(noun)
             else:
-                self.target(noun, self._role_of_object(noun.head), conjoined and clause.last_relation is None)
+                self.target(noun, self.role_of_object(noun.head), conjoined and clause.last_relation is None)
             return
         self.assign_by_preposition(pending, noun, following)
         clause.describes = clause.preposition in ("with", "near", "without") and not noun.is_definite
@@ -125,6 +135,8 @@ class RoleAssigner:
         if pending in handlers:
             handlers[pending](noun)
         elif pending == "when":
+            if clause.verb in verbs.GO_VERBS | {"turn"} and noun.has_determiner and is_thing(noun.head):
+                self._assign_waypoint(noun)  # "turn right after the painting"
             return
         elif pending == "purpose":
             self._assign_path_end(noun)
@@ -172,6 +184,11 @@ class RoleAssigner:
             return
         if clause.verb in verbs.TRAVEL_VERBS:
             self.reach_places()  # "stop at the shelf with the boxes"
+            if not clause.objects and noun.is_definite:
+                self._assign_waypoint(noun)  # "walk on with the railing on your left"
+                return
+        if clause.verb is None and clause.pending_places and lexicon.is_space(clause.pending_places[-1][1].words):
+            return  # "in the room with the fireplace, dust"
         if not clause.objects and clause.verb is None and not clause.terms.negated:
             clause.pending_places.append((clause.terms, noun))  # "with a sponge, wipe the table"
         elif (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
@@ -232,8 +249,9 @@ class RoleAssigner:
     def _is_destination(self, pending: str, following: Sequence[Chunk]) -> bool:
         """Return True if the preposition states where to put the objects: "put the mug on the desk"."""
         clause = self.clause
-        if clause.by_pronoun and clause.verb in verbs.DELIVERY_VERBS and pending in _DESTINATION_RELATIONS:
-            return True
+        moved = clause.verb not in verbs.LOOKING_VERBS | verbs.TOOL_VERBS | verbs.FETCHING_VERBS
+        if clause.by_pronoun and moved and not clause.statement and pending in _DESTINATION_RELATIONS:
+            return True  # "and line them up on the shelf"
         pushes = clause.verb in verbs.PUSHING_VERBS and bool(clause.objects)
         if pushes and clause.preposition.startswith(("to the ", "on to")):
             return True  # "move the mug to the left of the plate"
@@ -308,7 +326,7 @@ class RoleAssigner:
         clause = self.clause
         while len(following) > 1 and following[0].kind is ChunkKind.PREPOSITION and following[1].kind is ChunkKind.NOUN:
             following = following[2:]  # "bring the man in the wheelchair a drink"
-        follows = bool(following) and following[0].kind is ChunkKind.NOUN
+        follows = bool(following) and following[0].kind is ChunkKind.NOUN and following[0].word not in lexicon.PLACES
         return follows and clause.verb in verbs.GIVING_VERBS and not clause.objects
 
     def _is_final_place(self, pending: str, following: Sequence[Chunk]) -> bool:
@@ -331,7 +349,7 @@ class RoleAssigner:
             return True
         return noun.head in lexicon.COMMON_ANCHORS and self.clause.last_relation not in ("on", "inside", "with")
 
-    def _role_of_object(self, head: str) -> TargetRole:
+    def role_of_object(self, head: str) -> TargetRole:
         """Return the role of a verb's direct object."""
         if self.clause.verb in verbs.AVOIDING_VERBS:
             return TargetRole.OBSTACLE
@@ -404,7 +422,7 @@ class RoleAssigner:
     def _assign_after_of(self, noun: NounPhrase) -> None:
         clause = self.clause
         if not clause.objects and not clause.pending_places:
-            self.target(noun, self._role_of_object(noun.head))
+            self.target(noun, self.role_of_object(noun.head))
         elif lexicon.is_space(noun.words):
             self._draft.add_context(noun.text)
         elif clause.last_relation in ("to", "with") and clause.places:

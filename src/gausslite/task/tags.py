@@ -165,6 +165,10 @@ _FINITE: Final = word_set("is are was were has have can will")
 _THE: Final = _ARTICLES | word_set("this these those his her its our their")
 _OPENERS: Final = frozenset({"", ",", ".", ";", "and", "then"})
 _TURNS: Final = word_set("left right around back up down forward backward straight here there")
+_BELONG: Final = word_set("go belong")
+_MODIFIER_ENDINGS: Final = ("ing", "ed")
+_VERB_PARTICLES: Final = word_set("off up out away down")
+_RELATIVES: Final = word_set("which that who")
 _POSSESSIVES: Final = ("'s", "s'")
 _NOUNS: Final = lexicon.NOUNS | lexicon.PLACES | lexicon.ROUTES | lexicon.MEASURES | lexicon.PARTS | lexicon.ADDRESSEES
 _ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most")
@@ -192,8 +196,9 @@ _CLOSED: Final[dict[str, Options]] = (
 def tag_words(units: Sequence[str]) -> list[tuple[str, Tag]]:
     """Return the words with their part-of-speech tags; adverbs are dropped, because no graph needs them."""
     kept = [unit for unit in units if not is_adverb(unit)]
-    neighbours = zip(["", *kept], kept, [*kept[1:], ""], strict=False)
-    return list(zip(kept, best_tags([_tag_options(*three) for three in neighbours]), strict=True))
+    later = (kept[at + 2 : at + 4] if kept[at + 1 : at + 2] != ["the"] else [] for at in range(len(kept)))
+    neighbours = zip(["", *kept], kept, [*kept[1:], ""], later, strict=False)
+    return list(zip(kept, best_tags([_tag_options(*four) for four in neighbours]), strict=True))
 
 
 def is_adverb(word: str) -> bool:
@@ -206,7 +211,7 @@ def is_adverb(word: str) -> bool:
     )
 
 
-def _tag_by_neighbours(before: str, word: str, after: str) -> Tag | None:
+def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str]) -> Tag | None:
     """Return the tag that a word can only have between these neighbours; None if others are possible."""
     opens, is_place, is_open = before in _OPENERS, after in PREPOSITIONS, word not in _CLOSED
     ends = not after or is_place or after == "and"
@@ -220,27 +225,34 @@ def _tag_by_neighbours(before: str, word: str, after: str) -> Tag | None:
         or (opens and word in _MOTIONS and (is_place or after in _TURNS))
         or (word in verbs.PLACE_VERBS and before in ("and", "then") and is_place)
         or (opens and is_open and word in verbs.VERBS and after in lexicon.DETERMINERS)
-        or (opens and is_open and after in _THE and not is_english(word))  # "compost the apple"
+        or (opens and is_open and after in _THE and not word.endswith(_MODIFIER_ENDINGS))  # "fluff the pillow"
+        or (opens and word in verbs.VERBS and after in _VERB_PARTICLES)  # "switch off"
+        or (word in _BELONG and is_place and verbs.base_of_ed(before) is not None)  # "that were washed go in"
+        or (before in _RELATIVES and is_place and verbs.base_of_s(word) is not None)  # "which stands on"
         or (before == "you" and is_open and after in lexicon.DETERMINERS)
     )
-    named = is_thing(f"{word} {singular(after)}") or (before in _BEFORE_NAMES and _is_noun(after))
+    named = is_thing(f"{word} {singular(after)}") or is_thing(f"{before} {word}") or (before in _BEFORE_NAMES and _is_noun(after))
     waits = opens and word in verbs.STOPPING_VERBS and _is_noun(after) and after not in _CLOSED
     rules = {
         Tag.VERB: commands,
-        Tag.ADJECTIVE: (word, after) in lexicon.COMPOUND_OPENERS,
+        # "clean socks go in the drawer"
+        Tag.ADJECTIVE: (word, after) in lexicon.COMPOUND_OPENERS
+        or (opens and _BELONG.intersection(later) and _describes(word) and word in verbs.VERBS),
         Tag.ANAPHOR: word == "that" and not after,
         Tag.RELATIVE: word == "that" and not opens and after in _FINITE,
         Tag.CLAUSE_BREAK: word == "before" and after in _SUBJECTS,
-        Tag.NOUN: waits or (word.endswith("ing") and named) or (word == "half" and after == "of"),  # "stand lamp"
-        Tag.GERUND: before == "without" and verbs.base_of_ing(word) is not None,
+        Tag.NOUN: waits
+        or (opens and is_open and after in _BELONG and singular(word) != word)  # "drinks go on the shelf"
+        or (word.endswith("ing") and named) or (word == "half" and after == "of"),  # "stand lamp"
+        Tag.GERUND: before in ("without", *_BE) and verbs.base_of_ing(word) is not None,
         Tag.PRONOUN: word == "one" and after in _MODALS_AFTER_ONE,
         Tag.DETERMINER: word == "one" and after == "of",
     }
     return next((tag for tag, holds in rules.items() if holds), None)
 
 
-def _tag_options(before: str, word: str, after: str) -> Options:
-    forced = _tag_by_neighbours(before, word, after)
+def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Options:
+    forced = _tag_by_neighbours(before, word, after, later)
     if forced is not None:
         return {forced: 0}
     closed = _CLOSED.get(split_bounds(word)[0])

@@ -122,18 +122,23 @@ _PLAIN: Final = {
     # short forms
     r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
     r"(you|we|they)'re": r"\1 are",
+    r"i'm(?= \w+ (?:to|of|with)\b)": "i am",
     r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
+    r"gets(?= \w+(?:ed|en|wn)\b)": "should be",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
+    r"(i|you|we) last(?= \w)": r"\1",
     r"^whose": "the",
-    r"with (?:its|their|the) backs? (?:to|against)": "near",
+    r"(?:with|has|have) (?:its|their|the) backs? (?:to|towards?|facing|against)": "near",
     r"the (?:one|object|thing) (?:that )?(?:i|we|you) (?:want|need|mean|(?:am |are )?look(?:ing)? for) is": "it is",
     r"belonging to": "of",
     r"^the (?:target|goal|object|item)(?: object)? is": "this is",
     # "a cabinet, above it is a lamp"
     rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
     r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
-    rf"(?:which|what) ([\w ]{{2,40}}?) (?:is|are) ([\w ]{{2,40}}?) ({_PLACED})$": r"find the \1 and \2 \3 the \1",
+    rf"^(?:which|what) ([\w ]{{2,40}}?) (?:is|are|(?:did|do|does|has|have|can) \w+ \w+) ([\w ]{{2,40}}?) (?:\w+ing )?({_PLACED}|against)$": (
+        r"find the \1 and \2 \3 the \1"
+    ),
     # a viewpoint: before the description its object may be meant, after it not
     r"(?:(?:if |when |while |as )?(?:you (?:are )?)?(?:facing|looking at)|(?:if|when|as) you (?:face|look at)) "
     r"([\w ]{2,40}),(?: (?:it|that) is)?": r"there is \1;",
@@ -147,13 +152,13 @@ _PLAIN: Final = {
     r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor (on|in|inside|under|near|behind|at|above)": (
         r"not \1 \2 and not \3"
     ),
-    r"(stop|wait|halt|pause)(?: just| right| shortly)? (?:(?:before|after|past)(?= (?:the|an?|that|this) )"
+    rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? (?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
     r"|(?:before|when|once|after) you (?:get to|reach|come to|arrive at|hit))": r"\1 at",
     r"^not (the \w+)( [^,.;]+?),? but the one( [^,.;]+)": r"\1\3, not the one\2",
     r"out of the way of": "away from",
-    r"(?:behind|in front of|ahead of|beside|next to) you(?! \w+ing)": "",
+    r"(one|two|three) (?:by|at a) (?:one|two|three|time)|side by side": "",
     r"(stop|wait|halt)(?: walking| moving)? (?:once|when|after|as soon as) you(?: are| have)?": r"\1",
-    r"(?:and|but) (is|are|has)(?= (?:not|no|on|in|an?)\b)": r"and which \1",
+    r"(?:and|but) (?:(is|are)(?= (?:not|no|on|in|an?)\b)|(?:it )?(has))": r"and which \1\2",
     r"but (the [\w ]+?) (?:should|must|can|has to) (?:stay|remain)(?: \w+)*": r"but do not touch \1",
     r"nothing (?:but|except|other than)": "",
     r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)": "",
@@ -163,6 +168,7 @@ _PLAIN: Final = {
     r"(?:until|till|so that|so) (the|an?) ([\w ]{2,30}?) is(?= (?:on|to|at) your| behind you| in front of you)": (
         r"and pass \1 \2"
     ),
+    r"(?:behind|in front of|ahead of|beside|next to) you(?! \w+ing)": "",
     r"with your (?:back|left|right)(?: side)? (?:to|towards?|against) (.{2,40}?),": r"pass \1;",
     r"so(?: that)? you(?: are)? fac(?:e|ing)": "; face",
     r"(?:is |are )?made (?:out )?of (?:(?:solid|dark|light) )?\w+": "",
@@ -185,7 +191,8 @@ _PLAIN: Final = {
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
         "handle"
     ),
-    r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)": "i see",
+    r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)|"
+    r"(?:^|(?<=[.;,] ))you (?:will )?(?:see|find|notice)": "i see",
     r"back(?= where\b)": "",
     r"(?:so|as|very|quite|too) well": "",
     r"reach(?:ing)? for": "grab",
@@ -210,13 +217,14 @@ _PLAIN: Final = {
     rf"(?:keep|stay|remain) (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
     r"not (?:\w+ )?far (?:away )?from": "near",
     r"(?:farthest|furthest|most distant) away(?! from)|most distant(?! from)": "farthest",
-    r"(?:\w+ (?:floor|level|story))(?= (?:\w+room|kitchen|office|hallway)\b)": "",
+    r"(\w+) number (?:\d+|one|two|three|four|five)": r"\1",
+    rf"(?:\w+ (?:floor|level|story))(?= (?:\w+room|{'|'.join(lexicon.ROOMS)})\b)": "",
     r"(?:level|floor|storey) (?:one|two|three|four|\d)": "storey",
     r"around the (?:corner|bend)(?! of)": "",
     r"(?:is|are|am|have run|has run|ran)(?: almost)? out of (?!the\b|my\b)\w+": "is empty",
     r"(?:^|(?<=[,;.] )|(?<=and )|(?<=then ))plug in(?= (?:the|my|an?)\b)": "activate",
     r"until you (?:see|find|spot|notice|come to|get to|hit)": "until you reach",
-    r"(?:ground|first|second|third|fourth|top|upper|lower|next|\d+(?:st|nd|rd|th)) (?:floor|level)\b"
+    r"(?:ground|first|second|third|top|upper|lower|next|\w+th|\d+(?:st|nd|rd)) (?:floor|level)\b"
     r"(?! (?:tile|lamp|mat|plan|board))": "storey",
     r"(\w+)-colou?red": r"\1",
     r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
@@ -285,14 +293,14 @@ _BY_RELATION: Final = {
     "in reach of|within reach of|leaning on|leaning against|at the end of|at the head of|at the foot of|at the base of|"
     "at the edge of|on either side of|on both sides of|within arm's reach of|within easy reach of|tied to|"
     "chained to|hooked to|leashed to|plugged into|propped against|resting against",
-    "closer": "closer to",
+    "closer": "closer to|nearer to",
     "on": "on|all over|scattered over|spread over|on top of|upon|atop|resting on|on the top of|at the top of|"
     "on the surface of|mounted on|on to|on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|"
     "nailed to|screwed to|bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|"
     "mounted to|hung up on|hanging off",
     "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
     "farthest_from": "farthest from|furthest from|farthest to|farthest away from|furthest away from|"
-    "most distant from|furthest to",
+    "most distant from|furthest to|further from|farther from|further away from|farther away from",
     "far_from": "far from|away from|far away from|clear of|far off",
     "at_distance": VAGUE_MARKER,
     "inside": "in|inside|inside of|within|in the middle of|in the center of|in the centre of|in the corner of",
@@ -301,9 +309,9 @@ _BY_RELATION: Final = {
     "behind": "behind|in back of|at the back of|in the back of|to the rear of|at the rear of|on the other side of|"
     "on the far side of|round the back of|around the back of",
     "in_front_of": "in front of|at the front of|before the front of|ahead of",
-    "left_of": "left of|to the left of|on the left of|on the left side of|to the left side of|left to|"
+    "left_of": "left of|to the left of|on the left of|on the left side of|to the left side of|"
     "on the left-hand side of|on the left hand side of|at the left of|left side of",
-    "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|right to|"
+    "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|"
     "on the right-hand side of|on the right hand side of|at the right of|right side of",
     "between": "between|in between|among|amongst|amid",
     "opposite": "opposite|opposite to|opposite from|across from|facing|opposite of",

@@ -24,7 +24,7 @@ PLACE_VERBS: Final = word_set(
     "put place set drop leave stack hang throw load insert pour store stow deposit unload position arrange rest dump "
     "toss lay pile plant tuck slip stick wedge shove stuff cram squeeze sprinkle spread scatter bury park fling hurl "
     "lean prop return pack file deploy install transplant tip slide hide ladle scoop spoon funnel drain discard "
-    "recycle stash lodge drape embed immerse dip suspend fit pop serve "
+    "recycle stash lodge drape embed immerse dip suspend fit pop serve chuck plop shelve "
     # what happens in a place: "warm the mug in the microwave"
     "heat warm cook bake boil fry toast roast microwave chill cool freeze thaw soak keep"
 )
@@ -76,7 +76,8 @@ FETCHING_VERBS: Final = word_set(
     "bring take get fetch pick grab give hand pass choose select want need carry show deliver collect retrieve lift"
 )
 # "the mug that does not stand on the table"
-POSTURE_VERBS: Final = word_set("hang stand sit lie rest lean belong locate live stick place mount park")
+RESTING_VERBS: Final = word_set("hang stand sit lie rest lean")
+POSTURE_VERBS: Final = RESTING_VERBS | word_set("belong locate live stick place mount park")
 # negated, these mean contact or harm: the object is an obstacle
 CONTACT_VERBS: Final = word_set(
     "touch cross hit bump knock collide mess tamper fiddle meddle interfere stamp "
@@ -85,7 +86,7 @@ CONTACT_VERBS: Final = word_set(
     "brush scrape dent smudge burn tear rip injure stumble trip startle frighten endanger tilt overturn upset crack"
 )
 # the direct object is where the robot goes
-REACHING_VERBS: Final = word_set("approach reach enter visit board ascend climb")
+REACHING_VERBS: Final = word_set("approach reach enter visit board")
 # the robot keeps away from the direct object
 AVOIDING_VERBS: Final = word_set("avoid dodge evade circumvent bypass mind beware")
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
