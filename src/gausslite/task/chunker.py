@@ -320,6 +320,8 @@ class _Chunker:
             buffer.word(1) in _DO_FORMS or (buffer.tag(2) in OBJECT_START_TAGS and buffer.tag(1) is Tag.AUXILIARY)
         ):
             return
+        if word == "what" and buffer.tag(1) is Tag.PRONOUN and buffer.last_verb() in ("ask", "tell", "report"):
+            return  # "ask her what she wants"
         if word in ("nothing", "nobody") and buffer.last_kind() is ChunkKind.PREPOSITION:
             buffer.chunks.pop()  # "the crate that has nothing on it"
             buffer.emit(ChunkKind.NOT_UNDERSTOOD, word)

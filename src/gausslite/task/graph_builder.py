@@ -74,7 +74,8 @@ class GraphBuilder:
         elif chunk.kind is ChunkKind.NEGATION:
             self._negation(chunk.word)
         elif chunk.kind in (ChunkKind.CLAUSE_BREAK, ChunkKind.STATEMENT):
-            self._new_clause(None)
+            goes_on = self._clause.verb in GO_VERBS and after is not None and after.word in ("past", "via", "to")
+            self._new_clause(self._clause.verb if goes_on else None)  # "go up the steps, then past the bar"
             self._negated, self._clause.statement = False, chunk.kind is ChunkKind.STATEMENT
         elif chunk.kind is ChunkKind.ANAPHOR:
             self._resolve_back_reference(chunk.word, before)
@@ -346,6 +347,7 @@ class GraphBuilder:
         if pending is not None and self._clause.terms.negated and not of_follows:
             words = f"not {self._clause.preposition} {noun.text}"
             self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
+        self._clause.in_space = noun.head == "room" and pending == "inside"
         if noun.head in lexicon.ROUTES:
             self._clause.route = True
         elif noun.head in lexicon.PLACES and pending is None:

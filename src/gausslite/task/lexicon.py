@@ -213,7 +213,7 @@ MEASURES: Final = word_set(
 PHYSICAL_MEASURES: Final = word_set("picture photo photograph map list model record sample copy")
 # places that are also physical objects, unless "in" or "to" precedes them
 PHYSICAL_PLACES: Final = word_set("home corner site front back")
-PICTURES: Final = word_set("picture photo photograph image painting drawing poster portrait sketch")
+PICTURES: Final = word_set("picture photo photograph image painting drawing poster portrait sketch statue")
 BUILDINGS: Final = word_set("building house apartment")
 # spaces around the robot, which state a context and no anchor; other rooms of the lexicon are objects
 _SPACES: Final = (ROOMS - word_set("closet elevator staircase street sidewalk lawn driveway laundry")) | word_set(

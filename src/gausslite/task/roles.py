@@ -182,6 +182,8 @@ class RoleAssigner:
         if clause.verb in verbs.FILLING_VERBS and clause.objects:
             self._assign_loaded(noun)
             return
+        if clause.in_space and noun.head in lexicon.COMMON_ANCHORS and clause.verb not in verbs.TRAVEL_VERBS:
+            return  # "in the bathroom with two sinks"
         if clause.verb in verbs.TRAVEL_VERBS:
             self.reach_places()  # "stop at the shelf with the boxes"
             if not clause.objects and noun.is_definite:

@@ -50,7 +50,7 @@ a  0  3 40 40  8 10 20  7 15 10  5  7 20 30 40 40  5  7
 d  0  0  5 90  7  7 60 20 60 30 30 30 40 50 40 60 40 20
 v  5  5  0 30  8 30 40  0  0  5  5  5 20  0  0  0 10  5
 g  7  7  0 50 30 30 30  0  0 10 10 10 20  5  3  0 20  5
-e  7  7  7 50 30 30 40  0  3 10  7  7 20 10 10 10 10  3
+e  7  7  7 50 30 30 40  0  4 10  7  7 20 10 10 10 10  3
 x  5  0  0  0  0  0  5  0  5  0 20 20 20  0  0  0  0 10
 p  0  0  0 90 10 20 60 30 30 50 30 30 10  0  0  0 20 20
 t 10 10  0 30 30 30 20  0 10  5  0  0 20 10 10 20 10  0
@@ -171,7 +171,7 @@ _VERB_PARTICLES: Final = word_set("off up out away down")
 _RELATIVES: Final = word_set("which that who")
 _POSSESSIVES: Final = ("'s", "s'")
 _NOUNS: Final = lexicon.NOUNS | lexicon.PLACES | lexicon.ROUTES | lexicon.MEASURES | lexicon.PARTS | lexicon.ADDRESSEES
-_ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most")
+_ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most", "ic")
 _VERB_ENDINGS: Final = ("ize", "ise", "ify", "ate")
 _VERB_OPENINGS: Final = ("re", "un", "dis", "de", "over", "pre", "mis")
 
@@ -280,7 +280,7 @@ def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Op
     else:
         options = {
             Tag.NOUN: 5,
-            Tag.ADJECTIVE: 3 if word.endswith(_ADJECTIVE_ENDINGS) else 20 if word.endswith("s") else 12,
+            Tag.ADJECTIVE: 1 if word.endswith(_ADJECTIVE_ENDINGS) else 20 if word.endswith("s") else 12,
             Tag.VERB: 40,
         }
     return options

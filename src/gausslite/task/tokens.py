@@ -132,13 +132,15 @@ _PLAIN: Final = {
     r"(?:with|has|have) (?:its|their|the) backs? (?:to|towards?|facing|against)": "near",
     r"the (?:one|object|thing) (?:that )?(?:i|we|you) (?:want|need|mean|(?:am |are )?look(?:ing)? for) is": "it is",
     r"belonging to": "of",
-    r"^the (?:target|goal|object|item)(?: object)? is": "this is",
+    r"in (?:your|my) hands?|(?:(?:that|which) )?you(?: are)? (?:holding|carrying)": "",
+    r"do(?:es)? (?:any|some)(?:one|body) know": "",
+    r"^the (?:target|goal|object|item)(?: object)? is(?= (?:an?|the|my|one)\b)": "this is",
+    r"^(?:if|when) you (?:are )?(?:stand|sit|enter)\w*[^,;.]*,": "",
     # "a cabinet, above it is a lamp"
     rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
     r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
-    rf"^(?:which|what) ([\w ]{{2,40}}?) (?:is|are|(?:did|do|does|has|have|can) \w+ \w+) ([\w ]{{2,40}}?) (?:\w+ing )?({_PLACED}|against)$": (
-        r"find the \1 and \2 \3 the \1"
-    ),
+    rf"^(?:[\w ]* )?(?:which|what) (\w+(?: \w+)?) (?:(?:is|are|(?:did|do|does|has|have|can) \w+ \w+) ([\w ]{{2,40}}?)|"
+    rf"((?:the|my|your) [\w ]{{2,30}}?) (?:is|are))(?: \w+ing)? ({_PLACED}|against)$": r"find the \1 and \2\3 \4 the \1",
     # a viewpoint: before the description its object may be meant, after it not
     r"(?:(?:if |when |while |as )?(?:you (?:are )?)?(?:facing|looking at)|(?:if|when|as) you (?:face|look at)) "
     r"([\w ]{2,40}),(?: (?:it|that) is)?": r"there is \1;",
@@ -149,16 +151,14 @@ _PLAIN: Final = {
     rf"({_NAMED}),? (?:no|sorry|i mean|no wait|wait no|(?:or )?rather|actually),? ({_NAMED}){_END}": r"\2, not \1",
     r"(?:anywhere|somewhere) but(?= (?:on|in|under|near|at|next to)\b)": ", not",
     r"with neither (.{2,40}?) nor": r"without \1 or",
-    r"neither (on|in|inside|under|near|behind|at|above) (.{2,40}?) nor (on|in|inside|under|near|behind|at|above)": (
-        r"not \1 \2 and not \3"
-    ),
+    rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",
     rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? (?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
     r"|(?:before|when|once|after) you (?:get to|reach|come to|arrive at|hit))": r"\1 at",
     r"^not (the \w+)( [^,.;]+?),? but the one( [^,.;]+)": r"\1\3, not the one\2",
     r"out of the way of": "away from",
     r"(one|two|three) (?:by|at a) (?:one|two|three|time)|side by side": "",
     r"(stop|wait|halt)(?: walking| moving)? (?:once|when|after|as soon as) you(?: are| have)?": r"\1",
-    r"(?:and|but) (?:(is|are)(?= (?:not|no|on|in|an?)\b)|(?:it )?(has))": r"and which \1\2",
+    r"(?:and|but) (?:(is|are)(?! (?:the|it|they|there)\b)|(?:it )?(has))": r"and which \1\2",
     r"but (the [\w ]+?) (?:should|must|can|has to) (?:stay|remain)(?: \w+)*": r"but do not touch \1",
     r"nothing (?:but|except|other than)": "",
     r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)": "",
@@ -185,7 +185,7 @@ _PLAIN: Final = {
     rf"where (the [\w ]+?) (?:is|are)(?: \w+(?:ed|ing)| kept)?{_END}": r"\1 with \2",
     r"(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
     r"leave(?= (?:through|via)\b)": "exit",
-    r"(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
+    r"(?:at the (?:bottom|top),? )?(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
     # a double negation is a request
     r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
@@ -295,7 +295,7 @@ _BY_RELATION: Final = {
     "chained to|hooked to|leashed to|plugged into|propped against|resting against",
     "closer": "closer to|nearer to",
     "on": "on|all over|scattered over|spread over|on top of|upon|atop|resting on|on the top of|at the top of|"
-    "on the surface of|mounted on|on to|on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|"
+    "on the surface of|mounted on|on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|"
     "nailed to|screwed to|bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|"
     "mounted to|hung up on|hanging off",
     "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
