@@ -132,7 +132,7 @@ class VerbChunker:
         if after in NOUN_PHRASE_TAGS and before not in (Tag.NOUN, Tag.INDEFINITE, Tag.PRONOUN):
             buffer.words.append(word)
             return
-        self._end_relative_subject(finite=after is Tag.PRONOUN)
+        self._end_relative_subject(finite=after is Tag.PRONOUN or before is Tag.INDEFINITE)
         if self._after_modal and self._subject_is_object():
             buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
         elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
@@ -312,6 +312,7 @@ class _Chunker:
     def _indefinite(self, word: str) -> None:
         buffer = self._buffer
         buffer.close()
+        buffer.determiner_at = buffer.index
         asked = [buffer.tag(offset) for offset in (2, 3, 4)]
         if word == "what" and asked == [Tag.PRONOUN, Tag.VERB, Tag.PREPOSITION]:
             buffer.emit(ChunkKind.VERB, "find")  # "what did I put in the drawer"

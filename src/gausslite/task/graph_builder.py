@@ -347,7 +347,7 @@ class GraphBuilder:
         if pending is not None and self._clause.terms.negated and not of_follows:
             words = f"not {self._clause.preposition} {noun.text}"
             self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
-        self._clause.in_space = noun.head == "room" and pending == "inside"
+        self._clause.in_space = noun.head == "room" and pending in ("inside", "to")
         if noun.head in lexicon.ROUTES:
             self._clause.route = True
         elif noun.head in lexicon.PLACES and pending is None:

@@ -138,6 +138,8 @@ class RoleAssigner:
             if clause.verb in verbs.GO_VERBS | {"turn"} and noun.has_determiner and is_thing(noun.head):
                 self._assign_waypoint(noun)  # "turn right after the painting"
             return
+        elif pending == "purpose" and self._acts_on_people():
+            self._relations.relate("near", noun)  # "the man talking to the nurse"
         elif pending == "purpose":
             self._assign_path_end(noun)
         elif noun.head in lexicon.BODY_PARTS and pending in ("near", "inside", "on") and self._acts_on_people():
@@ -182,7 +184,8 @@ class RoleAssigner:
         if clause.verb in verbs.FILLING_VERBS and clause.objects:
             self._assign_loaded(noun)
             return
-        if clause.in_space and noun.head in lexicon.COMMON_ANCHORS and clause.verb not in verbs.TRAVEL_VERBS:
+        roles = [self._draft.roles.get(phrase) for phrase in clause.objects]
+        if clause.in_space and noun.head in lexicon.COMMON_ANCHORS and TargetRole.DESTINATION not in roles:
             return  # "in the bathroom with two sinks"
         if clause.verb in verbs.TRAVEL_VERBS:
             self.reach_places()  # "stop at the shelf with the boxes"
@@ -199,7 +202,7 @@ class RoleAssigner:
     def _assign_place(self, pending: str, noun: NounPhrase, following: Sequence[Chunk]) -> None:
         """Assign a noun after a preposition of place: a destination, or where an object or a destination is."""
         clause = self.clause
-        if clause.crosses and not clause.objects:
+        if (clause.crosses and not clause.objects) or clause.last_relation == "for":
             return  # "take the hallway to the left of the stairs"
         if clause.terms.negated and clause.adds_place and self._has_destination(pending):
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"

@@ -138,7 +138,10 @@ _PLAIN: Final = {
     r"^(?:if|when) you (?:are )?(?:stand|sit|enter)\w*[^,;.]*,": "",
     # "a cabinet, above it is a lamp"
     rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
-    r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
+    r"whose (\w+) (?:is|are) (?!made)(\w+)": r"with a \2 \1",
+    r"whose(?= \w+ (?:is|are) made)": "with",
+    r"(?:likes?|loves?|tends?|prefers?) to \w+(?= (?:on|in|under|behind|near|by|next)\b)": "is",
+    rf",? (?:but )?(?:no|not) (?:closer|nearer|farther|further) than {_VALUE} ?{_UNIT}{_END}": "",
     rf"^(?:[\w ]* )?(?:which|what) (\w+(?: \w+)?) (?:(?:is|are|(?:did|do|does|has|have|can) \w+ \w+) ([\w ]{{2,40}}?)|"
     rf"((?:the|my|your) [\w ]{{2,30}}?) (?:is|are))(?: \w+ing)? ({_PLACED}|against)$": r"find the \1 and \2\3 \4 the \1",
     # a viewpoint: before the description its object may be meant, after it not
