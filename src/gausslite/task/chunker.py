@@ -116,7 +116,11 @@ class VerbChunker:
             buffer.close()  # "a cloth for wiping the table"
             if after in OBJECT_START_TAGS:
                 buffer.emit_preposition("purpose")
-        elif before is Tag.NOUN and verbs.base_of_ing(word) in _PASSING and verbs.verb_base(buffer.last_verb()) in verbs.GO_VERBS:
+        elif (
+            before is Tag.NOUN
+            and verbs.base_of_ing(word) in _PASSING
+            and verbs.verb_base(buffer.last_verb()) in verbs.GO_VERBS
+        ):
             buffer.emit(ChunkKind.VERB, verbs.verb_base(word) or word)  # "walk along the hall keeping the wall"
         elif before is Tag.CONJUNCTION and verbs.base_of_ing(word) in verbs.RESTING_VERBS and after is Tag.PREPOSITION:
             buffer.chunks.pop()  # "the wrench, lying beside the toolbox"
@@ -154,7 +158,11 @@ class VerbChunker:
         """Remove the subject of a relative clause: the wife in "the mug (that) my wife uses"."""
         buffer = self._buffer
         buffer.close()
-        adjacent = buffer.determiner_at > 0 and buffer.tag(-1) is not Tag.RELATIVE and buffer.tagged[buffer.determiner_at - 1][1] is Tag.NOUN
+        adjacent = (
+            buffer.determiner_at > 0
+            and buffer.tag(-1) is not Tag.RELATIVE
+            and buffer.tagged[buffer.determiner_at - 1][1] is Tag.NOUN
+        )
         if finite and adjacent and [chunk.kind for chunk in buffer.chunks[-2:]] == [ChunkKind.NOUN, ChunkKind.NOUN]:
             buffer.chunks.pop()
         if self._relative_chunk is not None and self._relative_chunk == len(buffer.chunks) - 1:

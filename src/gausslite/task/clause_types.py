@@ -59,7 +59,7 @@ def is_command(tagged: TaggedWords, index: int) -> bool:
         subject_at -= 1
     before, subject = tagged[subject_at] if subject_at >= 0 else ("", None)
     if subject is Tag.PRONOUN:
-        is_relative = subject_at > 0 and tagged[subject_at - 1][1] is Tag.RELATIVE
+        is_relative = subject_at > 0 and tagged[subject_at - 1][1] in (Tag.RELATIVE, Tag.NOUN)  # "the cup you see"
         return before not in _OTHER_PEOPLE and not is_relative
     if subject in SUBJECT_TAGS and tagged[index - 1][0] in INABILITIES:
         return False

@@ -11,7 +11,16 @@ from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
 from gausslite.task.roles import RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
-from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, HANDLING_VERBS, LEAVING_VERBS, PLACE_VERBS, SPEAKING_VERBS, TRAVEL_VERBS
+from gausslite.task.verbs import (
+    BELONGING_VERBS,
+    CONTACT_VERBS,
+    GO_VERBS,
+    HANDLING_VERBS,
+    LEAVING_VERBS,
+    PLACE_VERBS,
+    SPEAKING_VERBS,
+    TRAVEL_VERBS,
+)
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is
@@ -46,7 +55,9 @@ class GraphBuilder:
         self._avoids = False  # the negation itself means contact: "avoid touching"
         self._corrects = False
         self._negated_objects: list[str] = []
-        self._partitive: tuple[NounPhrase, str | None, bool] | None = None  # "the largest" of "the largest of the boxes"
+        self._partitive: tuple[NounPhrase, str | None, bool] | None = (
+            None  # "the largest" of "the largest of the boxes"
+        )
         self._described: str | None = None  # the latest object, which an attribute may describe
         self._adjectives: list[NounPhrase] = []
         self._plurals: set[str] = set()
@@ -258,7 +269,7 @@ class GraphBuilder:
             if self._negated and len(noun.words) == 1:
                 self._negate_latest()  # "this mug, not that one"
                 return
-            noun = self._resolve_one(noun)
+            noun = self._resolve_one(noun, before)
         excepts = after is not None and after.kind is ChunkKind.NEGATION and noun.text == "object"
         if excepts and conjoined and self._clause.objects and self._pending is None:
             return  # "bring me a snack, anything but chips"
@@ -320,7 +331,7 @@ class GraphBuilder:
         elif any(word in SUPERLATIVES for word in noun.words) and self._described is not None:
             self._describe(" ".join(word for word in noun.words if is_attribute(word)), negated=False)
 
-    def _resolve_one(self, one: NounPhrase) -> NounPhrase:
+    def _resolve_one(self, one: NounPhrase, before: Chunk | None) -> NounPhrase:
         """Return the phrase with the latest object's noun in place of "one": "the blue one"."""
         clause = self._clause
         # "with the blue cloth, not with the yellow one"
@@ -335,8 +346,15 @@ class GraphBuilder:
         if len(one.words) == 1:
             return phrase_from_text(named[-1])
         described = NounPhrase((*one.words[:-1], *same.words), one.has_determiner)
+        listed = [chunk.kind for chunk in self._following[:2]] == [ChunkKind.CONJUNCTION, ChunkKind.NOUN]
+        repeats = before is not None and before.word == "," and named[-1] in clause.objects and one.is_definite
+        repeats = (
+            repeats and not one.is_plural and named[-1] == same.text and not listed
+        )  # "which jacket, the black one"
         if (
-            self._pending in (None, "purpose") and not self._negated and self._draft.is_from_statement(named[-1])
+            self._pending in (None, "purpose")
+            and not self._negated
+            and (repeats or self._draft.is_from_statement(named[-1]))
         ):  # "there are two mugs on the table, take the red one"
             self._assigner.rename(named[-1], described.text)
         return described
@@ -429,7 +447,7 @@ def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chu
         verb in SPEAKING_VERBS | {"report"}
         and pending is None
         and (verb == "say" or of_follows)
-        and noun.head not in lexicon.PEOPLE
+        and noun.head not in lexicon.PEOPLE | lexicon.CONTAINERS
     ):
         return False  # "say your name", "tell me the name of the person"
     if noun.words == ("light",) and of_follows and pending is not None:

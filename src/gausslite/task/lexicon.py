@@ -180,7 +180,7 @@ ADDRESSEES: Final = word_set(
 )
 
 # nouns that refer to the task itself: "the goal is to", "any idea where"
-TASK_NOUNS: Final = word_set("task mission goal objective job aim assignment duty idea clue question problem")
+TASK_NOUNS: Final = word_set("task mission goal objective job aim assignment duty idea clue question problem help")
 # nouns for places and properties: the object follows "of", or there is none
 PLACES: Final = word_set(
     "scene environment surroundings room area world space place vicinity workspace view region zone spot location "

@@ -202,7 +202,7 @@ class RoleAssigner:
     def _assign_place(self, pending: str, noun: NounPhrase, following: Sequence[Chunk]) -> None:
         """Assign a noun after a preposition of place: a destination, or where an object or a destination is."""
         clause = self.clause
-        if (clause.crosses and not clause.objects) or clause.last_relation == "for":
+        if clause.crosses and not clause.objects:
             return  # "take the hallway to the left of the stairs"
         if clause.terms.negated and clause.adds_place and self._has_destination(pending):
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
@@ -219,7 +219,7 @@ class RoleAssigner:
             and not clause.current_place
         ):
             self._relations.relate("near", noun)  # "pull the chair away from the wall": it is there now
-        else:
+        elif clause.last_relation != "for":  # "a chair for the woman by the window"
             if clause.pending_places and clause.verb in verbs.TRAVEL_VERBS:
                 self._make_places_targets()  # "stop behind the car near the tree"
             self._relations.relate(pending, noun)
@@ -263,6 +263,7 @@ class RoleAssigner:
         are_objects = any(self._draft.roles.get(phrase) is TargetRole.OBJECT for phrase in clause.objects)
         # "push the ball between the cones", unlike "push the button next to the door"
         moves = pushes and are_objects and not clause.is_part and clause.verb != "pull" and pending in _PUSHED_TO
+        moves = moves and not clause.preposition.startswith("at ")
         places = moves or clause.verb in verbs.ATTACHING_VERBS | verbs.PLACE_VERBS
         return places and not clause.current_place and self._is_final_place(pending, following)
 
@@ -285,6 +286,7 @@ class RoleAssigner:
     def _add_place(self, noun: NounPhrase, role: TargetRole, conjoined: bool) -> None:
         self._draft.add_target(noun.text, role)
         self.clause.places = [*self.clause.places, noun.text] if conjoined else [noun.text]
+        self.clause.in_space = False
 
     def make_tools(self, phrases: Sequence[str]) -> None:
         """Make earlier objects tools: "take the sponge and wipe the table with it"."""
@@ -400,6 +402,9 @@ class RoleAssigner:
             moving = {"turn"} | verbs.TRAVEL_VERBS | verbs.DELIVERY_VERBS | verbs.SPEAKING_VERBS
             going = clause.route or clause.verb is None or clause.verb in moving
             role = TargetRole.DESTINATION if going else TargetRole.OBJECT
+            if clause.verb in verbs.LEADING_VERBS and clause.objects:
+                self._add_destination(noun)
+                return
             if clause.verb in verbs.REACHING_VERBS:  # "climb the ladder to the attic"
                 self._draft.roles.update(dict.fromkeys(clause.objects, TargetRole.OBJECT))
             self.target(noun, role, conjoined=bool(clause.objects))

@@ -231,7 +231,11 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (before in _RELATIVES and is_place and verbs.base_of_s(word) is not None)  # "which stands on"
         or (before == "you" and is_open and after in lexicon.DETERMINERS)
     )
-    named = is_thing(f"{word} {singular(after)}") or is_thing(f"{before} {word}") or (before in _BEFORE_NAMES and _is_noun(after))
+    named = (
+        is_thing(f"{word} {singular(after)}")
+        or is_thing(f"{before} {word}")
+        or (before in _BEFORE_NAMES and _is_noun(after))
+    )
     waits = opens and word in verbs.STOPPING_VERBS and _is_noun(after) and after not in _CLOSED
     rules = {
         Tag.VERB: commands,
@@ -243,7 +247,8 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         Tag.CLAUSE_BREAK: word == "before" and after in _SUBJECTS,
         Tag.NOUN: waits
         or (opens and is_open and after in _BELONG and singular(word) != word)  # "drinks go on the shelf"
-        or (word.endswith("ing") and named) or (word == "half" and after == "of"),  # "stand lamp"
+        or (word.endswith("ing") and named)
+        or (word == "half" and after == "of"),  # "stand lamp"
         Tag.GERUND: before in ("without", *_BE) and verbs.base_of_ing(word) is not None,
         Tag.PRONOUN: word == "one" and after in _MODALS_AFTER_ONE,
         Tag.DETERMINER: word == "one" and after == "of",
