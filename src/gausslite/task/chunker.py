@@ -25,6 +25,7 @@ from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
 _OBJECT_TAGS: Final = OBJECT_START_TAGS | {Tag.PRONOUN, Tag.ANAPHOR}
+_DESCRIBED: Final = (ChunkKind.NOUN, ChunkKind.ATTRIBUTE)
 _NAMING: Final = word_set("label mark name call tag")
 _PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
 _MODIFIED_TAGS: Final = frozenset({Tag.NOUN, Tag.PARTICIPLE})
@@ -86,10 +87,13 @@ class VerbChunker:
             and not is_command(tagged, index)
         ):
             buffer.emit(ChunkKind.SUBJECT_VERB, base)
-        elif subject is Tag.CONJUNCTION and word != base and buffer.last_kind(1) is ChunkKind.NOUN:
+        elif subject is Tag.CONJUNCTION and word != base and buffer.last_kind(1) in _DESCRIBED:
             buffer.chunks.pop()  # "which is near the window and opens to the hall"
             if buffer.tag(1) in _OBJECT_TAGS:
                 self._subordinate_verb(base)
+        elif word == "wants" and subject is Tag.NOUN and buffer.tag(1) in OBJECT_START_TAGS:
+            buffer.chunks.pop()  # "my sister wants the soda"
+            buffer.emit(ChunkKind.VERB, base)
         elif subject not in SUBJECT_TAGS or is_wish or is_command(tagged, index):
             buffer.emit(ChunkKind.VERB, base)
         elif subject in (Tag.NOUN, Tag.RELATIVE, Tag.INDEFINITE) and buffer.tag(1) in _OBJECT_TAGS:
@@ -324,8 +328,8 @@ class _Chunker:
         asked = [buffer.tag(offset) for offset in (2, 3, 4)]
         if word == "what" and asked == [Tag.PRONOUN, Tag.VERB, Tag.PREPOSITION]:
             buffer.emit(ChunkKind.VERB, "find")  # "what did I put in the drawer"
-        # "what does the sign say", "what is that thing"
-        elif word == "what" and (
+        # "what does the sign say", "what is that thing", "who is the man"
+        elif word in ("what", "who") and (
             buffer.word(1) in _DO_FORMS or (buffer.tag(2) in OBJECT_START_TAGS and buffer.tag(1) is Tag.AUXILIARY)
         ):
             return

@@ -85,9 +85,11 @@ def _begins_clause(tagged: TaggedWords, index: int) -> bool:
 def _opens_clause(tagged: TaggedWords, conjunction_at: int) -> bool:
     """Return True if a verb, or a subject with its verb, follows the conjunction."""
     tags = [tag for _, tag in tagged[conjunction_at + 1 : conjunction_at + 3]] + [None, None]
-    if tags[0] is Tag.NEGATION and (tags[1] is Tag.PREPOSITION or tagged[conjunction_at + 1][0] == "no"):
-        return False  # "on the table, not on the shelf", "with a lamp but no shade"
-    if tags[0] in (Tag.VERB, Tag.NEGATION, Tag.AUXILIARY):
+    denied = tagged[conjunction_at + 1][0] if tags[0] is Tag.NEGATION else ""
+    if denied == "no" or (denied and tags[1] is Tag.PREPOSITION) or (denied == "not" and tags[1] is Tag.DETERMINER):
+        return False  # "on the table, not on the shelf", "with a lamp but no shade", "the cup, not the mug"
+    asks = tagged[conjunction_at + 1][0] in ("how", "where") if tags[1] is Tag.AUXILIARY else False
+    if asks or tags[0] in (Tag.VERB, Tag.NEGATION, Tag.AUXILIARY):
         return True
     if tags[0] in (Tag.PRONOUN, Tag.ANAPHOR):
         return tags[1] in _PREDICATES or tags[1] is Tag.NEGATION

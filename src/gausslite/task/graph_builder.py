@@ -61,6 +61,7 @@ class GraphBuilder:
         self._described: str | None = None  # the latest object, which an attribute may describe
         self._adjectives: list[NounPhrase] = []
         self._plurals: set[str] = set()
+        self._denied_places: list[tuple[str, RelationTerms, NounPhrase]] = []
         self._after_preposition: dict[str, list[str]] = {}  # the latest noun after each preposition
         self._following: Sequence[Chunk] = ()
 
@@ -106,6 +107,10 @@ class GraphBuilder:
     def finish(self) -> GraphDraft:
         """Return the draft after the last clause, without excluded objects."""
         self._new_clause(None)
+        for phrase, terms, noun in self._denied_places:  # "not the lamp by the bed but the lamp by the door"
+            if phrase in self._draft.targets and phrase in self._draft.excluded:
+                self._draft.excluded.remove(phrase)
+                self._draft.add_relation(terms, [phrase], noun.text)
         self._draft.finalise()
         return self._draft
 
@@ -365,7 +370,7 @@ class GraphBuilder:
         if pending is not None and self._clause.terms.negated and not of_follows:
             words = f"not {self._clause.preposition} {noun.text}"
             self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
-        self._clause.in_space = noun.head == "room" and pending in ("inside", "to")
+        self._clause.in_space = noun.head == "room"
         if noun.head in lexicon.ROUTES:
             self._clause.route = True
         elif noun.head in lexicon.PLACES and pending is None:
@@ -411,6 +416,7 @@ class GraphBuilder:
             if self._clause.verb in PLACE_VERBS and self._clause.verb_since_negation:
                 self._draft.exclude(noun.text)
                 return
+            self._denied_places += [(phrase, RelationTerms(relation, True, terms.bounds), noun) for phrase in objects]
             self._draft.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")
 
 

@@ -169,7 +169,7 @@ COMPOUND_OPENERS: Final = frozenset({("first", "aid"), ("second", "hand")})
 # irrelevant to the graph; most other adverbs end in -ly
 ADVERBS: Final = word_set(
     "please so yo pls plz thx ta cheers hey ok okay hello hi yes no-one thanks thank just now also too again very "
-    "so-so here there else sure still already yet always almost instead fast soon later today tonight tomorrow "
+    "so-so here there else sure still already yet always almost instead fast soon later today tonight tomorrow earlier "
     "yesterday sometime sometimes whenever maybe perhaps straight about nearly nearby anywhere somewhere together "
     "alone afterwards even ever quite rather pretty otherwise therefore however anyway indeed twice possible necessary "
     "ago overhead halfway only able um uh er erm hmm oh"
@@ -180,7 +180,7 @@ ADDRESSEES: Final = word_set(
 )
 
 # nouns that refer to the task itself: "the goal is to", "any idea where"
-TASK_NOUNS: Final = word_set("task mission goal objective job aim assignment duty idea clue question problem help")
+TASK_NOUNS: Final = word_set("task mission goal objective job aim assignment duty idea clue question problem help chance")
 # nouns for places and properties: the object follows "of", or there is none
 PLACES: Final = word_set(
     "scene environment surroundings room area world space place vicinity workspace view region zone spot location "
@@ -221,7 +221,7 @@ _SPACES: Final = (ROOMS - word_set("closet elevator staircase street sidewalk la
     "theatre theater cinema factory hangar farm clinic ward showroom storeroom stockroom mailroom washroom cloakroom "
     "ballroom courtroom playroom storey depot vestibule atrium mezzanine veranda conservatory greenhouse barn cellar "
     "loft nursery playground meadow forest woods beach orchard vineyard plaza town city village canteen cleanroom "
-    "darkroom sunroom dormitory gallery auditorium gymnasium studio home villa pharmacy bakery mudroom zoo stadium"
+    "darkroom sunroom dormitory gallery auditorium gymnasium studio home villa pharmacy bakery mudroom zoo stadium den sauna"
 )
 _SPACE_HEADS: Final = word_set("room area lot hall park site zone storey wing department section suite court space")
 

@@ -26,6 +26,7 @@ _ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
 # with a room: where the robot goes through
 _CROSSING_VERBS: Final = verbs.LEAVING_VERBS | (verbs.GO_VERBS - verbs.REACHING_VERBS - verbs.COVERING_VERBS)
 _PASSING_VERBS: Final = verbs.GO_VERBS - verbs.STOPPING_VERBS - word_set("park dock land")
+_GOING_ON: Final = verbs.TRAVEL_VERBS | {"keep", "turn", "pass"}
 _PASSAGES: Final = word_set("door doorway entrance gate archway")
 _PASSING_RELATIONS: Final = word_set("past beyond")
 
@@ -55,7 +56,7 @@ class RoleAssigner:
         if self._searches_for_referent():
             self._search_places_for_referents(before)
         elif not before.statement:  # "walk between the columns and stop at the altar"
-            self._make_places_targets(passes=before.verb in _PASSING_VERBS and next_verb in verbs.TRAVEL_VERBS)
+            self._make_places_targets(passes=before.verb in _PASSING_VERBS and next_verb in _GOING_ON)
         self._relations.clause = Clause(verb=verb, referents=before.objects or before.referents)
         self.clause.pending_places, self.clause.follows_statement = before.pending_places, before.statement
 
@@ -189,7 +190,7 @@ class RoleAssigner:
             return  # "in the bathroom with two sinks"
         if clause.verb in verbs.TRAVEL_VERBS:
             self.reach_places()  # "stop at the shelf with the boxes"
-            if not clause.objects and noun.is_definite:
+            if not clause.objects and noun.is_definite and not clause.in_space:
                 self._assign_waypoint(noun)  # "walk on with the railing on your left"
                 return
         if clause.verb is None and clause.pending_places and lexicon.is_space(clause.pending_places[-1][1].words):
@@ -443,8 +444,8 @@ class RoleAssigner:
     def _assign_origin(self, pending: str, noun: NounPhrase) -> None:
         clause = self.clause
         encloses = noun.head in lexicon.CONTAINERS or lexicon.is_space(noun.words)
-        going = clause.verb in verbs.GO_VERBS - verbs.MOVING_VERBS - verbs.SEARCH_VERBS and not (
-            clause.objects and clause.verb in verbs.LEADING_VERBS
+        going = clause.verb in verbs.GO_VERBS - verbs.SEARCH_VERBS and not (
+            clause.objects and clause.verb in verbs.LEADING_VERBS | verbs.MOVING_VERBS
         )
         if lexicon.is_space(noun.words) and not clause.objects and clause.verb is None:
             self._draft.add_context(noun.text)  # "once you are out of the bathroom"

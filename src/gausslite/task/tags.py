@@ -265,7 +265,7 @@ def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Op
         return closed
     if after in lexicon.DETERMINERS and verbs.base_of_ing(word) is not None:
         return {Tag.GERUND: 0}  # "cleaning the floors"
-    if word[0].isdigit():
+    if word[0].isdigit() and not word.endswith("up"):  # "7up"
         return {Tag.DETERMINER: 0, Tag.NOUN: 5}
     if word.endswith(_POSSESSIVES) and len(word) > 3:
         return {Tag.ADJECTIVE: 0, Tag.DETERMINER: 0}

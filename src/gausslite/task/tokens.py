@@ -152,6 +152,12 @@ _PLAIN: Final = {
     rf"[\w ]{{2,40}}?{_END}": "",
     # a correction, and what is denied of a place
     rf"({_NAMED}),? (?:no|sorry|i mean|no wait|wait no|(?:or )?rather|actually),? ({_NAMED}){_END}": r"\2, not \1",
+    rf"(\w+) ({_NAMED}),? (?:no|sorry|no wait|wait no|actually|rather),? \1 ({_NAMED}){_END}": r"\1 \3, not \2",
+    rf"(to|on|in|into|under|behind|near|next to) ({_NAMED})[.,;] (?:no|sorry|wait|actually),? \1 ({_NAMED}){_END}": (
+        r"\1 \3, not \1 \2"
+    ),
+    r"you (?:can|will|may|should)? ?find (?:her|him|it|them)": "it is",
+    r"between (?:you|me|us) and": "between",
     r"(?:anywhere|somewhere) but(?= (?:on|in|under|near|at|next to)\b)": ", not",
     r"with neither (.{2,40}?) nor": r"without \1 or",
     rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",

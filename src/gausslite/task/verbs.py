@@ -29,7 +29,7 @@ PLACE_VERBS: Final = word_set(
     "heat warm cook bake boil fry toast roast microwave chill cool freeze thaw soak keep"
 )
 TOOL_VERBS: Final = word_set(
-    "clean wipe vacuum sweep mop wash scrub dust polish rinse disinfect sanitize sanitise tidy brush dry sterilize "
+    "clean dampen wipe vacuum sweep mop wash scrub dust polish rinse disinfect sanitize sanitise tidy brush dry sterilize "
     "declutter organize organise sort clear hoover rake shovel mow paint cut cover spray water repair fix hose swab "
     "scrape sand iron weed dig sponge steam sterilise wax degrease deice sharpen lubricate oil grease"
 )
