@@ -56,7 +56,7 @@ class VerbChunker:
             and (continues or buffer.last_kind() is ChunkKind.NOUN or (self.describes and buffer.word(-1) == "it"))
             and buffer.tag(1) in OBJECT_START_TAGS
         ):
-            buffer.emit_preposition("near", current_place=True)
+            buffer.emit_preposition("near", "has", current_place=True)
         if word != "be":  # "should be moved to the bench"
             self._after_modal = is_modal(buffer.tagged, buffer.index) and buffer.last_kind() is ChunkKind.NOUN
 

@@ -18,7 +18,7 @@ _SHADES: Final = word_set("light dark bright pale deep")
 _COLOUR_COMPOUNDS: Final = frozenset(
     tuple(pair.split("_"))
     for pair in word_set(
-        "orange_juice orange_tree orange_peel red_wine white_wine green_tea black_tea black_coffee "
+        "orange_juice orange_soda red_bull orange_tree orange_peel red_wine white_wine green_tea black_tea black_coffee "
         "black_pepper white_bread brown_bread brown_rice brown_sugar white_sugar red_cross blue_cheese "
         "cream_cheese green_bean red_onion green_onion red_cabbage black_box white_board black_board "
         "ice_cream yellow_page gold_fish silver_foil black_hole green_house orange_slice red_meat "

@@ -114,7 +114,7 @@ class RoleAssigner:
                 self.target(noun, self.role_of_object(noun.head), conjoined and clause.last_relation is None)
             return
         self.assign_by_preposition(pending, noun, following)
-        clause.describes = clause.preposition in ("with", "near", "without") and not noun.is_definite
+        clause.describes = clause.preposition in ("with", "near", "has", "without") and not noun.is_definite
 
     def assign_by_preposition(self, pending: str, noun: NounPhrase, following: Sequence[Chunk] = ()) -> None:
         """Assign the noun's role relative to the clause's objects, by the preposition before it."""
@@ -185,8 +185,7 @@ class RoleAssigner:
         if clause.verb in verbs.FILLING_VERBS and clause.objects:
             self._assign_loaded(noun)
             return
-        roles = [self._draft.roles.get(phrase) for phrase in clause.objects]
-        if clause.in_space and noun.head in lexicon.COMMON_ANCHORS and TargetRole.DESTINATION not in roles:
+        if self._describes_room(noun):
             return  # "in the bathroom with two sinks"
         if clause.verb in verbs.TRAVEL_VERBS:
             self.reach_places()  # "stop at the shelf with the boxes"
@@ -200,10 +199,15 @@ class RoleAssigner:
         elif (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
             self._assign_after_with(noun)
 
+    def _describes_room(self, noun: NounPhrase) -> bool:
+        roles = [self._draft.roles.get(phrase) for phrase in self.clause.objects]
+        fixed = noun.head in lexicon.COMMON_ANCHORS or self.clause.preposition == "has"
+        return self.clause.in_space and fixed and TargetRole.DESTINATION not in roles
+
     def _assign_place(self, pending: str, noun: NounPhrase, following: Sequence[Chunk]) -> None:
         """Assign a noun after a preposition of place: a destination, or where an object or a destination is."""
         clause = self.clause
-        if clause.crosses and not clause.objects:
+        if (clause.crosses and not clause.objects) or (clause.preposition == "has" and self._describes_room(noun)):
             return  # "take the hallway to the left of the stairs"
         if clause.terms.negated and clause.adds_place and self._has_destination(pending):
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
@@ -340,7 +344,7 @@ class RoleAssigner:
     def _is_final_place(self, pending: str, following: Sequence[Chunk]) -> bool:
         """Return True if no later place is the destination; "on the table into the sink" goes to the sink."""
         more = [chunk.word for chunk in following[:1] if chunk.kind is ChunkKind.PREPOSITION]
-        rooms = [chunk.noun for chunk in following[1:2] if chunk.noun and chunk.noun.head in lexicon.ROOMS]
+        rooms = [chunk.noun for chunk in following[1:2] if chunk.noun and chunk.noun.head in lexicon.ROOMS | lexicon.PLACES]
         final = "to" in more or (pending == "on" and bool(_FINAL_DESTINATIONS.intersection(more)) and not rooms)
         return bool(self.clause.objects) and pending in _DESTINATION_RELATIONS and not final
 

@@ -113,7 +113,7 @@ def _number(text: str) -> float:
 
 
 _PLACED: Final = (
-    r"(?:(?:to|on) the (?:left|right)|in front|on top) of|next to|(?:above|below|under|behind|beside|near|in|on)"
+    r"(?:(?:(?:to|on) the (?:left|right)|in front|on top) of|next to|above|below|under|behind|beside|near|in|on)"
 )
 _END: Final = r"(?=$| ?[,.;])"
 _NAMED: Final = r"(?:the|an?|my|that|this)(?: \w+){1,3}?"
@@ -148,10 +148,11 @@ _PLAIN: Final = {
     r"(?:(?:if |when |while |as )?(?:you (?:are )?)?(?:facing|looking at)|(?:if|when|as) you (?:face|look at)) "
     r"([\w ]{2,40}),(?: (?:it|that) is)?": r"there is \1;",
     r"tell (?:me|us)": "report",
-    r",? (?:if|when|while|as)(?: you)?(?: are)? (?:facing|looking at|face|look at|enter|entering) "
+    r",? (?:if|when|while|as)(?: you)?(?: are)? (?:facing|looking(?: at| from)|face|look at|enter|entering) "
     rf"[\w ]{{2,40}}?{_END}": "",
     # a correction, and what is denied of a place
     rf"({_NAMED}),? (?:no|sorry|i mean|no wait|wait no|(?:or )?rather|actually),? ({_NAMED}){_END}": r"\2, not \1",
+    r"(the|an?|my) (\w+)[.;,]? (?:no|sorry),? the (\w+) one\b": r"\1 \3 \2",
     rf"(\w+) ({_NAMED}),? (?:no|sorry|no wait|wait no|actually|rather),? \1 ({_NAMED}){_END}": r"\1 \3, not \2",
     rf"(to|on|in|into|under|behind|near|next to) ({_NAMED})[.,;] (?:no|sorry|wait|actually),? \1 ({_NAMED}){_END}": (
         r"\1 \3, not \1 \2"
@@ -186,8 +187,11 @@ _PLAIN: Final = {
     r"(that|it|he|she|who|which)s? (?:is|has) got": r"\1 has",
     r"throw ((?:[\w']+ ){1,9})(?:away|out)(?=$| ?[,.;]| and )": r"remove \1",
     r"(?:to|on) your (?:\w+ )?(?:left|right)(?: hand)?(?: side)?(?! of\b)": "",
-    r"on top(?! of\b)": "",
-    rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED})\b)": "and stop",
+    r"(?:on top|at the (?:head|foot))(?! of\b)": "",
+    rf"to (?:dry|cool|soak|thaw|rest)(?: off| down)?(?= {_PLACED})": "",
+    r"on the (?:left|right)(?= and the\b)": "",
+    r"(?:something|anything) wrong with": "",
+    rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED}|{_VALUE} {_UNIT})\b)": "and stop",
     rf"with ((?!no)(?:\w+ ){{1,4}}?)(?:{_PLACED}|inside|around|over) (?:it|them)": r"holding \1",
     r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)": "",
     r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
@@ -270,13 +274,22 @@ _AHEAD: Final = re.compile(
 )
 
 
+# "a tall, thin lamp"
+_LISTED: Final = re.compile(r"\b(an? \w+), (\w+)(?= \w)")
 # "the cup (the red one)"
 _BRACKETS: Final = re.compile(r"(\w+),? \((?:the |an? )?((?:\w+ )??\w+?)(?: ones?)?\)")
 
 
 def _described_before(match: re.Match[str]) -> str:
-    described = all(word in lexicon.ADJECTIVES or lexicon.is_attribute(word) for word in match[2].split())
-    return f"{match[2]} {match[1]}" if described else match[0]
+    return f"{match[2]} {match[1]}" if _describes(match[2]) else match[0]
+
+
+def _joined(match: re.Match[str]) -> str:
+    return f"{match[1]} {match[2]}" if _describes(f"{match[1].split()[1]} {match[2]}") else match[0]
+
+
+def _describes(words: str) -> bool:
+    return all(word in lexicon.ADJECTIVES or lexicon.is_attribute(word) for word in words.split())
 
 
 def comparisons(text: str) -> list[str]:
@@ -288,7 +301,7 @@ def replace_idioms(text: str) -> str:
     """Return a normalised sentence with idioms replaced."""
     text = _ARROW.sub(" to ", text)
     text = _LEAVE_ALONE.sub(lambda match: f"do not touch {match[1] or match[2]}", text)
-    text = _BRACKETS.sub(_described_before, text)
+    text = _LISTED.sub(_joined, _BRACKETS.sub(_described_before, text))
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
     text = _AHEAD.sub(r"\1", _COMPARISON.sub("", text))
