@@ -272,9 +272,9 @@ class _Chunker:
         buffer = self._buffer
         if buffer.tag(-1) is Tag.NEGATION and buffer.last_kind() is ChunkKind.NOT_UNDERSTOOD:
             return  # "that is not rotten"
-        if buffer.last_kind() is ChunkKind.CONJUNCTION and buffer.last_kind(1) is ChunkKind.ATTRIBUTE:
-            if buffer.tag(-1) is Tag.CONJUNCTION and buffer.tag(1) not in NOUN_PHRASE_TAGS:
-                return  # "it is white and oval"
+        follows_state = buffer.tag(-1) is Tag.CONJUNCTION and buffer.last_kind(1) is ChunkKind.ATTRIBUTE
+        if follows_state and not buffer.words and buffer.tag(1) not in NOUN_PHRASE_TAGS:
+            return  # "it is white and oval"
         # "the red and blue mugs": a lone adjective shares the noun of the next phrase
         if not buffer.words and buffer.last_kind() is ChunkKind.CONJUNCTION and len(buffer.chunks) >= 2:
             before = buffer.chunks[-2].noun

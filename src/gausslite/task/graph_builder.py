@@ -352,15 +352,12 @@ class GraphBuilder:
             return phrase_from_text(named[-1])
         described = NounPhrase((*one.words[:-1], *same.words), one.has_determiner)
         listed = [chunk.kind for chunk in self._following[:2]] == [ChunkKind.CONJUNCTION, ChunkKind.NOUN]
+        # "which jacket, the black one"
         repeats = before is not None and before.word == "," and named[-1] in clause.objects and one.is_definite
-        repeats = (
-            repeats and not one.is_plural and named[-1] == same.text and not listed
-        )  # "which jacket, the black one"
-        if (
-            self._pending in (None, "purpose")
-            and not self._negated
-            and (repeats or self._draft.is_from_statement(named[-1]))
-        ):  # "there are two mugs on the table, take the red one"
+        repeats = repeats and not one.is_plural and named[-1] == same.text and not listed
+        # "there are two mugs on the table, take the red one"
+        repeats = repeats or self._draft.is_from_statement(named[-1])
+        if self._pending in (None, "purpose") and not self._negated and repeats:
             self._assigner.rename(named[-1], described.text)
         return described
 

@@ -18,11 +18,10 @@ _SHADES: Final = word_set("light dark bright pale deep")
 _COLOUR_COMPOUNDS: Final = frozenset(
     tuple(pair.split("_"))
     for pair in word_set(
-        "orange_juice orange_soda red_bull orange_tree orange_peel red_wine white_wine green_tea black_tea black_coffee "
-        "black_pepper white_bread brown_bread brown_rice brown_sugar white_sugar red_cross blue_cheese "
-        "cream_cheese green_bean red_onion green_onion red_cabbage black_box white_board black_board "
-        "ice_cream yellow_page gold_fish silver_foil black_hole green_house orange_slice red_meat "
-        "white_chocolate"
+        "orange_juice orange_soda red_bull orange_tree orange_peel red_wine white_wine green_tea black_tea "
+        "black_coffee black_pepper white_bread brown_bread brown_rice brown_sugar white_sugar red_cross blue_cheese "
+        "cream_cheese green_bean red_onion green_onion red_cabbage black_box white_board black_board ice_cream "
+        "yellow_page gold_fish silver_foil black_hole green_house orange_slice red_meat white_chocolate"
     )
 )
 _WORDS_OF_SUPERLATIVE: Final = {
@@ -123,25 +122,25 @@ COMMON_ANCHORS: Final = word_set(
 )
 CONTAINERS: Final = word_set(
     "drawer box bin basket cabinet cupboard closet fridge refrigerator freezer dishwasher oven microwave bag backpack "
-    "crate bucket bowl jar suitcase locker wardrobe container carton trunk dumpster sink bathtub pot washer dryer "
-    "case pocket purse toolbox chest sack hamper safe mailbox vase envelope package pantry kitchen incubator "
-    "centrifuge autoclave cooler canister tin tub barrel van trailer tank pouch satchel rucksack handbag holdall "
-    "briefcase carrier cage hutch kennel crib cot pram tote pail caddy cellar shed barn greenhouse tent cubby "
-    "cubbyhole glovebox boot cup mug glass bottle can thermos jug pitcher cooker kiln chamber compartment slot hole "
-    "folder binder hopper silo casket coffin wallet quiver holster sheath sleeve wrapper packet sachet pack bundle "
-    "bathroom bedroom office garage room car truck lorry bus ambulance helicopter boat plane taxi train"
+    "crate bucket bowl jar suitcase locker wardrobe container carton trunk dumpster sink bathtub pot washer dryer case "
+    "pocket purse toolbox chest sack hamper safe mailbox vase envelope package pantry kitchen incubator centrifuge "
+    "autoclave cooler canister tin tub barrel van trailer tank pouch satchel rucksack handbag holdall briefcase "
+    "carrier cage hutch kennel crib cot pram tote pail caddy cellar shed barn greenhouse tent cubby cubbyhole glovebox "
+    "boot cup mug glass bottle can thermos jug pitcher cooker kiln chamber compartment slot hole folder binder hopper "
+    "silo casket coffin wallet quiver holster sheath sleeve wrapper packet sachet pack bundle bathroom bedroom office "
+    "garage room car truck lorry bus ambulance helicopter boat plane taxi train"
 )
 # nouns that are also verbs or adjectives, or that the vocabulary lacks
 _OBJECTS: Final = word_set(
     "glass spoon sponge dish grill orange milk water book document monitor headphones light watch tape painting plant "
-    "rock puddle sand litter dust stain spill recycling cart truck sign post switch plug handle vent pump hammer "
-    "drill saw nail screw bolt hose mop vacuum brush shovel rake block dice frisbee t-shirt tshirt cap jeans dress "
-    "keychain ring tie pedestrian pet animal comb package hook stand electronics supply article belonging valuables "
-    "step crack leak exit dock tag whiteboard ladle whisk yoga sleeping usb drive cd dvd swing slide wheel weed log "
-    "seed tap drain metal spring coil seat pad notepad label stamp coin money cash ticket passport badge lighting "
-    "wrap weld cover lift clip clamp peg grip splash seal strap latch hatch winch hoist drop iron polish spray paint "
-    "oil grease wax trap track guard guide print sketch note pack file pass switchgear stick mail patch building "
-    "house head cream eye hand age"
+    "rock puddle sand litter dust stain spill recycling cart truck sign post switch plug handle vent pump hammer drill "
+    "saw nail screw bolt hose mop vacuum brush shovel rake block dice frisbee t-shirt tshirt cap jeans dress keychain "
+    "ring tie pedestrian pet animal comb package hook stand electronics supply article belonging valuables step crack "
+    "leak exit dock tag whiteboard ladle whisk yoga sleeping usb drive cd dvd swing slide wheel weed log seed tap "
+    "drain metal spring coil seat pad notepad label stamp coin money cash ticket passport badge lighting wrap weld "
+    "cover lift clip clamp peg grip splash seal strap latch hatch winch hoist drop iron polish spray paint oil grease "
+    "wax trap track guard guide print sketch note pack file pass switchgear stick mail patch building house head cream "
+    "eye hand age"
 )
 NOUNS: Final = (
     _OBJECTS
@@ -154,9 +153,9 @@ NOUNS: Final = (
 
 DETERMINERS: Final = word_set(
     "a an the this that these those my your his her its our their any some all every each both several many few "
-    "another other others more much enough whole entire one two three four five six seven eight nine ten eleven "
-    "twelve zero dozen most various different multiple single either whichever first second third last next following "
-    "same such"
+    "another other others more much enough whole entire one two three four five six seven eight nine ten eleven twelve "
+    "zero dozen most various different multiple single either whichever first second third last next following same "
+    "such"
 )
 # indefinite pronouns, with the noun that a graph uses for them
 INDEFINITE_PRONOUNS: Final = {
@@ -180,17 +179,17 @@ ADDRESSEES: Final = word_set(
 )
 
 # nouns that refer to the task itself: "the goal is to", "any idea where"
-TASK_NOUNS: Final = word_set("task mission goal objective job aim assignment duty idea clue question problem help chance")
+TASK_NOUNS: Final = word_set("task mission goal job aim duty idea clue question problem help chance")
 # nouns for places and properties: the object follows "of", or there is none
 PLACES: Final = word_set(
-    "scene environment surroundings room area world space place vicinity workspace view region zone spot location "
-    "site map surface home floorplan indoors outdoors way side corner middle center centre top bottom edge end front "
-    "back rear left right half part rest remainder interior inside outside distance position pose state status "
-    "condition direction everywhere background foreground sight ground-truth height level perimeter neighbourhood "
-    "neighborhood premises presence existence absence geometry details detail underside topside exterior tip lot size "
-    "colour color shape temperature humidity smell speed damage wear corrosion safety progress time purpose pressure "
-    "voltage moment minute hour day week morning afternoon evening night noon bother trouble favour favor kindness "
-    "matter texture appearance structure"
+    "scene environment surroundings room area world space place vicinity workspace view region zone spot location site "
+    "map surface home floorplan indoors outdoors way side corner middle center centre top bottom edge end front back "
+    "rear left right half part rest remainder interior inside outside distance position pose state status condition "
+    "direction everywhere background foreground sight ground-truth height level perimeter neighbourhood neighborhood "
+    "premises presence existence absence geometry details detail underside topside exterior tip lot size colour color "
+    "shape temperature humidity smell speed damage wear corrosion safety progress time purpose pressure voltage moment "
+    "minute hour day week morning afternoon evening night noon bother trouble favour favor kindness matter texture "
+    "appearance structure"
 )
 # after a preposition and without an article they express manner or purpose: by hand, for lunch, in order
 MANNER_NOUNS: Final = word_set(
@@ -206,8 +205,8 @@ ROUTES: Final = word_set("path way route road course trajectory passage line sho
 MEASURES: Final = word_set(
     "picture photo photograph image video model reconstruction kind type sort piece pair set group pile stack lots "
     "number row bunch couple list total cluster collection copy amount view scan map sample none instance instances "
-    "section suit bit heap batch handful slice lump chunk strip loaf record inventory close-up closeup overview "
-    "weight content"
+    "section suit bit heap batch handful slice lump chunk strip loaf record inventory close-up closeup overview weight "
+    "content"
 )
 # measures and places that a robot can also be asked to handle: "bring me the list"
 PHYSICAL_MEASURES: Final = word_set("picture photo photograph map list model record sample copy")
@@ -221,7 +220,8 @@ _SPACES: Final = (ROOMS - word_set("closet elevator staircase street sidewalk la
     "theatre theater cinema factory hangar farm clinic ward showroom storeroom stockroom mailroom washroom cloakroom "
     "ballroom courtroom playroom storey depot vestibule atrium mezzanine veranda conservatory greenhouse barn cellar "
     "loft nursery playground meadow forest woods beach orchard vineyard plaza town city village canteen cleanroom "
-    "darkroom sunroom dormitory gallery auditorium gymnasium studio home villa pharmacy bakery mudroom zoo stadium den sauna"
+    "darkroom sunroom dormitory gallery auditorium gymnasium studio home villa pharmacy bakery mudroom zoo stadium den "
+    "sauna"
 )
 _SPACE_HEADS: Final = word_set("room area lot hall park site zone storey wing department section suite court space")
 
@@ -243,8 +243,8 @@ PEOPLE: Final = word_set(
     "technician someone anyone everyone somebody anybody everybody who whoever"
 )
 CLOTHING: Final = word_set(
-    "jacket coat shirt vest hat dress suit t-shirt tshirt uniform trousers jeans skirt sweater jumper hoodie cap "
-    "scarf gown apron overalls shorts boots shoes helmet blouse cardigan pullover costume kilt"
+    "jacket coat shirt vest hat dress suit t-shirt tshirt uniform trousers jeans skirt sweater jumper hoodie cap scarf "
+    "gown apron overalls shorts boots shoes helmet blouse cardigan pullover costume kilt"
 )
 PARTS: Final = word_set(
     "handle leg lid knob button screen cable door wheel seat armrest drawer shelf cap label display spout hinge arm "
@@ -293,10 +293,10 @@ _IRREGULAR: Final = dict(
 )
 # words that singular() returns unchanged: plural in form only, or singular with a final s
 UNCHANGED: Final = word_set(
-    "scissors forceps glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs tweezers "
-    "binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species thermos "
-    "asbestos christmas canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls tights "
-    "leggings clippers shears remains goods supplies premises outdoors upstairs downstairs"
+    "scissors forceps glasses sunglasses eyeglasses headphones earphones pants jeans trousers shorts pliers tongs "
+    "tweezers binoculars goggles clothes stairs valuables electronics groceries gas bus lens news series species "
+    "thermos asbestos christmas canvas atlas chaos always mass pass chess press cutlery pajamas pyjamas overalls "
+    "tights leggings clippers shears remains goods supplies premises outdoors upstairs downstairs"
 )
 
 

@@ -344,7 +344,8 @@ class RoleAssigner:
     def _is_final_place(self, pending: str, following: Sequence[Chunk]) -> bool:
         """Return True if no later place is the destination; "on the table into the sink" goes to the sink."""
         more = [chunk.word for chunk in following[:1] if chunk.kind is ChunkKind.PREPOSITION]
-        rooms = [chunk.noun for chunk in following[1:2] if chunk.noun and chunk.noun.head in lexicon.ROOMS | lexicon.PLACES]
+        unfit = lexicon.ROOMS | lexicon.PLACES
+        rooms = [chunk.noun for chunk in following[1:2] if chunk.noun and chunk.noun.head in unfit]
         final = "to" in more or (pending == "on" and bool(_FINAL_DESTINATIONS.intersection(more)) and not rooms)
         return bool(self.clause.objects) and pending in _DESTINATION_RELATIONS and not final
 

@@ -151,8 +151,8 @@ _NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not t
 _MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
 _USUALLY_VERBS: Final = verbs.GO_VERBS | verbs.TOOL_VERBS | verbs.SEARCH_VERBS | word_set("stop hand")
 _NEVER_NOUNS: Final = verbs.GO_VERBS | word_set(
-    "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear "
-    "know think eat sit seem contain include become lose forget boil"
+    "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear know think eat sit "
+    "seem contain include become lose forget boil"
 )
 # at the start of a clause no things: "stand in front of", "swing left", "stock the shelf"
 _MOTIONS: Final = verbs.GO_VERBS | verbs.STOPPING_VERBS | word_set("turn pass")

@@ -143,7 +143,9 @@ _PLAIN: Final = {
     r"(?:likes?|loves?|tends?|prefers?) to \w+(?= (?:on|in|under|behind|near|by|next)\b)": "is",
     rf",? (?:but )?(?:no|not) (?:closer|nearer|farther|further) than {_VALUE} ?{_UNIT}{_END}": "",
     rf"^(?:[\w ]* )?(?:which|what) (\w+(?: \w+)?) (?:(?:is|are|(?:did|do|does|has|have|can) \w+ \w+) ([\w ]{{2,40}}?)|"
-    rf"((?:the|my|your) [\w ]{{2,30}}?) (?:is|are))(?: \w+ing)? ({_PLACED}|against)$": r"find the \1 and \2\3 \4 the \1",
+    rf"((?:the|my|your) [\w ]{{2,30}}?) (?:is|are))(?: \w+ing)? ({_PLACED}|against)$": (
+        r"find the \1 and \2\3 \4 the \1"
+    ),
     # a viewpoint: before the description its object may be meant, after it not
     r"(?:(?:if |when |while |as )?(?:you (?:are )?)?(?:facing|looking at)|(?:if|when|as) you (?:face|look at)) "
     r"([\w ]{2,40}),(?: (?:it|that) is)?": r"there is \1;",
@@ -162,7 +164,8 @@ _PLAIN: Final = {
     r"(?:anywhere|somewhere) but(?= (?:on|in|under|near|at|next to)\b)": ", not",
     r"with neither (.{2,40}?) nor": r"without \1 or",
     rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",
-    rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? (?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
+    rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? "
+    r"(?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
     r"|(?:before|when|once|after) you (?:get to|reach|come to|arrive at|hit))": r"\1 at",
     r"^not (the \w+)( [^,.;]+?),? but the one( [^,.;]+)": r"\1\3, not the one\2",
     r"out of the way of": "away from",
@@ -191,7 +194,9 @@ _PLAIN: Final = {
     rf"to (?:dry|cool|soak|thaw|rest)(?: off| down)?(?= {_PLACED})": "",
     r"on the (?:left|right)(?= and the\b)": "",
     r"(?:something|anything) wrong with": "",
-    rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED}|{_VALUE} {_UNIT})\b)": "and stop",
+    rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED}|{_VALUE} {_UNIT})\b)": (
+        "and stop"
+    ),
     rf"with ((?!no)(?:\w+ ){{1,4}}?)(?:{_PLACED}|inside|around|over) (?:it|them)": r"holding \1",
     r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)": "",
     r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
