@@ -78,7 +78,7 @@ class VerbChunker:
         if subject is Tag.INFINITIVE and buffer.tag(-2) is Tag.INDEFINITE and buffer.tag(1) not in OBJECT_START_TAGS:
             buffer.close()  # "something to write with"
         elif is_required and self._subject_is_object():
-            if base in verbs.BELONGING_VERBS:
+            if base in verbs.BELONGING_VERBS or buffer.word(-1) == "be":
                 buffer.emit(ChunkKind.SUBJECT_VERB, base)
         elif (
             base in verbs.BELONGING_VERBS

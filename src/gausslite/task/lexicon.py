@@ -171,7 +171,7 @@ ADVERBS: Final = word_set(
     "so-so here there else sure still already yet always almost instead fast soon later today tonight tomorrow earlier "
     "yesterday sometime sometimes whenever maybe perhaps straight about nearly nearby anywhere somewhere together "
     "alone afterwards even ever quite rather pretty otherwise therefore however anyway indeed twice possible necessary "
-    "ago overhead halfway only able um uh er erm hmm oh"
+    "ago overhead halfway only able um uh asap er erm hmm oh"
 )
 # names and forms of address for the robot
 ADDRESSEES: Final = word_set(

@@ -124,7 +124,7 @@ _PLAIN: Final = {
     r"(you|we|they)'re": r"\1 are",
     r"i'm(?= \w+ (?:to|of|with)\b)": "i am",
     r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
-    r"gets(?= \w+(?:ed|en|wn)\b)": "should be",
+    r"gets(?= \w+(?:ed|en|wn)\b)|(?:is|are) to be": "should be",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
     r"(i|you|we) last(?= \w)": r"\1",
@@ -192,7 +192,8 @@ _PLAIN: Final = {
     r"(?:to|on) your (?:\w+ )?(?:left|right)(?: hand)?(?: side)?(?! of\b)": "",
     r"(?:on top|at the (?:head|foot))(?! of\b)": "",
     rf"to (?:dry|cool|soak|thaw|rest)(?: off| down)?(?= {_PLACED})": "",
-    r"on the (?:left|right)(?= and the\b)": "",
+    r"on the (?:left|right)(?=,? (?:and )?the\b)|upside down|(?:how|what) about(?= \w+ing\b)": "",
+    r"why (?:don't|do not|not)(?: you| we)?": "please",
     r"(?:something|anything) wrong with": "",
     rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED}|{_VALUE} {_UNIT})\b)": (
         "and stop"
