@@ -116,10 +116,6 @@ class VerbChunker:
         )
         if can_start and after in NOUN_PHRASE_TAGS and lexicon.ADJECTIVES.issuperset(buffer.words):
             buffer.words.append(word)  # "the leaking pipe"
-        elif before is Tag.PREPOSITION and buffer.last_kind() is ChunkKind.NOUN and buffer.tag(-2) in _MODIFIED_TAGS:
-            buffer.close()  # "a cloth for wiping the table"
-            if after in OBJECT_START_TAGS:
-                buffer.emit_preposition("purpose")
         elif (
             before is Tag.NOUN
             and verbs.base_of_ing(word) in _PASSING
@@ -231,7 +227,6 @@ class _Chunker:
             Tag.GERUND: self._verbs.gerund,
             Tag.PARTICIPLE: self._verbs.participle,
             Tag.PREPOSITION: self._preposition,
-            Tag.PARTICLE: self._particle,
             Tag.CONJUNCTION: lambda word: self._buffer.emit(ChunkKind.CONJUNCTION, word),
             Tag.CLAUSE_BREAK: self._clause_break,
             Tag.INDEFINITE: self._indefinite,
@@ -409,9 +404,3 @@ class _Chunker:
             return
         is_required = buffer.last_kind() is ChunkKind.SUBJECT_VERB  # "should be stacked against the wall"
         buffer.emit_preposition(relation, text, before in _LOCATION_TAGS and not is_required, bounds)
-
-    def _particle(self, word: str) -> None:
-        buffer = self._buffer
-        buffer.close()
-        if word in PREPOSITIONS and (buffer.tag(1), buffer.tag(2)) == (Tag.CONJUNCTION, Tag.PREPOSITION):
-            buffer.emit_preposition(PREPOSITIONS[word], word)  # "under or behind the couch"

@@ -102,8 +102,6 @@ def _is_statement(tagged: TaggedWords, start: int) -> bool:
         tag = tagged[index][1]
         if tag in (Tag.AUXILIARY, Tag.VERB):
             return index > start and not (tag is Tag.VERB and is_command(tagged, index))
-        if tag is Tag.PARTICIPLE and index + 1 < len(tagged) and tagged[index + 1][1] is Tag.DETERMINER:
-            return index > start
         if tag not in _SUBJECT_PHRASE_TAGS and tag is not Tag.PARTICIPLE:
             return False
     return False

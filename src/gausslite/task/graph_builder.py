@@ -168,8 +168,6 @@ class GraphBuilder:
         if is_leave and self._draft.targets and self._leave_excludes(before):
             self._negate()
             return
-        if chunk.gerund and before is not None and before.kind is ChunkKind.VERB and before.word == "avoid":
-            self._negation("avoid " + chunk.word)
         joined = before is not None and before.kind is ChunkKind.CONJUNCTION
         same_negation = self._negated and (
             # "don't turn left, go to the table"

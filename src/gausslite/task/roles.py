@@ -98,7 +98,7 @@ class RoleAssigner:
 
     def assign(self, noun: NounPhrase, pending: str | None, conjoined: bool, following: Sequence[Chunk]) -> None:
         """Assign one noun, given its preposition, whether a conjunction precedes it, and the following chunks."""
-        clause, after = self.clause, following[0] if following else None
+        clause = self.clause
         if pending == "of" and clause.skip_of_phrase:
             pending, conjoined = clause.inherited_preposition, clause.inherited_conjoined
             clause.skip_of_phrase, clause.inherited_preposition = False, None
@@ -106,7 +106,7 @@ class RoleAssigner:
             if lexicon.is_space(noun.words) and clause.verb in _CROSSING_VERBS | {"take"} and not clause.objects:
                 self._draft.add_context(noun.text)
                 clause.crosses, clause.verb = True, "cross"  # "leave the kitchen through the door"
-            elif conjoined and clause.last_relation is not None and self._is_second_anchor(noun, after):
+            elif conjoined and clause.last_relation is not None and self._is_second_anchor(noun):
                 self._add_anchor(clause.last_relation, noun)
             elif self._is_recipient(following):
                 self._add_destination(noun)
@@ -142,7 +142,7 @@ class RoleAssigner:
         elif pending == "purpose" and self._acts_on_people():
             self._relations.relate("near", noun)  # "the man talking to the nurse"
         elif pending == "purpose":
-            self._assign_path_end(noun)
+            clause.last_relation = "with"  # where a door leads or what a key opens
         elif noun.head in lexicon.BODY_PARTS and pending in ("near", "inside", "on") and self._acts_on_people():
             return  # "raising their arm"
         elif pending == "inside" and noun.head in lexicon.CLOTHING and self._acts_on_people():
@@ -167,8 +167,6 @@ class RoleAssigner:
             by_route and clause.verb in verbs.LEADING_VERBS and clause.objects
         ):
             self._draft.add_target(noun.text)
-        elif by_route and clause.verb in verbs.DELIVERY_VERBS and not clause.objects:
-            self.target(noun, TargetRole.OBJECT)  # "lead me around the puddle"
         elif (
             (moves_by and (clause.adds_place or aimless))  # "walk by the bathroom, by the bedroom"
             or (pending == "past" and clause.verb in verbs.TRAVEL_VERBS)
@@ -192,8 +190,6 @@ class RoleAssigner:
             if not clause.objects and noun.is_definite and not clause.in_space:
                 self._assign_waypoint(noun)  # "walk on with the railing on your left"
                 return
-        if clause.verb is None and clause.pending_places and lexicon.is_space(clause.pending_places[-1][1].words):
-            return  # "in the room with the fireplace, dust"
         if not clause.objects and clause.verb is None and not clause.terms.negated:
             clause.pending_places.append((clause.terms, noun))  # "with a sponge, wipe the table"
         elif (noun.is_known or noun.has_determiner) and (clause.objects or clause.verb is None):
@@ -245,14 +241,6 @@ class RoleAssigner:
             self.target(noun, TargetRole.OBJECT, conjoined)
         self.clause.route = True
 
-    def _assign_path_end(self, noun: NounPhrase) -> None:
-        """Make the end of a path a target; where a door leads or what a key opens is no target."""
-        passage = self._draft.mentions[-1:] and self._draft.mentions[-1].split()[-1] in _PASSAGES
-        if self.clause.route and not passage:
-            self.target(noun, TargetRole.DESTINATION)
-        else:
-            self.clause.last_relation = "with"
-
     def _acts_on_people(self) -> bool:
         return self._are_people((*self.clause.objects, *self._draft.mentions[-1:]))
 
@@ -263,8 +251,6 @@ class RoleAssigner:
         if clause.by_pronoun and moved and not clause.statement and pending in _DESTINATION_RELATIONS:
             return True  # "and line them up on the shelf"
         pushes = clause.verb in verbs.PUSHING_VERBS and bool(clause.objects)
-        if pushes and clause.preposition.startswith(("to the ", "on to")):
-            return True  # "move the mug to the left of the plate"
         are_objects = any(self._draft.roles.get(phrase) is TargetRole.OBJECT for phrase in clause.objects)
         # "push the ball between the cones", unlike "push the button next to the door"
         moves = pushes and are_objects and not clause.is_part and clause.verb != "pull" and pending in _PUSHED_TO
@@ -275,8 +261,6 @@ class RoleAssigner:
     def _add_anchor(self, relation: str, noun: NounPhrase) -> None:
         if relation == "to":
             self._add_destination(noun, conjoined=True)
-        elif relation == "with":
-            self._add_tool(noun, conjoined=True)
         else:
             self._relations.relate(relation, noun)
 
@@ -301,10 +285,6 @@ class RoleAssigner:
         """Assign the noun after "with": the hat of "find a man with a hat" is near him, a sponge is a tool."""
         clause = self.clause
         is_part = noun.head in lexicon.PARTS or noun.head in lexicon.CLOTHING
-        if noun.head in lexicon.BODY_PARTS and clause.verb and clause.objects and not self._are_people(clause.objects):
-            return  # "with both hands"
-        if clause.last_relation == "for":
-            return  # "for the man with the trolley"
         if clause.last_relation == "to" and clause.places and (is_part or not self._may_be_tool(noun)):
             self._relations.relate_places(RelationTerms("near"), noun)
         elif (
@@ -349,17 +329,13 @@ class RoleAssigner:
         final = "to" in more or (pending == "on" and bool(_FINAL_DESTINATIONS.intersection(more)) and not rooms)
         return bool(self.clause.objects) and pending in _DESTINATION_RELATIONS and not final
 
-    def _is_second_anchor(self, noun: NounPhrase, after: Chunk | None) -> bool:
+    def _is_second_anchor(self, noun: NounPhrase) -> bool:
         """Return True for the stove in "near the sink and the stove", not for a target of its own."""
         if self.clause.last_relation == "between" or self.clause.between or self.clause.is_alternative:
             return True
         # "a couch with a throw and two cushions", unlike "the mug with a lid and the plate"
         if self.clause.describes and not noun.is_definite:
             return self.clause.verb is None or self.clause.verb in verbs.LOOKING_VERBS | verbs.STOPPING_VERBS
-        if after is not None and after.kind is ChunkKind.PREPOSITION and after.word not in ("of", "to", "for", "with"):
-            return False
-        if lexicon.is_space(noun.words) and self.clause.in_space:
-            return True
         return noun.head in lexicon.COMMON_ANCHORS and self.clause.last_relation not in ("on", "inside", "with")
 
     def role_of_object(self, head: str) -> TargetRole:
@@ -386,10 +362,7 @@ class RoleAssigner:
         clause.is_part = noun.head in lexicon.PARTS
         pending_places, clause.pending_places = clause.pending_places, []
         for terms, anchor in pending_places:
-            if terms.relation == "with" and clause.verb is not None:
-                self._add_tool(anchor)
-            else:
-                self._relations.relate_by(replace(terms, relation=terms.relation.replace("with", "near")), anchor)
+            self._relations.relate_by(replace(terms, relation=terms.relation.replace("with", "near")), anchor)
 
     def _are_people(self, phrases: Sequence[str]) -> bool:
         return any(phrase.split()[-1] in lexicon.PEOPLE for phrase in phrases)
@@ -411,8 +384,6 @@ class RoleAssigner:
             if clause.verb in verbs.LEADING_VERBS and clause.objects:
                 self._add_destination(noun)
                 return
-            if clause.verb in verbs.REACHING_VERBS:  # "climb the ladder to the attic"
-                self._draft.roles.update(dict.fromkeys(clause.objects, TargetRole.OBJECT))
             self.target(noun, role, conjoined=bool(clause.objects))
             clause.route = False
         else:
@@ -452,9 +423,6 @@ class RoleAssigner:
         going = clause.verb in verbs.GO_VERBS - verbs.SEARCH_VERBS and not (
             clause.objects and clause.verb in verbs.LEADING_VERBS | verbs.MOVING_VERBS
         )
-        if lexicon.is_space(noun.words) and not clause.objects and clause.verb is None:
-            self._draft.add_context(noun.text)  # "once you are out of the bathroom"
-            return
         if going:
             if pending == "from_inside" and not encloses and noun.head not in lexicon.ROOMS:
                 self._assign_waypoint(noun, conjoined=True)  # "out of the back door"
