@@ -7,32 +7,15 @@ from typing import Final
 
 from gausslite.domain.nouns import is_thing
 from gausslite.domain.task import Superlative
+from gausslite.task.verbs import TABLES, words
 from gausslite.task.verbs import word_set as word_set
-from gausslite.task.verbs import words
 
 COLOURS: Final = words("colours")
 _SHADES: Final = word_set("light dark bright pale deep")
 # a colour and a noun that together name another thing
 _COLOUR_COMPOUNDS: Final = frozenset(tuple(pair.split("_")) for pair in words("colour_compounds"))
-_WORDS_OF_SUPERLATIVE: Final = {
-    Superlative.LARGEST: "largest biggest hugest greatest larger bigger",
-    Superlative.SMALLEST: "smallest tiniest littlest smaller tinier littler",
-    Superlative.TALLEST: "tallest taller",
-    Superlative.SHORTEST: "shortest shorter",
-    Superlative.LONGEST: "longest longer",
-    Superlative.WIDEST: "widest wider broadest broader",
-    Superlative.NARROWEST: "narrowest narrower",
-    Superlative.THICKEST: "thickest thicker fattest fatter",
-    Superlative.THINNEST: "thinnest thinner slimmest slimmer",
-    Superlative.HIGHEST: "highest topmost uppermost higher",
-    Superlative.LOWEST: "lowest bottommost lowermost",
-    Superlative.LEFTMOST: "leftmost left-most",
-    Superlative.RIGHTMOST: "rightmost right-most",
-    Superlative.NEAREST: "nearest closest nearer closer",
-    Superlative.FARTHEST: "farthest furthest farther further remotest",
-}
 SUPERLATIVES: Final = {
-    word: superlative for superlative, words in _WORDS_OF_SUPERLATIVE.items() for word in words.split()
+    word: Superlative(name) for name, words_of_it in TABLES["superlatives"].items() for word in words_of_it.split()
 }
 COMPARATIVES: Final = frozenset(
     word
@@ -114,11 +97,7 @@ NOUNS: Final = (
 
 DETERMINERS: Final = words("determiners")
 # indefinite pronouns, with the noun that a graph uses for them
-INDEFINITE_PRONOUNS: Final = {
-    "something": "object", "anything": "object", "everything": "object", "someone": "person", "anyone": "person",
-    "everyone": "person", "somebody": "person", "anybody": "person", "everybody": "person", "what": "object",
-    "whatever": "object", "nothing": "object", "nobody": "person", "whoever": "person",
-}  # fmt: skip
+INDEFINITE_PRONOUNS: Final = TABLES["indefinite_pronouns"]
 # an ordinal that is part of a compound noun
 COMPOUND_OPENERS: Final = frozenset({("first", "aid"), ("second", "hand")})
 # irrelevant to the graph; most other adverbs end in -ly
@@ -167,13 +146,7 @@ GENERIC: Final = word_set("object thing item stuff obstacle obstruction clutter 
 ADJECTIVES: Final = COLOURS.union(SUPERLATIVES) | words("adjectives")
 
 # words that always exclude the following noun or verb
-_EXCLUDING: Final = (
-    "without|neither|nor|do not|don't|dont|never|ignore|ignoring|except for|except|excluding|exclude|"
-    "but not|not to|not|other than|rather than|instead of|apart from|aside from|skip|skipping|disregard|"
-    "disregarding|besides|must not|should not|leave out|leaving out|avoid touching|avoid hitting|"
-    "forget about|forget|doesn't|can't|cannot|shouldn't|mustn't|omit|neglect|avoid bumping"
-)
-NEGATIONS: Final = frozenset(tuple(negation.split()) for negation in _EXCLUDING.split("|"))
+NEGATIONS: Final = frozenset(tuple(negation.split()) for negation in str(TABLES["excluding"]).split("|"))
 
 
 _IRREGULAR: Final = dict(pair.split(":") for pair in words("irregular_nouns"))

@@ -10,6 +10,7 @@ from gausslite.domain.nouns import is_thing
 from gausslite.task import lexicon, verbs
 from gausslite.task.lexicon import UNCHANGED, is_attribute, singular, word_set
 from gausslite.task.tokens import PREPOSITIONS, split_bounds
+from gausslite.task.verbs import TABLES
 
 
 class Tag(Enum):
@@ -104,47 +105,6 @@ def _cost(pair: tuple[int, Tag | None]) -> int:
 
 Options = dict[Tag, int]
 
-# one line for words with the same possible tags; the digits after a tag are its cost
-_CLOSED_LINES: Final = """
-d0: a an the my your his our their its every whose
-q0: no
-d0 o3: her
-d0 k2: this these those
-d0 k4 w0 s13: that
-d0 w0: which
-d0 n3: one
-d0 t15: all both each more most
-d0 s3: first second third last next
-d5 a0 n9: half
-k0: it them
-o0: i me you he him she we us they myself yourself itself themselves himself herself mine yours
-x0: is are was were be been being am could would should will shall may might must does did has had having ought
-x4 n0: can
-a0 p2: closest nearest
-x0 v15: do have
-v0: let lets
-i3 w0: who
-w0: whom where how why
-s0 w5: when
-s0: . ; : ! ? then while if whether because unless although though once as than
-s0 p2: before after until since
-c0: and or , / & plus but + ( )
-p0 u0: to
-t0: away out apart ahead forward forwards backward backwards upstairs downstairs aside
-t0 n8 a5 v15: back
-t0 p20: up down
-t0 p3: off
-t3 p2: around
-t0 p2: outside
-p0 t5: over inside
-p0 t10: in on under below above behind along through past across by near
-p0 g0: touching facing surrounding
-p3 v0: like
-a0 e3 n14 t20: left
-a0 n14 t8: right
-n0: ones everywhere
-i0 d8: what whatever
-"""
 # "go stand", "help clean": the second verb is the instruction
 _LEADING_VERBS: Final = word_set("go come help")
 _NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
@@ -185,11 +145,7 @@ _CLOSED: Final[dict[str, Options]] = (
     | {" ".join(negation): {Tag.NEGATION: 0} for negation in lexicon.NEGATIONS}
     | {word: {Tag.DETERMINER: 0} for word in lexicon.DETERMINERS}
     | {word: {Tag.INDEFINITE: 0} for word in lexicon.INDEFINITE_PRONOUNS}
-    | {
-        word: _options(line.partition(": ")[0])
-        for line in _CLOSED_LINES.strip().splitlines()
-        for word in line.partition(": ")[2].split()
-    }
+    | {word: _options(tags) for tags, line in TABLES["tags"].items() for word in line.split()}
 )
 
 

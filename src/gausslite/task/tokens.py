@@ -8,6 +8,7 @@ from typing import Final
 
 from gausslite.task import lexicon
 from gausslite.task.lexicon import COLOURS, COMPARATIVES
+from gausslite.task.verbs import TABLES
 
 _NUMBERS: Final = {
     "a quarter of a": 0.25, "half a": 0.5, "half an": 0.5, "half": 0.5, "a couple of": 2.0, "a": 1.0, "an": 1.0,
@@ -130,7 +131,6 @@ _PLAIN: Final = {
     r"(i|you|we) last(?= \w)": r"\1",
     r"^whose": "the",
     r"(?:with|has|have) (?:its|their|the) backs? (?:to|towards?|facing|against)": "near",
-    r"the (?:one|object|thing) (?:that )?(?:i|we|you) (?:want|need|mean|(?:am |are )?look(?:ing)? for) is": "it is",
     r"belonging to": "of",
     r"in (?:your|my) hands?|(?:(?:that|which) )?you(?: are)? (?:holding|carrying)": "",
     r"do(?:es)? (?:any|some)(?:one|body) know": "",
@@ -161,13 +161,10 @@ _PLAIN: Final = {
     ),
     r"you (?:can|will|may|should)? ?find (?:her|him|it|them)": "it is",
     r"between (?:you|me|us) and": "between",
-    r"(?:anywhere|somewhere) but(?= (?:on|in|under|near|at|next to)\b)": ", not",
-    r"with neither (.{2,40}?) nor": r"without \1 or",
     rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",
     rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? "
     r"(?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
     r"|(?:before|when|once|after) you (?:get to|reach|come to|arrive at|hit))": r"\1 at",
-    r"^not (the \w+)( [^,.;]+?),? but the one( [^,.;]+)": r"\1\3, not the one\2",
     r"out of the way of": "away from",
     r"(one|two|three) (?:by|at a) (?:one|two|three|time)|side by side": "",
     r"(stop|wait|halt)(?: walking| moving)? (?:once|when|after|as soon as) you(?: are| have)?": r"\1",
@@ -203,7 +200,6 @@ _PLAIN: Final = {
     r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
     rf"where (the [\w ]+?) (?:is|are)(?: \w+(?:ed|ing)| kept)?{_END}": r"\1 with \2",
     r"(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
-    r"leave(?= (?:through|via)\b)": "exit",
     r"(?:at the (?:bottom|top),? )?(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
     # a double negation is a request
     r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
@@ -213,7 +209,6 @@ _PLAIN: Final = {
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)|"
     r"(?:^|(?<=[.;,] ))you (?:will )?(?:see|find|notice)": "i see",
     r"back(?= where\b)": "",
-    r"(?:so|as|very|quite|too) well": "",
     r"reach(?:ing)? for": "grab",
     r"(?:head|make|leave|set off|set out) for(?= (?:the|a|an|my|that|this)\b)": "go to",
     r"(there|where|what|who|that)s": r"\1 is",
@@ -235,13 +230,11 @@ _PLAIN: Final = {
     r"keep (?:your|a safe|some|a) distance (?:from|to)|(?:stay|keep) off(?: of)?(?= \w)": "avoid",
     rf"(?:keep|stay|remain) (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
     r"not (?:\w+ )?far (?:away )?from": "near",
-    r"(?:farthest|furthest|most distant) away(?! from)|most distant(?! from)": "farthest",
     r"(\w+) number (?:\d+|one|two|three|four|five)": r"\1",
     rf"(?:\w+ (?:floor|level|story))(?= (?:\w+room|{'|'.join(lexicon.ROOMS)})\b)": "",
     r"(?:level|floor|storey) (?:one|two|three|four|\d)": "storey",
     r"around the (?:corner|bend)(?! of)": "",
     r"(?:is|are|am|have run|has run|ran)(?: almost)? out of (?!the\b|my\b)\w+": "is empty",
-    r"(?:^|(?<=[,;.] )|(?<=and )|(?<=then ))plug in(?= (?:the|my|an?)\b)": "activate",
     r"until you (?:see|find|spot|notice|come to|get to|hit)": "until you reach",
     r"(?:ground|first|second|third|top|upper|lower|next|\w+th|\d+(?:st|nd|rd)) (?:floor|level)\b"
     r"(?! (?:tile|lamp|mat|plan|board))": "storey",
@@ -314,51 +307,10 @@ def replace_idioms(text: str) -> str:
     return mark_distances(_TWO_COLOURS.sub(r"\1-and-\2", text))
 
 
-# a relation that is not a Predicate becomes `near`, with a warning; prepositions are separated by "|"
-_BY_RELATION: Final = {
-    "near": "near|next to|beside|by|close to|adjacent to|alongside|at|around|against|nearby to|touching|"
-    "connected to|in the vicinity of|next|surrounding|along|close by|by the side of|at the side of|right next to|"
-    "in reach of|within reach of|leaning on|leaning against|at the end of|at the head of|at the foot of|at the base of|"
-    "at the edge of|on either side of|on both sides of|within arm's reach of|within easy reach of|tied to|"
-    "chained to|hooked to|leashed to|plugged into|propped against|resting against",
-    "closer": "closer to|nearer to",
-    "on": "on|all over|scattered over|spread over|on top of|upon|atop|resting on|on the top of|at the top of|"
-    "on the surface of|mounted on|on the side of|attached to|stuck to|stuck on|taped to|glued to|pinned to|"
-    "nailed to|screwed to|bolted to|fixed to|fastened to|clipped to|hung on|hanging on|hanging from|hung from|"
-    "mounted to|hung up on|hanging off",
-    "closest_to": "closest to|nearest to|nearest|closest|most close to|nearest from|closest from",
-    "farthest_from": "farthest from|furthest from|farthest to|farthest away from|furthest away from|"
-    "most distant from|furthest to|further from|farther from|further away from|farther away from",
-    "far_from": "far from|away from|far away from|clear of|far off",
-    "at_distance": VAGUE_MARKER,
-    "inside": "in|inside|inside of|within|in the middle of|in the center of|in the centre of|in the corner of",
-    "under": "under|underneath|beneath|below|underneath of",
-    "above": "above|over",
-    "behind": "behind|in back of|at the back of|in the back of|to the rear of|at the rear of|on the other side of|"
-    "on the far side of|round the back of|around the back of",
-    "in_front_of": "in front of|at the front of|before the front of|ahead of",
-    "left_of": "left of|to the left of|on the left of|on the left side of|to the left side of|"
-    "on the left-hand side of|on the left hand side of|at the left of|left side of",
-    "right_of": "right of|to the right of|on the right of|on the right side of|to the right side of|"
-    "on the right-hand side of|on the right hand side of|at the right of|right side of",
-    "between": "between|in between|among|amongst|amid",
-    "opposite": "opposite|opposite to|opposite from|across from|facing|opposite of",
-    "outside": "outside|outside of|out in front of",
-    "beyond": "beyond",
-    "past": "past|through|across|via|up|down",
-    "when": "before|after|during|like|until|since|despite|per",
-    "from": "from",
-    "from_on": "off|off of|from the top of|from on top of|from atop",
-    "from_under": "out from under|out from underneath|from under|from underneath|from below|from beneath",
-    "from_inside": "out of|from inside|from within|from inside of|from out of",
-    "from_behind": "from behind|out from behind",
-    "from_near": "from near|from beside|from next to",
-    "to": "to|into|onto|toward|towards|up to|over to|back to|all the way to|down to|inside to|out to",
-    "for": "for",
-    "of": "of",
-    "with": "with|using|by means of|by using",
-}
-PREPOSITIONS: Final = {words: relation for relation, line in _BY_RELATION.items() for words in line.split("|")}
+# a relation that is not a Predicate becomes `near`, with a warning
+PREPOSITIONS: Final = {
+    words: relation for relation, line in TABLES["prepositions"].items() for words in line.split("|")
+} | {VAGUE_MARKER: "at_distance"}
 
 
 _TOKEN: Final = re.compile(r"[^\W\d_][\w'’-]*|\d[\w.]*|[,/&+;.!?:()]")

@@ -12,12 +12,12 @@ def word_set(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-_LISTS: Final = tomllib.loads(resources.files("gausslite.task").joinpath("words.toml").read_text(encoding="utf-8"))
+TABLES: Final = tomllib.loads(resources.files("gausslite.task").joinpath("words.toml").read_text(encoding="utf-8"))
 
 
 def words(name: str) -> frozenset[str]:
     """Return a word list of `words.toml`."""
-    return word_set(_LISTS[name])
+    return word_set(TABLES[name])
 
 
 GO_VERBS: Final = words("go_verbs")
