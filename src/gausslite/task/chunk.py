@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from gausslite.domain.nouns import is_thing
-from gausslite.task import lexicon
+from gausslite.task import lexicon, verbs
 from gausslite.task.lexicon import DISTANCE_SUPERLATIVES, SUPERLATIVES, is_attribute, singular, word_set
 from gausslite.task.tags import Tag
 from gausslite.task.tokens import Bounds
 
 # drinking glasses have a singular, spectacles have none
-_DRINK_WORDS = word_set(
-    "wine beer water champagne drinking cocktail juice whisky whiskey shot pint milk measuring dirty empty"
-)
+_DRINK_WORDS = verbs.words("drink_words")
 _DEFINITE = word_set("the this that these those my your his her its our their")
 _PLACES_OF_A_THING = word_set("center centre middle edge")
 
@@ -171,3 +169,61 @@ class ChunkBuffer:
             noun = replace(noun, is_definite=is_definite, is_plural=noun.head != self.words[-1])
             self.chunks.append(Chunk(ChunkKind.NOUN, self.words[-1], noun))
         self.words, self.has_determiner = [], False
+
+
+# they make a picture: "take a picture of the mug"
+_PICTURING_VERBS = frozenset(
+    {"take", "make", "get", "capture", "shoot", "draw", "snap", "record", "want", "need", "see"}
+)
+
+
+def names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chunk], verb: str | None) -> bool:
+    """Return False for names of the robot, and for places, routes and amounts that stand for another noun."""
+    is_named = (noun.has_determiner and pending == "to") or (noun.is_plural and pending == "with")
+    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES and not is_named:
+        return False
+    if noun.head in lexicon.TASK_NOUNS and pending is None:
+        return False
+    of_follows = bool(following) and following[0].kind is ChunkKind.PREPOSITION and following[0].word == "of"
+    content = following[1].noun if of_follows and len(following) > 1 else None
+    is_picture = noun.head in lexicon.PICTURES and verb not in _PICTURING_VERBS
+    if content is not None and not (content.has_determiner or is_picture or noun.head in lexicon.CONTAINERS):
+        return False  # "a bar of soap"
+    if of_follows and is_picture:
+        return True
+    compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
+    if compound and noun.head in lexicon.PLACES and not of_follows:
+        return True
+    if noun.head in lexicon.PHYSICAL_MEASURES and verb in verbs.HANDLING_VERBS and pending is None and not of_follows:
+        return True
+    unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
+    likely = (None, "from", "of", "to", "on", "with" if noun.has_determiner else None)
+    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in likely:
+        return False
+    return _names_by_kind(noun, pending, verb, of_follows, compound)
+
+
+def _names_by_kind(noun: NounPhrase, pending: str | None, verb: str | None, of_follows: bool, compound: bool) -> bool:
+    if noun.head in lexicon.BUILDINGS:
+        return pending != "inside" or bool(noun.words[1:])
+    if noun.head in lexicon.PLACES:
+        if pending == "to" and lexicon.is_space(noun.words):
+            return True  # "to the cold room"
+        return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
+    if (
+        verb in verbs.SPEAKING_VERBS | {"report"}
+        and pending is None
+        and (verb == "say" or of_follows)
+        and noun.head not in lexicon.PEOPLE | lexicon.CONTAINERS
+    ):
+        return False  # "say your name", "tell me the name of the person"
+    if noun.words == ("light",) and of_follows and pending is not None:
+        return False  # "by the light of the lamp"
+    if noun.head in lexicon.ROUTES and not compound and noun.words[0] not in lexicon.COLOURS:
+        return pending not in (None, "of", "for", "to")
+    if noun.head in lexicon.MEASURES and pending not in (None, "of"):
+        return not of_follows
+    # "the smallest piece"
+    described = len(noun.words) > 1 and verb not in _PICTURING_VERBS
+    known = noun.head in lexicon.NOUNS or (noun.is_known and pending != "of")
+    return noun.head not in lexicon.MEASURES or ((known or compound or described) and not of_follows)

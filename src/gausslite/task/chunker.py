@@ -25,10 +25,9 @@ from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
 _OBJECT_TAGS: Final = OBJECT_START_TAGS | {Tag.PRONOUN, Tag.ANAPHOR}
-_DESCRIBED: Final = (ChunkKind.NOUN, ChunkKind.ATTRIBUTE)
 _NAMING: Final = word_set("label mark name call tag")
 _PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
-_MODIFIED_TAGS: Final = frozenset({Tag.NOUN, Tag.PARTICIPLE})
+_BELONGING_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.ANAPHOR, Tag.PARTICIPLE})
 
 
 class VerbChunker:
@@ -75,19 +74,16 @@ class VerbChunker:
         is_required = self._after_modal
         self._after_modal = is_modal(tagged, index) and subject in SUBJECT_TAGS
         is_wish = subject is Tag.PRONOUN and base in WISHES
+        belongs = base in verbs.BELONGING_VERBS and word.startswith(base) and subject in _BELONGING_TAGS
+        described = buffer.last_kind(1) in (ChunkKind.NOUN, ChunkKind.ATTRIBUTE)
         if subject is Tag.INFINITIVE and buffer.tag(-2) is Tag.INDEFINITE and buffer.tag(1) not in OBJECT_START_TAGS:
             buffer.close()  # "something to write with"
         elif is_required and self._subject_is_object():
             if base in verbs.BELONGING_VERBS or buffer.word(-1) == "be":
                 buffer.emit(ChunkKind.SUBJECT_VERB, base)
-        elif (
-            base in verbs.BELONGING_VERBS
-            and word.startswith(base)
-            and subject in (Tag.NOUN, Tag.INDEFINITE, Tag.ANAPHOR, Tag.PARTICIPLE)
-            and not is_command(tagged, index)
-        ):
+        elif belongs and not is_command(tagged, index):
             buffer.emit(ChunkKind.SUBJECT_VERB, base)
-        elif subject is Tag.CONJUNCTION and word != base and buffer.last_kind(1) in _DESCRIBED:
+        elif subject is Tag.CONJUNCTION and word != base and described:
             buffer.chunks.pop()  # "which is near the window and opens to the hall"
             if buffer.tag(1) in _OBJECT_TAGS:
                 self._subordinate_verb(base)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from gausslite.domain.task import TargetRole
 from gausslite.task import lexicon
-from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, phrase_from_text
+from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, names_object, phrase_from_text
 from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
 from gausslite.task.roles import RoleAssigner
@@ -15,10 +15,8 @@ from gausslite.task.verbs import (
     BELONGING_VERBS,
     CONTACT_VERBS,
     GO_VERBS,
-    HANDLING_VERBS,
     LEAVING_VERBS,
     PLACE_VERBS,
-    SPEAKING_VERBS,
     TRAVEL_VERBS,
 )
 
@@ -26,10 +24,6 @@ from gausslite.task.verbs import (
 # with these, a room or place states where something is
 _SPACE_PREPOSITIONS = frozenset(
     {"at", "around", "throughout", "across", "on", "near the middle of", "along", "through"}
-)
-# they make a picture: "take a picture of the mug"
-_PICTURING_VERBS = frozenset(
-    {"take", "make", "get", "capture", "shoot", "draw", "snap", "record", "want", "need", "see"}
 )
 _THOSE_THERE = [ChunkKind.DEMONSTRATIVE, ChunkKind.PREPOSITION]
 _ADDRESSED_ROBOTS = (("drone",), ("rover",))
@@ -199,16 +193,11 @@ class GraphBuilder:
         """Resolve "it" or "them": the clause's objects, or after a preposition the objects named before these."""
         clause = self._clause
         is_object = before is not None and before.kind is ChunkKind.VERB
-        if (
-            not clause.referents
-            and not clause.objects
-            and is_object
-            and not self._negated
-            and (self._negated_objects[:1] == self._draft.excluded[:1] != [])
-        ):
+        refers_to_none = is_object and not clause.referents and not clause.objects
+        if refers_to_none and not self._negated and self._negated_objects[:1] == self._draft.excluded[:1] != []:
             clause.referents = [self._draft.excluded.pop(0)]  # "don't put the knife in the dishwasher, wash it"
             self._draft.add_target(clause.referents[0])
-        if not clause.referents and not clause.objects and is_object:
+        elif refers_to_none:
             self._handle_demonstrative(word, before, None)
             return
         pending, self._pending = self._pending, None
@@ -217,12 +206,7 @@ class GraphBuilder:
             self._draft.warnings.append(f"{words!r} is not understood: it is dropped")
             return
         if self._negated:
-            named = (clause.objects or clause.referents)[-1:]
-            if pending is not None and named:
-                self._place_negated(phrase_from_text(named[0]), pending)
-            elif pending is None and clause.objects:
-                for phrase in filter(self._draft.is_from_statement, clause.referents):
-                    self._draft.exclude(phrase)  # "I'm allergic to nuts, bring a snack without them"
+            self._deny_reference(pending)
             return
         if pending is None:
             clause.objects = clause.objects or list(clause.referents)
@@ -245,6 +229,15 @@ class GraphBuilder:
                 return
             for phrase in named:
                 self._assigner.assign_by_preposition(pending, phrase_from_text(phrase))
+
+    def _deny_reference(self, pending: str | None) -> None:
+        clause = self._clause
+        named = (clause.objects or clause.referents)[-1:]
+        if pending is not None and named:
+            self._place_negated(phrase_from_text(named[0]), pending)
+        elif pending is None and clause.objects:
+            for phrase in filter(self._draft.is_from_statement, clause.referents):
+                self._draft.exclude(phrase)  # "I'm allergic to nuts, bring a snack without them"
 
     def _handle_demonstrative(self, word: str, before: Chunk | None, after: Chunk | None) -> None:
         """Handle a "this" without a noun."""
@@ -282,13 +275,8 @@ class GraphBuilder:
             self._draft.warnings.append(f"what {self._described!r} shows is not understood: {noun.text!r} is dropped")
             return
         longer = [phrase for phrase in self._draft.targets if phrase.endswith(f" {noun.text}")]
-        if (
-            pending is None
-            and noun.is_definite
-            and noun.has_determiner
-            and len(longer) == 1
-            and noun.text not in self._draft.mentions
-        ):
+        repeats = noun.is_definite and noun.has_determiner and noun.text not in self._draft.mentions
+        if pending is None and repeats and len(longer) == 1:
             noun = phrase_from_text(longer[0])  # "take the alarm clock and look at the clock"
         if self._partitive is not None and pending in (None, "of"):
             (superlative, pending, conjoined), self._partitive = self._partitive, None
@@ -297,7 +285,7 @@ class GraphBuilder:
         if adjectives_only(noun.words) and not (of_follows and noun.head in lexicon.PLACES):
             self._lone_adjectives(noun, pending, conjoined, after)
             return
-        if not _names_object(noun, pending, self._following, self._clause.verb):
+        if not names_object(noun, pending, self._following, self._clause.verb):
             self._skip_noun(noun, pending, conjoined, after)
             return
         in_space = lexicon.is_space(noun.words) and self._clause.preposition in _SPACE_PREPOSITIONS
@@ -413,54 +401,6 @@ class GraphBuilder:
                 return
             self._denied_places += [(phrase, RelationTerms(relation, True, terms.bounds), noun) for phrase in objects]
             self._draft.warnings.append(f"an exception by place ({noun.text!r}) is not supported: it is dropped")
-
-
-def _names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chunk], verb: str | None) -> bool:
-    """Return False for names of the robot, and for places, routes and amounts that stand for another noun."""
-    is_named = (noun.has_determiner and pending == "to") or (noun.is_plural and pending == "with")
-    if len(noun.words) == 1 and noun.head in lexicon.ADDRESSEES and not is_named:
-        return False
-    if noun.head in lexicon.TASK_NOUNS and pending is None:
-        return False
-    of_follows = bool(following) and following[0].kind is ChunkKind.PREPOSITION and following[0].word == "of"
-    content = following[1].noun if of_follows and len(following) > 1 else None
-    is_picture = noun.head in lexicon.PICTURES and verb not in _PICTURING_VERBS
-    if content is not None and not (content.has_determiner or is_picture or noun.head in lexicon.CONTAINERS):
-        return False  # "a bar of soap"
-    if of_follows and is_picture:
-        return True
-    compound = len(noun.words) > 1 and not adjectives_only(noun.words[:-1])
-    if compound and noun.head in lexicon.PLACES and not of_follows:
-        return True
-    if noun.head in lexicon.PHYSICAL_MEASURES and verb in HANDLING_VERBS and pending is None and not of_follows:
-        return True
-    unlikely = lexicon.TIME_NOUNS if noun.has_determiner else lexicon.MANNER_NOUNS | lexicon.TIME_NOUNS
-    likely = (None, "from", "of", "to", "on", "with" if noun.has_determiner else None)
-    if noun.head in unlikely and adjectives_only(noun.words[:-1]) and pending not in likely:
-        return False
-    if noun.head in lexicon.BUILDINGS:
-        return pending != "inside" or bool(noun.words[1:])
-    if noun.head in lexicon.PLACES:
-        if pending == "to" and lexicon.is_space(noun.words):
-            return True  # "to the cold room"
-        return noun.head in lexicon.PHYSICAL_PLACES and pending not in (None, "inside", "to") and not of_follows
-    if (
-        verb in SPEAKING_VERBS | {"report"}
-        and pending is None
-        and (verb == "say" or of_follows)
-        and noun.head not in lexicon.PEOPLE | lexicon.CONTAINERS
-    ):
-        return False  # "say your name", "tell me the name of the person"
-    if noun.words == ("light",) and of_follows and pending is not None:
-        return False  # "by the light of the lamp"
-    if noun.head in lexicon.ROUTES and not compound and noun.words[0] not in lexicon.COLOURS:
-        return pending not in (None, "of", "for", "to")
-    if noun.head in lexicon.MEASURES and pending not in (None, "of"):
-        return not of_follows
-    # "the smallest piece"
-    described = len(noun.words) > 1 and verb not in _PICTURING_VERBS
-    known = noun.head in lexicon.NOUNS or (noun.is_known and pending != "of")
-    return noun.head not in lexicon.MEASURES or ((known or compound or described) and not of_follows)
 
 
 def _with_shared_head(adjective: NounPhrase, noun: NounPhrase) -> NounPhrase:

@@ -103,9 +103,7 @@ COMPOUND_OPENERS: Final = frozenset({("first", "aid"), ("second", "hand")})
 # irrelevant to the graph; most other adverbs end in -ly
 ADVERBS: Final = words("adverbs")
 # names and forms of address for the robot
-ADDRESSEES: Final = word_set(
-    "robot agent arm gripper bot dear darling sweetheart honey mate buddy sir madam pal friend"
-)
+ADDRESSEES: Final = words("addressees")
 
 # nouns that refer to the task itself: "the goal is to", "any idea where"
 TASK_NOUNS: Final = word_set("task mission goal job aim duty idea clue question problem help chance")

@@ -22,7 +22,6 @@ _NEGATED_VERBS: Final = WISHES | word_set("care touch mean")
 _EXCLUDING_TAGS: Final = frozenset({Tag.VERB, Tag.DETERMINER, Tag.NOUN})
 _VERB_FORMS: Final = frozenset({Tag.VERB, Tag.GERUND, Tag.PARTICIPLE})
 _NOUN_BEFORE: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.RELATIVE, Tag.AUXILIARY, Tag.ANAPHOR, Tag.CONJUNCTION})
-_PUNCTUATION: Final = (",", ".", ";")
 _NOTS: Final = word_set("not never") | {"but not", "do not", "doesn't", "don't", "dont"}
 _CLAUSE_START_TAGS: Final = frozenset({None, Tag.CLAUSE_BREAK, Tag.CONJUNCTION})
 _QUESTION_WORDS: Final = word_set("is are was were does did has have can could would will")
@@ -31,7 +30,7 @@ _QUESTION_WORDS: Final = word_set("is are was were does did has have can could w
 def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
     """Handle the negation at the current word."""
     before, after = buffer.tag(-1), buffer.tag(1)
-    if word == "no" and buffer.word(1) in _PUNCTUATION:
+    if word == "no" and buffer.word(1) in (",", ".", ";"):
         buffer.close()  # "the hammer. no, the bigger one"
     elif word == "no":
         _deny(buffer)

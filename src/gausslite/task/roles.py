@@ -138,7 +138,6 @@ class RoleAssigner:
         elif pending == "when":
             if clause.verb in verbs.GO_VERBS | {"turn"} and noun.has_determiner and is_thing(noun.head):
                 self._assign_waypoint(noun)  # "turn right after the painting"
-            return
         elif pending == "purpose" and self._acts_on_people():
             self._relations.relate("near", noun)  # "the man talking to the nurse"
         elif pending == "purpose":

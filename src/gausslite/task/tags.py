@@ -110,10 +110,7 @@ _LEADING_VERBS: Final = word_set("go come help")
 _NEGATED_COMMANDS: Final = frozenset({"do not", "don't", "dont", "never", "not to"})
 _MODALS_AFTER_ONE: Final = word_set("can can't cannot could should must may might would has needs")
 _USUALLY_VERBS: Final = verbs.GO_VERBS | verbs.TOOL_VERBS | verbs.SEARCH_VERBS | word_set("stop hand")
-_NEVER_NOUNS: Final = verbs.GO_VERBS | word_set(
-    "belong bring put take get find fetch make keep give hold grab need want do lie be say see hear know think eat sit "
-    "seem contain include become lose forget boil"
-)
+_NEVER_NOUNS: Final = verbs.GO_VERBS | verbs.words("never_nouns")
 # at the start of a clause no things: "stand in front of", "swing left", "stock the shelf"
 _MOTIONS: Final = verbs.GO_VERBS | verbs.STOPPING_VERBS | word_set("turn pass")
 _ARTICLES: Final = frozenset({"a", "an", "the", "my", "your", "every"})
@@ -128,7 +125,6 @@ _TURNS: Final = word_set("left right around back up down forward backward straig
 _BELONG: Final = word_set("go belong")
 _MODIFIER_ENDINGS: Final = ("ing", "ed")
 _VERB_PARTICLES: Final = word_set("off up out away down")
-_RELATIVES: Final = word_set("which that who")
 _POSSESSIVES: Final = ("'s", "s'")
 _NOUNS: Final = lexicon.NOUNS | lexicon.PLACES | lexicon.ROUTES | lexicon.MEASURES | lexicon.PARTS | lexicon.ADDRESSEES
 _ADJECTIVE_ENDINGS: Final = ("ful", "ous", "able", "ible", "less", "ish", "most", "ic")
@@ -184,14 +180,11 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (opens and is_open and after in _THE and not word.endswith(_MODIFIER_ENDINGS))  # "fluff the pillow"
         or (opens and word in verbs.VERBS and after in _VERB_PARTICLES)  # "switch off"
         or (word in _BELONG and is_place and verbs.base_of_ed(before) is not None)  # "that were washed go in"
-        or (before in _RELATIVES and is_place and verbs.base_of_s(word) is not None)  # "which stands on"
+        or (before in ("which", "that", "who") and is_place and verbs.base_of_s(word) is not None)  # "which stands on"
         or (before == "you" and is_open and after in lexicon.DETERMINERS)
     )
-    named = (
-        is_thing(f"{word} {singular(after)}")
-        or is_thing(f"{before} {word}")
-        or (before in _BEFORE_NAMES and _is_noun(after))
-    )
+    named = is_thing(f"{word} {singular(after)}") or is_thing(f"{before} {word}")
+    named = named or (before in _BEFORE_NAMES and _is_noun(after))
     waits = opens and word in verbs.STOPPING_VERBS and _is_noun(after) and after not in _CLOSED
     rules = {
         Tag.VERB: commands,

@@ -10,29 +10,21 @@ from gausslite.task import lexicon
 from gausslite.task.lexicon import COLOURS, COMPARATIVES
 from gausslite.task.verbs import TABLES
 
-_NUMBERS: Final = {
-    "a quarter of a": 0.25, "half a": 0.5, "half an": 0.5, "half": 0.5, "a couple of": 2.0, "a": 1.0, "an": 1.0,
-    "one": 1.0, "two": 2.0, "three": 3.0, "four": 4.0, "five": 5.0, "six": 6.0, "seven": 7.0, "eight": 8.0,
-    "nine": 9.0, "ten": 10.0, "twelve": 12.0, "fifteen": 15.0, "twenty": 20.0,
-}  # fmt: skip
+_NUMBERS: Final[dict[str, float]] = TABLES["numbers"]
 # metres by the first letters of a unit
 _UNITS_M: Final = (
     ("centi", 0.01), ("cm", 0.01), ("milli", 0.001), ("mm", 0.001), ("f", 0.3048), ("in", 0.0254), ("y", 0.9144),
     ("step", 0.75), ("pace", 0.75), ("m", 1.0),
 )  # fmt: skip
 _VALUE: Final = rf"(?:\d{{1,4}}(?:[.,]\d{{1,3}})?|{'|'.join(sorted(_NUMBERS, key=len, reverse=True))})(?: and a half)?"
-_UNIT: Final = (
-    r"(?:centimet(?:er|re)s?|cms?|millimet(?:er|re)s?|mm|met(?:er|re)s?|m|feet|foot|ft|inch(?:es)?|yards?|paces?|"
-    r"steps?)"
-)
+_UNIT: Final = r"(?:(?:centi|milli)?met(?:er|re)s?|cms?|mm|m|feet|foot|ft|inch(?:es)?|yards?|paces?|steps?)"
 _MAX: Final = (
     r"within|inside|less than|at most|up to|under|below|a maximum of|max(?:imum)?|(?:closer|nearer) than|"
     r"(?:no|not) (?:more|further|farther|greater)(?: away)? than|not over|(?:no|not) beyond"
 )
 _MIN: Final = (
     r"at least|more than|over|above|beyond|a minimum of|min(?:imum)?|(?:further|farther)(?: away)? than|"
-    r"outside(?: of)?|"
-    r"(?:no|not) (?:less|closer|nearer)(?: away)? than"
+    r"outside(?: of)?|(?:no|not) (?:less|closer|nearer)(?: away)? than"
 )
 _ABOUT: Final = r"about|around|roughly|approximately|approx|some|exactly|nearly|almost|just|only|circa"
 # other prepositions that a distance can bound

@@ -26,12 +26,9 @@ PLACE_VERBS: Final = words("place_verbs")
 TOOL_VERBS: Final = words("tool_verbs")
 SEARCH_VERBS: Final = words("search_verbs")
 INSPECTION_VERBS: Final = word_set("check scan inspect survey examine test monitor probe assess audit")
-LOOKING_VERBS: Final = (
-    SEARCH_VERBS | GO_VERBS | word_set("find locate identify detect spot map reconstruct photograph count track avoid")
-)
+LOOKING_VERBS: Final = SEARCH_VERBS | GO_VERBS | words("looking_verbs")
 # with and without an object: "move to the chair", "move the chair to the door"
 MOVING_VERBS: Final = word_set("move roll run advance return get land park dock drive fly race swing back reverse")
-# "stop behind the car": the car is the target
 # a room that the robot leaves or crosses
 LEAVING_VERBS: Final = word_set("exit leave cross pass traverse")
 LEADING_VERBS: Final = word_set("follow escort guide lead accompany")
@@ -65,25 +62,10 @@ REACHING_VERBS: Final = word_set("approach reach enter visit board")
 AVOIDING_VERBS: Final = word_set("avoid dodge evade circumvent bypass mind beware")
 DELIVERY_VERBS: Final = CARRY_VERBS | PLACE_VERBS
 # "clean the kitchen": everything in it
-COVERING_VERBS: Final = (
-    SEARCH_VERBS
-    | INSPECTION_VERBS
-    | TOOL_VERBS
-    | word_set("map reconstruct photograph capture record film model digitize monitor declutter tour roam watch empty")
-)
+COVERING_VERBS: Final = SEARCH_VERBS | INSPECTION_VERBS | TOOL_VERBS | words("covering_verbs")
 # their object is a thing that exists: "fetch the map", unlike "make a map" and "take a picture"
 HANDLING_VERBS: Final = words("handling_verbs")
-_OTHER_VERBS: Final = words("other_verbs")
-VERBS: Final = (
-    GO_VERBS
-    | FILLING_VERBS
-    | DELIVERY_VERBS
-    | CONTACT_VERBS
-    | TOOL_VERBS
-    | SEARCH_VERBS
-    | INSPECTION_VERBS
-    | _OTHER_VERBS
-)
+VERBS: Final = FILLING_VERBS | INSPECTION_VERBS.union(*(words(name) for name in TABLES if name.endswith("_verbs")))
 
 
 # past forms and participles that do not end in -ed
