@@ -280,7 +280,7 @@ class _Chunker:
             buffer.words = []
         elif buffer.tag(-1) is Tag.NEGATION and not buffer.negates_next and buffer.tag(1) not in NOUN_PHRASE_TAGS:
             buffer.close()  # "that is not broken"
-        elif buffer.tag(-1) in _BEFORE_STATE_TAGS and buffer.tag(1) not in NOUN_PHRASE_TAGS:
+        elif (buffer.tag(-1) in _BEFORE_STATE_TAGS or self._joins_state()) and buffer.tag(1) not in NOUN_PHRASE_TAGS:
             buffer.close()
             self._state(word)
         elif buffer.negates_next:
@@ -288,10 +288,15 @@ class _Chunker:
         else:
             buffer.words.append(word)
 
+    def _joins_state(self) -> bool:
+        """Return True for the "brown" of "it is long and brown"."""
+        tags = [self._buffer.tag(offset) for offset in (-1, -2, -3)]
+        return tags == [Tag.CONJUNCTION, Tag.ADJECTIVE, Tag.AUXILIARY]
+
     def _state(self, word: str) -> None:
         """Emit the colour of "the mug that is red" or "anything red"; other states describe no object ("is empty")."""
         buffer = self._buffer
-        before = (buffer.tag(-1), buffer.tag(-2))
+        before = (buffer.tag(-3), buffer.tag(-4)) if self._joins_state() else (buffer.tag(-1), buffer.tag(-2))
         follows_noun = Tag.INDEFINITE in before or Tag.RELATIVE in (buffer.tag(-2), buffer.tag(-3))
         is_it = self._is_statement and before == (Tag.AUXILIARY, Tag.ANAPHOR)  # "it is black"
         is_description = not any(other in (Tag.VERB, Tag.INDEFINITE) for _, other in buffer.tagged)
