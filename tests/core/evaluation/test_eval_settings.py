@@ -10,7 +10,7 @@ import pytest
 from tiny_sequences import HEIGHT, write_seven_scenes
 
 from gausslite.cli.main import main
-from gausslite.mission.results import read_report
+from gausslite.mission.results import MAP_TO_ODOM, read_report
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 TRAINED = "map.ply was trained on these views; to score views that it has not seen, map and score with --test-every 8"
@@ -68,6 +68,21 @@ def test_eval_scores_the_frames_that_were_held_out(
     assert "from the report next to map.ply: --test-every 5\n" in captured.err
     assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json", "--test-every", "1"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 10
+
+
+def test_corrections_hold_for_the_mapped_source_alone(
+    kitchen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    map_path = mapped(kitchen, tmp_path / "out", "--set", "register-depth=none", "--set", f"pose-prior={POSE_PRIOR}")
+    corrections = map_path.with_name(MAP_TO_ODOM)
+    corrections.write_text("0 0.01 0 0 0 0 0 1\n")
+    other = write_seven_scenes(tmp_path / "other", tuple(range(0, 40, 4)))
+    for source, is_used in ((kitchen, True), (other, False)):
+        capsys.readouterr()
+        assert main(["eval", str(map_path), str(source), "--set", "threads=1", "--json", "--test-every", "5"]) == 0
+        captured = capsys.readouterr()
+        assert ("map_to_odom" in json.loads(captured.out)) == is_used
+        assert ("corrects the poses of another source: not used" in captured.err) != is_used
 
 
 def test_a_map_has_a_preview_next_to_recorded_images(kitchen: Path, tmp_path: Path) -> None:
