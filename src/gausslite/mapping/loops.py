@@ -16,6 +16,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.calibration.alignment import align_images
+from gausslite.calibration.moving_pairs import warp_into
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, translation_m
@@ -27,7 +28,7 @@ from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.places.descriptors import DESCRIPTOR_BYTES, PlaceDescriptor
 from gausslite.places.localisation import View, guessed_motions
 from gausslite.places.registration import register
-from gausslite.places.verification import verify
+from gausslite.places.verification import RenderMap, reduced, verify
 from gausslite.process import print_message
 from gausslite.render.rasterizer import Rasterizer, Rendering, Subset
 
@@ -41,10 +42,11 @@ _ALIGNED_STD = np.array([0.03] * 3 + [np.radians(0.7)] * 3)
 """Error of a registered motion before images refine it: translation (m) and rotation (rad)."""
 _MIN_ALIGNED = 0.5
 """Share of the points in both images whose depth must agree."""
-_MAX_MOVED = 0.04, 1.0
-"""By how much, in metres and degrees, the rendering may move the pose of a loop. Where depth or images of a camera err,
-surfaces and images agree on a wrong motion, and the map draws the pose back: by 4 to 18 cm in the kitchen of 7-Scenes,
-by at most 3 cm and 0.5 degrees for true loops of homes with drift."""
+_MAX_SHARE, _MOVED_M, _MOVED_DEG = 0.5, (0.02, 0.08), (0.5, 2.0)
+"""The rendering may move the pose of a loop by this share of the correction, within these limits. Where depth or images
+of a camera err, surfaces and images agree on a wrong motion, and the map draws the pose back: by 0.8 to 1.05 of the
+correction in the kitchen of 7-Scenes. True loops of homes with drift are moved by a seventh of 19 cm, by two fifths of
+4 cm, and by at most 2 cm where the correction is smaller."""
 _NOISE = 0.006, 0.15
 """A loop that the poses contradict by less, in metres and degrees, moves nothing until another one does."""
 _NOISE_STDS = 2.0 * 2.0**0.5
@@ -188,13 +190,26 @@ class LoopCloser:
             return None
         T_world_camera = old.frame.T_world_camera @ T_old_keyframe
         loop = Loop(old.anchor, keyframe.anchor, inverse(self._graph.poses[old.anchor]) @ T_world_camera)
-        if self._is_noise(loop) or self._is_verified(keyframe, T_world_camera):
+        if self._is_noise(loop) or self._is_verified(keyframe, old, loop, T_world_camera):
             return loop
         self._refused += 1
         return None
 
-    def _is_verified(self, keyframe: Keyframe, T_world_camera: Float64[ndarray, "4 4"]) -> bool:
-        """True if what earlier keyframes have mapped, rendered from this pose, agrees with its image there."""
+    def _is_verified(
+        self, keyframe: Keyframe, old: Keyframe, loop: Loop, T_world_camera: Float64[ndarray, "4 4"]
+    ) -> bool:
+        """True if the map does not draw a loop's pose back, and it or the earlier image shows the same from there."""
+        frame, error_m, error_deg = keyframe.frame, *self._graph.residual(loop)
+        shown = verify(self._earlier_map(keyframe), frame, T_world_camera)
+        moved_m = translation_m(shown.T_world_camera, T_world_camera)
+        moved_deg = rotation_angle_deg(shown.T_world_camera, T_world_camera)
+        max_m, max_deg = np.clip(_MAX_SHARE * error_m, *_MOVED_M), np.clip(_MAX_SHARE * error_deg, *_MOVED_DEG)
+        if not shown.depth_agrees or moved_m >= max_m or moved_deg >= max_deg:
+            return False
+        return shown.is_accepted or verify(_render_image(old.frame), frame, T_world_camera).is_accepted
+
+    def _earlier_map(self, keyframe: Keyframe) -> RenderMap:
+        """Return a function that renders what earlier keyframes have mapped."""
         table = self._table
         earlier = (table.anchor <= keyframe.anchor - MIN_GAP) & (table.anchor != NO_ANCHOR)
         subset = Subset(None, np.flatnonzero(earlier).astype(np.uint32))
@@ -202,15 +217,24 @@ class LoopCloser:
         def render(camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None) -> Rendering:
             return self._rasterizer.forward(table.rows, camera, inverse(T_world_camera), subset, motion)
 
-        verification = verify(render, keyframe.frame, T_world_camera)
-        moved_m = translation_m(verification.T_world_camera, T_world_camera)
-        moved_deg = rotation_angle_deg(verification.T_world_camera, T_world_camera)
-        return verification.is_accepted and moved_m < _MAX_MOVED[0] and moved_deg < _MAX_MOVED[1]
+        return render
 
     def _is_noise(self, loop: Loop) -> bool:
         """True if the poses agree with a loop, so that it does not move the map."""
         error_m, error_deg = self._graph.residual(loop)
         return error_m < self._noise[0] and error_deg < self._noise[1]
+
+
+def _render_image(old: Frame) -> RenderMap:
+    """Return a function that shows an earlier image from another pose, by its depth."""
+    old = reduced(old)
+
+    def render(camera: Camera, T_world_camera: Float64[ndarray, "4 4"], _: CameraMotion | None) -> Rendering:
+        height, width = camera.height_px, camera.width_px
+        rgb, depth_m = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
+        return warp_into(old, Frame(0, 0, rgb, depth_m, camera, T_world_camera))
+
+    return render
 
 
 def _aligned(

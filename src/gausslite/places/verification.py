@@ -67,8 +67,12 @@ class Verification:
     @property
     def shows_the_same(self) -> bool:
         """True if the map covers the view, and depth, texture and colours agree."""
-        colours_agree = self.texture >= _MIN_TEXTURE and self.chroma <= _MAX_CHROMA
-        return self.covered >= _MIN_COVERED and self.agreement >= _MIN_AGREEMENT and colours_agree
+        return self.depth_agrees and self.texture >= _MIN_TEXTURE and self.chroma <= _MAX_CHROMA
+
+    @property
+    def depth_agrees(self) -> bool:
+        """True if the map covers the view, and its depth agrees."""
+        return self.covered >= _MIN_COVERED and self.agreement >= _MIN_AGREEMENT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +115,7 @@ def verify(render: RenderMap, frame: Frame, T_world_camera: Float64[ndarray, "4 
 
     T_world_camera: within about 10 cm and 5 degrees; the frame's own pose is not used.
     """
-    photograph = _small(frame)
+    photograph = reduced(frame)
     T, rendering = _refined(render, photograph, T_world_camera)
     found = _Residuals.of(rendering, photograph)
     measured = int(np.count_nonzero(photograph.depth_m > 0))
@@ -130,7 +134,7 @@ def verify(render: RenderMap, frame: Frame, T_world_camera: Float64[ndarray, "4 
     return replace(verification, sigmas=sigmas)
 
 
-def _small(frame: Frame) -> Frame:
+def reduced(frame: Frame) -> Frame:
     """Return the frame at the size of the comparison."""
     width = min(_WIDTH_PX, frame.camera.width_px)
     height = max(round(frame.camera.height_px * width / frame.camera.width_px), 1)
