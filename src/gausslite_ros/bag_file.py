@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 from gausslite.domain.errors import DatasetError
-from gausslite_ros.bag_parts import SUFFIXES, has_bag, is_bag, open_parts, repair_of
+from gausslite_ros.bag_parts import SUFFIXES, has_bag, is_bag, missing_parts, open_parts, repair_of
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -113,6 +113,8 @@ _TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 _ALIASES = {"tf/msg/tfMessage": _TF_MESSAGE}
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _SERIALISATIONS = ("ros1", "cdr")
+_MAX_LATE_NS = 1_500_000_000
+"""A message whose stamp is older than the newest one by more was recorded after the clock had been set back."""
 _STAMP_ROS1, _STAMP_ROS2 = struct.Struct("<4xII"), (struct.Struct(">4xiI"), struct.Struct("<4xiI"))
 
 
@@ -132,6 +134,27 @@ class StampedMessage:
 
     key: MessageKey
     stamp_ns: int
+
+
+class _Clock:
+    """Raises DatasetError for a stamp of before the clock was set back; a single stamp of the future does no harm."""
+
+    def __init__(self, location: str) -> None:
+        self._location = location
+        self._newest_ns = self._before_ns = -_MAX_LATE_NS
+
+    def add(self, stamp_ns: int) -> None:
+        """Compare the next stamp in the order of recording."""
+        newest_ns = self._newest_ns
+        if stamp_ns < newest_ns - _MAX_LATE_NS:
+            if stamp_ns < self._before_ns - _MAX_LATE_NS:
+                raise DatasetError(
+                    f"{self._location}: expected one run, got stamps that go back from {newest_ns / 1e9:.1f} to "
+                    f"{stamp_ns / 1e9:.1f} s, as in a playback in a loop, a reset of a simulator or several recordings"
+                )
+            self._newest_ns = self._before_ns
+        if stamp_ns > self._newest_ns:
+            self._before_ns, self._newest_ns = self._newest_ns, stamp_ns
 
 
 class BagFile:
@@ -165,8 +188,9 @@ class BagFile:
 
     @property
     def notes(self) -> list[str]:
-        """Messages on parts that are not whole."""
-        return [note for part in self._parts if (note := getattr(part, "note", ""))]
+        """Messages on parts that are not whole, or not there."""
+        notes = [getattr(part, "note", "") for part in self._parts]
+        return [note for note in (*notes, missing_parts(self._path)) if note]
 
     @property
     def types(self) -> dict[str, str]:
@@ -188,18 +212,21 @@ class BagFile:
                 yield self._deserialise(connection, data)
 
     def stamps(self, topic: str) -> list[StampedMessage]:
-        """Return all messages of a topic by the stamps of their headers, ascending. Raises DatasetError.
+        """Return all messages of a topic by the stamps of their headers, ascending.
 
-        A header without a stamp counts from the time when the message was recorded. Payloads are not decoded.
+        A header without a stamp counts from the time when the message was recorded. Payloads are not decoded. Raises
+        DatasetError, also if the clock was set back: poses of two runs would stand at one time.
         """
         found: list[StampedMessage] = []
         last, rank = (-1, -1), 0
+        clock = _Clock(f"{self._path}: {topic}")
         with self._readable(topic):
             for part, connection, time_ns, data in self._serialised(topic):
                 rank = rank + 1 if (part, time_ns) == last else 0
                 last = part, time_ns
-                stamp_ns = _header_stamp_ns(data, _is_ros1(connection)) or time_ns
-                found.append(StampedMessage(MessageKey(topic, part, time_ns, rank), stamp_ns))
+                if stamp_ns := _header_stamp_ns(data, _is_ros1(connection)):
+                    clock.add(stamp_ns)
+                found.append(StampedMessage(MessageKey(topic, part, time_ns, rank), stamp_ns or time_ns))
         return sorted(found, key=lambda message: message.stamp_ns)
 
     def read(self, key: MessageKey) -> Any:

@@ -27,6 +27,7 @@ _COMPANIONS = ("-wal", "-journal")
 """SQLite's files beside a database whose recorder was killed; they hold messages that are not in it yet."""
 _BESIDE = (*_COMPANIONS, "-shm", METADATA)
 _PART = re.compile(r"_(\d+)$")
+_MAX_LISTED = 12
 _REPAIRS = {
     ".bag": "`rosbag reindex FILE` of ROS 1 repairs a recording that was interrupted or cut short",
     ".mcap": "`mcap recover FILE` repairs a recording that was interrupted or cut short",
@@ -94,15 +95,32 @@ def bag_files(path: Path) -> list[Path]:
         )
     if listed and all((path / name).is_file() for name in listed):
         return [path / name for name in listed]
-    numbers = [_PART.search(file.name.lower().removesuffix(_ACTIVE).removesuffix(kind_of(file))) for file in found]
-    parts = {int(number[1]): file for number, file in zip(numbers, found, strict=True) if number}
-    if len(found) == 1 or (len(parts) == len(found) and len({kind_of(file) for file in found}) == 1):
-        return found if len(found) == 1 else [parts[number] for number in sorted(parts)]
-    names = ", ".join(file.name for file in found) or "no file of a bag"
+    if len(found) == 1:
+        return found
+    names = [file.name.lower().removesuffix(_ACTIVE) for file in found]
+    parts = {number: file for file in found if (number := _part_number(file)) is not None}
+    # the parts of one recording differ in their numbers, and in the times that ROS 1 adds
+    if len(parts) == len(found) and len({re.sub(r"\d+", "", name) for name in names}) == 1:
+        return [parts[number] for number in sorted(parts)]
+    got = ", ".join(file.name for file in found) or "no file of a bag"
     raise DatasetError(
-        f"{path}: expected one recording, in several parts named NAME_0, NAME_1 and so on, got {names}; "
+        f"{path}: expected one recording, in several parts named NAME_0, NAME_1 and so on, got {got}; "
         "give the file of one recording"
     )
+
+
+def missing_parts(path: Path) -> str:
+    """Return a message on numbers that are missing between the parts of a recording; empty without any."""
+    files = [file for file in path.iterdir() if kind_of(file)] if path.is_dir() else []
+    numbers = {number for number in map(_part_number, files) if number is not None}
+    missing = sorted(set(range(min(numbers, default=0), max(numbers, default=0))) - numbers)
+    named = ", ".join(map(str, missing[:_MAX_LISTED]))
+    return f"{path.name}: parts {named} are not there; their frames are missing" if missing else ""
+
+
+def _part_number(file: Path) -> int | None:
+    found = _PART.search(file.name.lower().removesuffix(_ACTIVE).removesuffix(kind_of(file)))
+    return int(found[1]) if found else None
 
 
 def _listed_files(folder: Path) -> list[str]:

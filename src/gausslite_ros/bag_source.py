@@ -195,7 +195,7 @@ def _no_poses(bag: BagFile, tree: TransformTree, camera: str) -> str:
     topics = [topic for topic, kind in bag.types.items() if kind == _TF_MESSAGE]
     above = tree.ancestors(camera)
     links = f"tf has only {' → '.join(above)}" if len(above) > 1 else f"tf does not have {camera!r}"
-    links += f" ({tree.left_out})" if tree.left_out else ""
+    links += f" ({'; '.join(tree.notes)})" if tree.notes else ""
     return (
         f"expected poses: tf between a world frame and {camera!r}, or an odometry topic, got none: {links}, in "
         f"{' and '.join(topics) or 'no topic'} with {', '.join(tree.frames) or 'no frames'}; tf_static stands at the "
@@ -254,7 +254,7 @@ class BagSource:
         self._converter = FrameConverter(self._cameras, self._colour.name, self._depth.name, units_per_metre)
         self._recorded = len(colours)
         self._repeated = sum(a.stamp_ns == b.stamp_ns for a, b in pairwise(colours))
-        self._left_out = tree.left_out
+        self._tree_notes = tree.notes
         matches = self._associate(colours, depths)
         tolerance = f"{1000 * self._options.tolerance_s:g} ms"
         times_s = {"colour": seconds(colour.stamp_ns for colour in colours).tolist()}
@@ -331,7 +331,7 @@ class BagSource:
         reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
         unmatched = excluded_frames_note(self._recorded - self._repeated - len(self), self._recorded, reason)
         repeated = repeated_times_note(self._repeated, self._recorded)
-        return tuple(filter(None, (repeated, unmatched, self._left_out, *self._bag.notes, self._origin.note)))
+        return tuple(filter(None, (repeated, unmatched, *self._tree_notes, *self._bag.notes, self._origin.note)))
 
     def __len__(self) -> int:
         return len(self._matches)

@@ -15,7 +15,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.datasets.camera_files import FolderCamera, lens_of
-from gausslite.datasets.files import decode_image, require_pixel_count
+from gausslite.datasets.files import decode_image, depth_in_metres, require_pixel_count
 from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError
 
@@ -321,7 +321,7 @@ def _decode_16_bit(location: str, data: bytes) -> NDArray[Any]:
 def _in_metres(image: NDArray[Any], units_per_metre: float | None) -> Float32[ndarray, "h w"]:
     if image.dtype == np.float32:
         return _valid(image / np.float32(units_per_metre or 1.0))
-    return image.astype(np.float32) / np.float32(units_per_metre or _MILLIMETRES_PER_METRE)
+    return depth_in_metres(image, units_per_metre or _MILLIMETRES_PER_METRE)
 
 
 def _valid(depth_m: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:

@@ -21,6 +21,7 @@ MAX_GAP_S = 1.0
 _MAX_LAG_S = 0.010
 _MAX_DEPTH = 64
 _MAX_LISTED = 12
+_SAME_M, _SAME_HALF_COSINE = 0.001, float(np.cos(np.radians(0.05)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,7 @@ class TransformTree:
     def __init__(self, transforms: Iterable[Transform]) -> None:
         grouped: dict[tuple[str, str], list[Transform]] = {}
         self._left_out: dict[tuple[str, str], int] = {}
+        self._restated: list[str] = []
         for transform in transforms:
             link = transform.child, transform.parent
             if is_pose(transform.translation_m, transform.quat_xyzw):
@@ -81,6 +83,8 @@ class TransformTree:
             fixed = [transform for transform in measured if transform.time_ns is None]
             if fixed:
                 self._static.add((child, parent))
+            if any(_differ(transform, fixed[-1]) for transform in fixed):
+                self._restated.append(f"{parent} → {child}")
             track = _track(f"tf {parent} → {child}", fixed[-1:] or measured)
             self._tracks.setdefault(child, {})[parent] = track
 
@@ -90,11 +94,13 @@ class TransformTree:
         return sorted(set(self._tracks).union(*self._tracks.values()))
 
     @property
-    def left_out(self) -> str:
-        """Message on transforms that are no pose; empty without any."""
+    def notes(self) -> tuple[str, ...]:
+        """Messages on transforms that are no pose, and on static ones that are stated in two ways."""
         links = [f"{count} {parent} → {child}" for (child, parent), count in sorted(self._left_out.items())]
-        named = ", ".join(links[:_MAX_LISTED])
-        return f"tf: left out transforms with NaN, infinity or a quaternion of zeros: {named}" if links else ""
+        left_out = "left out transforms with NaN, infinity or a quaternion of zeros"
+        restated = "static transforms are stated in several ways, the last one is used"
+        found = ((left_out, links), (restated, self._restated))
+        return tuple(f"tf: {words}: {', '.join(named[:_MAX_LISTED])}" for words, named in found if named)
 
     def ancestors(self, frame: str) -> list[str]:
         """Return the frame and its parents up to the root. Raises DatasetError for a frame with two parents."""
@@ -183,6 +189,13 @@ class TransformTree:
                 return None
             T = T_parent_child if T is None else T_parent_child @ T
         return np.eye(4) if T is None else T
+
+
+def _differ(a: Transform, b: Transform) -> bool:
+    """True if two transforms differ by more than a millimetre or 0.1 degrees."""
+    distance_m = np.linalg.norm(np.subtract(a.translation_m, b.translation_m))
+    cosine = abs(np.dot(a.quat_xyzw, b.quat_xyzw)) / (np.linalg.norm(a.quat_xyzw) * np.linalg.norm(b.quat_xyzw))
+    return bool(distance_m > _SAME_M or cosine < _SAME_HALF_COSINE)
 
 
 def _two_parents(frame: str, parents: Iterable[str]) -> str:

@@ -87,6 +87,17 @@ def test_an_unknown_encoding_is_named_with_the_option(tmp_path: Path) -> None:
         frames_of(bag)
 
 
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_depth_beyond_the_range_is_no_return(tmp_path: Path, encoding: str) -> None:
+    def beyond(depth: np.ndarray) -> np.ndarray:
+        far = depth if encoding == "16UC1" else (depth / 1000).astype(np.float32)
+        far[0, :2] = 65535 if encoding == "16UC1" else (np.inf, np.nan)
+        return far
+
+    frames = frames_of(write_small_bag(tmp_path / "b.mcap", depth=depth_as(encoding, beyond)))
+    assert [frame.depth_m[0, :3].tolist() for frame in frames[:1]] == [[0.0, 0.0, pytest.approx(1.5)]]
+
+
 def test_depth_as_mono16_is_named_and_read_if_it_is_stated(tmp_path: Path) -> None:
     bag = write_small_bag(tmp_path / "b.mcap", depth=depth_as("mono16", lambda depth: depth))
     with pytest.raises(DatasetError, match=r"\(mono16\).*name it with depth=TOPIC"):
@@ -318,3 +329,15 @@ def test_the_first_of_images_with_one_stamp_counts(tmp_path: Path) -> None:
     source = BagSource(BagAddress(write_small_bag(tmp_path / "a.mcap", colour=twice)))
     assert source.indices() == list(range(0, 2 * FRAMES, 2))
     assert source.notes == ("8 of 16 colour images are skipped: they have the time of the image before",)
+
+
+def test_a_static_transform_that_is_stated_in_two_ways_is_reported(tmp_path: Path) -> None:
+    def again(bag: Writer) -> None:
+        for x_m in (0.1, 0.0):
+            bag.write("/tf_static", TF, time_of(3), link(time_of(3), "base_link", OPTICAL, x_m))
+
+    path = write_small_bag(tmp_path / "a.mcap", extra=again)
+    require_small_bag(frames_of(path))
+    assert BagSource(BagAddress(path)).notes == (
+        f"tf: static transforms are stated in several ways, the last one is used: base_link → {OPTICAL}",
+    )

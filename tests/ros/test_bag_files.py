@@ -13,15 +13,19 @@ import zstandard
 from small_bag import (
     COLOUR,
     FRAMES,
+    IMAGE,
     START_NS,
+    Writer,
     channel,
     chunk,
     frames_of,
+    image,
     mcap,
     mcap_parts,
     message,
     record,
     require_small_bag,
+    rgb_of,
     schema,
     text,
     time_of,
@@ -205,17 +209,48 @@ def test_the_folder_of_the_parts_is_the_recording(tmp_path: Path) -> None:
     require_small_bag(frames_of(tmp_path / "run"))
 
 
+def test_a_part_that_is_missing_between_others_is_reported(tmp_path: Path) -> None:
+    split(write_small_bag(tmp_path / "a.bag"), tmp_path / "run", ("run_0.bag", "run_1.bag", "run_2.bag"))
+    (tmp_path / "run" / "run_1.bag").unlink()
+    source = BagSource(BagAddress(tmp_path / "run"))
+    assert len(source) < FRAMES
+    assert "run: parts 1 are not there; their frames are missing" in source.notes
+
+
 def test_a_later_part_alone_names_the_missing_link(tmp_path: Path) -> None:
     split(write_small_bag(tmp_path / "a.bag"), tmp_path / "run", ("run_0.bag", "run_1.bag"))
     with pytest.raises(DatasetError, match=r"tf_static stands at the start .* give the folder of all parts"):
         frames_of(tmp_path / "run" / "run_1.bag")
 
 
-def test_recordings_that_are_not_parts_of_one_are_listed(tmp_path: Path) -> None:
-    for name in ("kitchen.bag", "office.bag"):
+@pytest.mark.parametrize("names", [("kitchen.bag", "office.bag"), ("kitchen_1.bag", "office_2.bag")])
+def test_recordings_that_are_not_parts_of_one_are_listed(tmp_path: Path, names: tuple[str, str]) -> None:
+    for name in names:
         write_small_bag(tmp_path / name)
-    with pytest.raises(DatasetError, match=r"got kitchen.bag, office.bag; give the file of one recording"):
+    with pytest.raises(DatasetError, match=rf"got {', '.join(names)}; give the file of one recording"):
         frames_of(f"bag:{tmp_path}")
+
+
+def test_several_runs_in_one_recording_are_refused(tmp_path: Path) -> None:
+    def again(bag: Writer, i: int) -> None:
+        # the clock is set back after every fourth frame
+        time_ns = time_of(i % 4) - 10**10 * (i // 4)
+        bag.write(COLOUR, IMAGE, time_of(i), image(i, "rgb8", rgb_of(i), time_ns=time_ns))
+
+    bag = write_small_bag(tmp_path / "loop.bag", colour=again)
+    with pytest.raises(
+        DatasetError, match=r"image_raw: expected one run, got stamps that go back from 1000.1 to 990.0"
+    ):
+        frames_of(bag)
+
+
+def test_a_single_stamp_of_the_future_does_no_harm(tmp_path: Path) -> None:
+    def colour(bag: Writer, i: int) -> None:
+        time_ns = time_of(i) + 10**12 * (i == 3)
+        bag.write(COLOUR, IMAGE, time_of(i), image(i, "rgb8", rgb_of(i), time_ns=time_ns))
+
+    frames = frames_of(write_small_bag(tmp_path / "a.bag", colour=colour))
+    assert len(frames) == FRAMES - 1
 
 
 def test_a_missing_part_is_named(tmp_path: Path) -> None:

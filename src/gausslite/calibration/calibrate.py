@@ -127,11 +127,13 @@ def _contradictions(source: Source, force: bool) -> tuple[str, ...]:
     found = find_contradiction(source)
     if found is None:
         return ()
+    way = "state it as scale in cam_params.json, or as depth_unit=Xmm in the address of a bag"
     if found.only_unit and not source.depth_unit_stated:
-        return (f"{found}; the files do not state the unit of depth: state it as scale in cam_params.json",)
+        return (f"{found}; the files do not state the unit of depth: {way}",)
     if force:
         return (str(found),)
-    raise DatasetError(f"{source.name}: {found}; correct the recording, or map it as it is with --set force=true")
+    advice = way if found.only_unit else "correct the recording"
+    raise DatasetError(f"{source.name}: {found}; {advice}, or map it as it is with --set force=true")
 
 
 def _registration_of(source: Source, decide: Callable[[Evidence], None]) -> DepthRegistration | None:

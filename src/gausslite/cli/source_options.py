@@ -24,6 +24,7 @@ from gausslite.config.values import (
     write_correction,
     write_prior,
 )
+from gausslite.datasets.folder import up_note
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import DatasetError, PoseError
@@ -85,6 +86,11 @@ def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True)
         print_message(f"{spec}: {source.description}")
     for note in source.notes:
         print_message(f"{spec}: {note}")
+    if up_axis is None and require_poses and not source.poses_exact:
+        # `frame` reports a damaged pose if it is used
+        with suppress(DatasetError, PoseError):
+            if note := up_note(source.trajectory().T_world_camera[:, :3, :3], source.up_axis):
+                print_message(f"{spec}: {note}")
     return source
 
 

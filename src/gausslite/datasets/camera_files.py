@@ -18,6 +18,8 @@ INTRINSICS_FILE = "camera-intrinsics.txt"
 CAMERA_FILE = "cam_params.json"
 CAMERA_INFO_FILES = ("camera_info.yaml", "camera_info.yml")
 COLMAP_FILE = "cameras.txt"
+_MIN_UNITS_PER_METRE = 0.1
+"""Smaller values are metres per unit, the reciprocal."""
 
 
 def find_in_or_above(folder: Path, name: str) -> Path | None:
@@ -102,8 +104,9 @@ def read_json_camera(path: Path) -> FolderCamera:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         expected = '{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}} with numbers'
         raise DatasetError(f"{path}: expected {expected}; {type(error).__name__}: {error}") from None
-    if not (np.isfinite(numbers["scale"]) and numbers["scale"] > 0):
-        raise DatasetError(f"{path}: expected a positive depth scale, got {numbers['scale']}")
+    if not (np.isfinite(numbers["scale"]) and numbers["scale"] >= _MIN_UNITS_PER_METRE):
+        expected = "depth units per metre, such as 1000 for millimetres"
+        raise DatasetError(f"{path}: scale: expected {expected}, got {numbers['scale']:g}")
     if not (np.isfinite(numbers["w"]) and np.isfinite(numbers["h"])):
         raise DatasetError(f"{path}: expected a finite width and height, got {numbers['w']} and {numbers['h']}")
     registered = fields.get("depth_registered")
@@ -145,16 +148,24 @@ _COLMAP_LENSES: Mapping[str, Callable[[Sequence[float]], tuple[float, ...]]] = {
     "OPENCV": lambda p: tuple(p[:8]),
     "FULL_OPENCV": lambda p: tuple(p[:12]),
     "OPENCV_FISHEYE": lambda p: tuple(p[:8]),
+    "SIMPLE_RADIAL_FISHEYE": lambda p: (p[0], p[0], p[1], p[2], p[3], 0.0, 0.0, 0.0),
+    "RADIAL_FISHEYE": lambda p: (p[0], p[0], p[1], p[2], p[3], p[4], 0.0, 0.0),
 }
 """Parameters of COLMAP's camera models as fx fy cx cy and OpenCV's distortion coefficients."""
 
 
 def read_colmap_camera(path: Path) -> FolderCamera:
-    """Return the first camera of COLMAP's cameras.txt, whose principal point counts from the image corner.
+    """Return the camera of COLMAP's cameras.txt, whose principal point counts from the image corner.
 
-    Raises DatasetError.
+    Raises DatasetError, also for several cameras that differ: which one took an image is not in this file.
     """
-    location, fields = next(iter(read_rows(path)), (str(path), []))
+    rows = read_rows(path)
+    location, fields = rows[0] if rows else (str(path), [])
+    others = sum(other[1:] != fields[1:] for _, other in rows[1:])
+    if others:
+        raise DatasetError(
+            f"{path}: expected one camera, got {1 + others} that differ; leave the one that took the images"
+        )
     model = fields[1] if len(fields) > 1 else ""
     if model not in _COLMAP_LENSES:
         raise DatasetError(
@@ -166,7 +177,7 @@ def read_colmap_camera(path: Path) -> FolderCamera:
         fx, fy, cx, cy, *distortion = _COLMAP_LENSES[model](numbers[2:])
     except (IndexError, ValueError):
         raise DatasetError(f"{location}: expected more parameters for {model}, got {len(numbers) - 2}") from None
-    lens = lens_of(str(path), "equidistant" if model == "OPENCV_FISHEYE" else "plumb_bob", distortion)
+    lens = lens_of(str(path), "equidistant" if model.endswith("FISHEYE") else "plumb_bob", distortion)
     camera = FileIntrinsics(fx, fy, cx - 0.5, cy - 0.5).camera(str(path), int(numbers[0]), int(numbers[1]))
     return FolderCamera(camera, lens=lens)
 
@@ -174,9 +185,10 @@ def read_colmap_camera(path: Path) -> FolderCamera:
 _LENS_MODELS = {
     **dict.fromkeys(("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "opencv"), LensModel.RADTAN),
     **dict.fromkeys(("brownconrady", "modifiedbrownconrady", "inversebrownconrady"), LensModel.RADTAN),
-    **dict.fromkeys(("equidistant", "fisheye", "kannalabrandt", "kannalabrandt4"), LensModel.FISHEYE),
+    **dict.fromkeys(("equidistant", "fisheye", "opencvfisheye", "kb4"), LensModel.FISHEYE),
+    **dict.fromkeys(("kannalabrandt", "kannalabrandt4", "kannalabrandt8"), LensModel.FISHEYE),
 }
-"""Names of ROS, Kalibr, OpenCV and the RealSense SDK, in lower case, without marks between words."""
+"""Names of ROS, Kalibr, OpenCV, ORB-SLAM, Basalt and the RealSense SDK, in lower case, without marks between words."""
 _WITHOUT_LENS = ("", "none", "pinhole", "ideal", "undistorted", "rectified")
 _MAX_COEFFICIENTS = {LensModel.RADTAN: 8, LensModel.FISHEYE: 4}
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -26,14 +26,14 @@ _PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\x01\xd0-\xd7])", re.DOTALL)
 """The start of a JPEG segment; other bytes after FF belong to compressed pixels."""
 _JPEG_START, _JPEG_END = b"\xd8", b"\xd9"
+_SATURATED = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True, slots=True)
 class DepthUnits:
-    """Units per metre of a 16-bit depth image, and the values that mark missing depth."""
+    """Units per metre of a depth image."""
 
     per_metre: float
-    invalid: tuple[int, ...] = (0,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +81,13 @@ def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
     raw = _decode(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DatasetError(f"{path}: expected a 16-bit image of one channel, got {raw.dtype} of shape {raw.shape}")
-    depth_m = raw.astype(np.float32) / np.float32(units.per_metre)
-    for value in units.invalid:
-        if value != 0:
-            depth_m[raw == value] = 0.0
+    return depth_in_metres(raw, units.per_metre)
+
+
+def depth_in_metres(raw: UInt16[ndarray, "h w"], per_metre: float) -> Float32[ndarray, "h w"]:
+    """Return depth in metres of 16-bit units; 0 for the largest value, which cameras write beyond their range."""
+    depth_m = raw.astype(np.float32) / np.float32(per_metre)
+    depth_m[raw == _SATURATED] = 0.0
     return depth_m
 
 

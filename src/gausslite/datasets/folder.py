@@ -109,6 +109,19 @@ def estimate_up(
     return (float(up[0]), float(up[1]), float(up[2]))
 
 
+_LEVEL_COSINE = 0.8
+"""Cameras without roll show up within about 20 degrees; rarely level ones within 37."""
+
+
+def up_note(rotations_world_camera: Float64[ndarray, "n 3 3"], up_axis: UpAxis) -> str:
+    """Return the message on images that show another upward direction than this one; empty if they agree."""
+    shown = np.array(estimate_up(rotations_world_camera, up_axis))
+    if shown @ up_axis > _LEVEL_COSINE:
+        return ""
+    stated, found = (",".join(f"{value + 0.0:.2g}" for value in np.round(axis, 2)) for axis in (up_axis, shown))
+    return f"the images show up as {found}, the layout as {stated}; 'on', heights and grids need it: state up={found}"
+
+
 _ORIGIN_STEP_M = 10_000.0
 _EARTH_DIAMETER_M = 1.3e7
 _ORIGIN_POSES = 9

@@ -16,7 +16,7 @@ from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.pose import UpAxis, unit_up_axis
 
-_UNITS = DepthUnits(per_metre=1000.0, invalid=(0, 65535))
+_UNITS = DepthUnits(per_metre=1000.0)
 _COLOUR_NAME = re.compile(r"frame-(\d{6})\.color\.(?:png|jpg)")
 _KINECT = FileIntrinsics(585.0, 585.0, 320.0, 240.0)
 _KINECT_SIZE = (640, 480)

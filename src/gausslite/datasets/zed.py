@@ -16,7 +16,7 @@ from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource, is_lo
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis
 
-_MILLIMETRES = DepthUnits(per_metre=1000.0, invalid=(0, 65535))
+_MILLIMETRES = DepthUnits(per_metre=1000.0)
 _COLOUR_NAME = re.compile(r"left(\d{6})\.png")
 _POSE_FILES = ("poses.csv", "poses.txt")
 _MEANING = "frame tx ty tz qx qy qz qw"

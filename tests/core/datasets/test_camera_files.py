@@ -16,7 +16,15 @@ from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import DatasetError
 
-FISHEYE_NAMES = ["equidistant", "fisheye", "Kannala Brandt4", "kannala_brandt4", "KANNALA-BRANDT"]
+FISHEYE_NAMES = [
+    "equidistant",
+    "fisheye",
+    "Kannala Brandt4",
+    "kannala_brandt4",
+    "KANNALA-BRANDT",
+    "KannalaBrandt8",
+    "kb4",
+]
 RADIAL_NAMES = ["plumb_bob", "rational_polynomial", "radtan", "Brown Conrady", "inverse_brown_conrady", "OPENCV"]
 
 
@@ -131,3 +139,30 @@ def test_the_published_camera_is_for_its_series_and_aspect_ratio(tmp_path: Path,
         write_colour(image, width)
     with pytest.raises(DatasetError, match=f"{name}: the camera is unknown"):
         open_source(str(folder))
+
+
+def test_several_colmap_cameras_are_no_choice(tmp_path: Path) -> None:
+    file = tmp_path / "cameras.txt"
+    file.write_text("1 PINHOLE 16 12 20 20 8 6\n2 PINHOLE 16 12 20 20 8 6\n")
+    found = read_folder_camera(tmp_path, 16, 12)
+    assert found is not None
+    file.write_text("1 PINHOLE 16 12 20 20 8 6\n2 PINHOLE 16 12 24 24 8 6\n")
+    with pytest.raises(DatasetError, match=r"cameras.txt: expected one camera, got 2 that differ"):
+        read_folder_camera(tmp_path, 16, 12)
+
+
+@pytest.mark.parametrize(
+    ("line", "k2"), [("SIMPLE_RADIAL_FISHEYE 16 12 20 8 6 0.1", 0.0), ("RADIAL_FISHEYE 16 12 20 8 6 0.1 -0.2", -0.2)]
+)
+def test_colmap_fisheyes_of_one_focal_length(tmp_path: Path, line: str, k2: float) -> None:
+    (tmp_path / "cameras.txt").write_text(f"1 {line}\n")
+    found = read_folder_camera(tmp_path, 16, 12)
+    assert found is not None
+    assert found.lens == Lens(LensModel.FISHEYE, (0.1, k2, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("scale", [0.001, 0.0, -1000.0, float("inf")])
+def test_a_scale_is_units_per_metre(tmp_path: Path, scale: float) -> None:
+    write_json(tmp_path / "cam_params.json", scale=scale)
+    with pytest.raises(DatasetError, match=r"scale: expected depth units per metre, such as 1000 for millimetres"):
+        read_folder_camera(tmp_path, 16, 12)

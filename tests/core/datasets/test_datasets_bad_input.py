@@ -163,7 +163,7 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
     ("replica", lambda f: (f.parent / "cam_params.json").unlink(), DatasetError, "office0: the camera is unknown"),
     ("replica", lambda f: (f.parent / "cam_params.json").write_text("{"), DatasetError, "cam_params.json: expected"),
     ("replica", lambda f: replace(f.parent / "cam_params.json", '"fx"', '"x"'), DatasetError, "cam_params.json: .*fx"),
-    ("replica", lambda f: replace(f.parent / "cam_params.json", "6553.5", "0"), DatasetError, "positive depth scale"),
+    ("replica", lambda f: replace(f.parent / "cam_params.json", "6553.5", "0"), DatasetError, "depth units per metre"),
     (
         "replica",
         lambda f: replace(f.parent / "cam_params.json", '"w": 16', '"w": 20'),

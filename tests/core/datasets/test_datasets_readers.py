@@ -76,6 +76,16 @@ def test_seven_scenes_reads_numbers_depth_and_principal_point(tmp_path: Path) ->
     assert source.frame(2).index == 8
 
 
+@pytest.mark.parametrize(("write", "name"), [(write_tum, "depth/1.png"), (write_replica, "results/depth000001.png")])
+def test_the_largest_depth_is_no_return_in_every_layout(
+    tmp_path: Path, write: Callable[[Path], Path], name: str
+) -> None:
+    folder = write(tmp_path / "fr1")
+    write_depth(folder / name, 65535)
+    source = open_source(str(folder))
+    assert [source.frame(i).has_depth for i in range(3)] == [True, False, True]
+
+
 def test_seven_scenes_repairs_rounded_rotations(tmp_path: Path) -> None:
     folder = write_seven_scenes(tmp_path / "seq")
     (folder / "frame-000000.pose.txt").write_text("1.004 0 0 1\n0 1 0.003 2\n0 0 0.998 3\n0 0 0 1\n")

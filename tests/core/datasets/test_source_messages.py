@@ -109,3 +109,17 @@ def test_a_folder_without_poses_is_refused_with_the_option_that_tracks_them(
     (tum / "groundtruth.txt").write_text("")
     assert main(["map", str(tum), "--out", str(tmp_path / "out")]) == 2
     assert "--poses track" not in capsys.readouterr().err
+
+
+def test_images_that_show_another_upward_direction_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_tum(tmp_path / "fr1", frames=60)
+    # the first camera is the world, as in the trajectories of ORB-SLAM: y points down
+    yaws = np.linspace(-1.2, 1.2, 300) / 2
+    rows = [f"{9.9 + i / 100:.3f} 0 0 0 0 {np.sin(a):.9f} 0 {np.cos(a):.9f}" for i, a in enumerate(yaws)]
+    (folder / "groundtruth.txt").write_text("\n".join(rows))
+    assert open_recorded(str(folder), None).up_axis == (0.0, 0.0, 1.0)
+    assert "the images show up as 0,-1,0, the layout as 0,0,1;" in capsys.readouterr().err
+    open_recorded(str(folder), (0.0, -1.0, 0.0))
+    assert "up" not in capsys.readouterr().err
