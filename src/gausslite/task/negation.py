@@ -22,6 +22,7 @@ _NEGATED_VERBS: Final = WISHES | word_set("care touch mean")
 _EXCLUDING_TAGS: Final = frozenset({Tag.VERB, Tag.DETERMINER, Tag.NOUN})
 _VERB_FORMS: Final = frozenset({Tag.VERB, Tag.GERUND, Tag.PARTICIPLE})
 _NOUN_BEFORE: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.RELATIVE, Tag.AUXILIARY, Tag.ANAPHOR, Tag.CONJUNCTION})
+_SUBJECTS: Final = word_set("i we he she they one")
 _NOTS: Final = word_set("not never") | {"but not", "do not", "doesn't", "don't", "dont"}
 _CLAUSE_START_TAGS: Final = frozenset({None, Tag.CLAUSE_BREAK, Tag.CONJUNCTION})
 _QUESTION_WORDS: Final = word_set("is are was were does did has have can could would will")
@@ -34,7 +35,7 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
         buffer.close()  # "the hammer. no, the bigger one"
     elif word == "no":
         _deny(buffer)
-    elif before is Tag.PRONOUN and buffer.word(-1) != "you" and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
+    elif before is Tag.PRONOUN and buffer.word(-1) in _SUBJECTS and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
         buffer.close()  # "I can't find my phone"
         # "I can't find it on the sofa"
         found = verb_base(buffer.word(1)) in _FINDING_VERBS and buffer.tag(2) is Tag.ANAPHOR

@@ -151,6 +151,8 @@ _PLAIN: Final = {
     rf"(to|on|in|into|under|behind|near|next to) ({_NAMED})[.,;] (?:no|sorry|wait|actually),? \1 ({_NAMED}){_END}": (
         r"\1 \3, not \1 \2"
     ),
+    rf"(?:do not|don't|never) (\w+ {_NAMED}) ({_PLACED} {_NAMED}),? but ({_PLACED} {_NAMED}){_END}": r"\1 \3, not \2",
+    r"let (the [\w ]+?) (?:stay|be|remain)(?: where (?:it is|they are))?(?= and\b|$)": r"do not touch \1",
     r"you (?:can|will|may|should)? ?find (?:her|him|it|them)": "it is",
     r"between (?:you|me|us) and": "between",
     rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",

@@ -53,6 +53,10 @@ def test_no_sentence_of_a_foreign_set_is_read_as_its_opposite(path):
         ("Do not put the knife in the dishwasher, wash it in the sink", "dishwasher"),
         ("Sweep the hall but stay off the yellow line", "line"),
         ("Pick the ripe plums and leave the green ones on the tree", "plum"),
+        ("Bring me neither the fork nor the knife but the spoon", "fork"),
+        ("Do not put the vase on the table but on the shelf", "table"),
+        ("Bring the plate, no wait, bring the bowl", "plate"),
+        ("Take the box to the kitchen. No, to the garage", "kitchen"),
     ],
 )
 def test_what_is_denied_is_not_handled(text, denied):
