@@ -2,8 +2,9 @@
 
 Candidates are the nearest earlier keyframe by position, and the most similar one by its place descriptor. Their depth
 surfaces give the motion to a centimetre, and their images refine it. A motion that would move the map is verified: what
-earlier keyframes have mapped, rendered from the new pose, must agree with the image. The pose graph then decides which
-loops are true. One that it rejects, at once or later, is counted and reported, and does not correct the map.
+earlier keyframes have mapped, rendered from the new pose, must not draw the pose back, and it or the earlier image must
+agree with the new image. The pose graph then decides which loops are true. One that it rejects, at once or later, is
+counted and reported, and does not correct the map.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ _NOISE_STDS = 2.0 * 2.0**0.5
 class LoopCounts:
     """What became of the loops so far.
 
-    refused: keyframes whose rendering from the pose of a loop did not agree with their image. accepted, rejected: loops
+    refused: keyframes whose image, or the map, did not agree with the pose of a loop. accepted, rejected: loops
     by the latest solution of the pose graph. withdrawn: accepted by one solution and rejected by a later one.
     corrections: how often the map moved.
     """

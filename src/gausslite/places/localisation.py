@@ -19,7 +19,7 @@ from gausslite.places.descriptors import PlaceDescriptor, PlaceIndex, describe
 from gausslite.places.registration import Surface, can_match_without_guess, depth_points, matched_motion, register
 from gausslite.places.verification import RenderMap, Verification, verify
 
-_CANDIDATES = 5
+_CANDIDATES = 10
 _WIDTH_PX = 320
 _SAME_PLACE_M, _SAME_PLACE_DEG = 0.3, 10.0
 """Verified poses closer than this are one place; more than one place is an ambiguity."""
