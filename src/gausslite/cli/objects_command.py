@@ -31,6 +31,7 @@ from gausslite.wire.security import TlsFiles
 _NS_PER_S = 1e9
 _EPOCH_TIMES_S = 1e8
 """Larger times are counted from 1970."""
+_MAX_LISTED = 20
 _MIN_GAUSSIANS = 20
 
 
@@ -78,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
         for note in notes:
             print(f"note: {note}")
         if options.question or not objects:
-            print(_count(len(objects), options.question))
+            print(_count(len(objects), options.question, place.objects))
     return 0 if objects else 1
 
 
@@ -98,10 +99,13 @@ def _select(place: _Place, question: str) -> tuple[Sequence[TeamObject], Sequenc
     return [by_id[landmark.object_id] for landmark in found.objects], found.notes
 
 
-def _count(count: int, question: str) -> str:
-    if not count:
-        return f"no object{f' for {quote_name(question)}' if question else ''}"
-    return f"{count} object{'s' if count > 1 else ''}"
+def _count(count: int, question: str, known: Sequence[TeamObject]) -> str:
+    """Return how many objects were found; without any, also what the map has."""
+    if count:
+        return f"{count} object{'s' if count > 1 else ''}"
+    nouns = sorted({team_object.landmark.noun for team_object in known})[:_MAX_LISTED]
+    has = f"; the map has {', '.join(nouns)}" if nouns else ""
+    return f"no object{f' for {quote_name(question)}' if question else ''}{has}"
 
 
 def _query(options: argparse.Namespace) -> _Place:
@@ -202,13 +206,17 @@ def _describe(team_object: TeamObject, box: OrientedBox | None) -> str:
     size = " x ".join(f"{value:.2f}" for value in (landmark.size_m if box is None else box.size_m))
     turned = "" if box is None else f" turned by {round(math.degrees(box.yaw_rad))} deg"
     seen = "; ".join(
-        f"{observer.agent_id} from {_time(observer.first_seen_ns)} to {_time(observer.last_seen_ns)}"
+        f"{observer.agent_id} {_span(_time(observer.first_seen_ns), _time(observer.last_seen_ns))}"
         for observer in team_object.observers
     )
     return (
         f"{landmark.noun} ({landmark.role}) {landmark.object_id}: at ({place}) m, size {size} m{turned}, "
         f"confidence {landmark.confidence:.2f}, seen by {seen}"
     )
+
+
+def _span(first: str, last: str) -> str:
+    return f"at {first}" if first == last else f"from {first} to {last}"
 
 
 def _time(time_ns: int) -> str:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from gausslite.config.option import suggestion
+from gausslite.config.option import nearest, suggestion
 from gausslite.config.plain_values import describe_range, is_within, read_plain, without_password
 from gausslite.domain.errors import InvalidInputError
 from gausslite.process import printable
@@ -29,6 +29,14 @@ class CommandParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the message and the command that lists the options, and exit."""
         self.exit(2, f"{self.prog}: {printable(without_password(message))}; see `{self.prog} --help`\n")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Name the nearest command or choice, which argparse does from Python 3.14 on."""
+        if action.choices is not None and value not in action.choices:
+            similar = nearest(str(value), map(str, action.choices))
+            if similar is not None:
+                raise argparse.ArgumentError(action, f"invalid choice: {value!r}; did you mean {similar}?")
+        super()._check_value(action, value)
 
     @property
     def flags(self) -> list[str]:

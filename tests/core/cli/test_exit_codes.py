@@ -40,6 +40,15 @@ def test_wrong_options_have_the_code_of_wrong_input() -> None:
     assert ended.value.code == 2
 
 
+def test_a_misspelt_command_names_the_nearest_one(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["exprot", "run"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == (
+        "gausslite: argument COMMAND: invalid choice: 'exprot'; did you mean export?; see `gausslite --help`\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "program"),
     [(("parse", "Find the mug", "--jsn"), "gausslite parse"), (("bench", "parser", "--jsn"), "gausslite bench parser")],
