@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -16,6 +16,7 @@ from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.arrays import require_array
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.wire.map_follower import FollowedMap
 
 NO_AGENT = -1
@@ -147,6 +148,34 @@ def _category_legend(names: Sequence[str], indices: Int[ndarray, " n"]) -> list[
 
 def _as_rgb(colour: UInt8[ndarray, "3"]) -> tuple[int, int, int]:
     return int(colour[0]), int(colour[1]), int(colour[2])
+
+
+def with_agents(fused: ViewContents, own: Mapping[str, Gaussians]) -> ViewContents:
+    """Return a voted map with the agent of each Gaussian, by the agents' own maps.
+
+    A fused file does not name its winners. A voxel's content came from the agent whose own voxel is most alike in
+    number, mean place and mean colour; messages round these by far less than agents differ.
+    """
+    grid = VoxelGrid()
+    keys, rows, features = _voxel_features(fused.gaussians, grid)
+    distances = np.full((len(own), len(keys)), np.inf)
+    for index, gaussians in enumerate(own.values()):
+        own_keys, _, own_features = _voxel_features(gaussians, grid)
+        present = np.isin(keys, own_keys)
+        others = own_features[np.searchsorted(own_keys, keys[present])]
+        distances[index, present] = np.abs(features[present] - others).sum(axis=1)
+    owner = np.where(np.isfinite(distances).any(axis=0), distances.argmin(axis=0), NO_AGENT)
+    return replace(fused, agent=owner[rows].astype(np.int64), agents=tuple(own))
+
+
+def _voxel_features(
+    gaussians: Gaussians, grid: VoxelGrid
+) -> tuple[Int64[ndarray, " v"], Int64[ndarray, " n"], Float64[ndarray, "v 7"]]:
+    """Return the voxels, that of each Gaussian, and logarithm of the number, mean place in voxels, and mean colour."""
+    keys, rows, counts = np.unique(grid.keys(gaussians.means_m), return_inverse=True, return_counts=True)
+    values = np.concatenate([gaussians.means_m / grid.size_m, gaussians.rgb], axis=1).astype(np.float64)
+    means = np.stack([np.bincount(rows, column, len(keys)) / counts for column in values.T], axis=1)
+    return keys, rows, np.column_stack([np.log(counts), means])
 
 
 DEFAULT_LIMIT = 150_000

@@ -8,6 +8,7 @@ from typing import Any
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import GaussLiteError
+from gausslite.evaluation.compare import map_purpose
 from gausslite.wire.clients import Export, FusionClient
 from gausslite.wire.map_follower import MapFollower
 from gausslite_view.cameras import TeamCameras, TeamKeyframes
@@ -16,6 +17,7 @@ from gausslite_view.map_page import MapPage, text_html
 from gausslite_view.plots import TeamPlots
 
 _FUSED, _REFINED = "fused map", "refined map"
+_STRATEGIES = {_FUSED: "vote", _REFINED: "refine"}
 _NS_PER_S = 1e9
 
 
@@ -30,6 +32,7 @@ class FusionPanel:
         gui = page.server.gui
         with gui.add_folder("Fusion server", order=0):
             self._layer: Any = gui.add_dropdown("Shown map", [_FUSED])
+            self._purpose = gui.add_html("")
             self._status = gui.add_html("")
             self._refine = gui.add_button("Start refinement")
             self._message = gui.add_html("")
@@ -50,6 +53,7 @@ class FusionPanel:
         followed = self._follower.newest()
         revision = status.fused_revision if followed is None else followed.revision
         layer = str(self._layer.value)
+        self._purpose.content = text_html([map_purpose(_STRATEGIES.get(layer, layer))])
         # an agent that replaces keyframes also sends updates, so that the revision changes
         keyframes = tuple((agent.agent_id, agent.keyframes) for agent in status.agents if agent.keyframes)
         shown = (layer, revision, keyframes, self._cameras.keyframes_back)
@@ -94,8 +98,9 @@ class FusionPanel:
             f"{mission}: {status.fused_gaussians:,} Gaussians in "
             f"{status.fused_voxels:,} voxels, {status.keyframes} keyframes",
             *(
-                f"{agent.agent_id}{'' if agent.joined else ' (left)'}: wins {agent.won_voxels:,} of {agent.voxels:,} "
-                f"voxels, {(agent.roi_bytes + agent.handover_bytes) / 1e6:.1f} MB received"
+                f"{agent.agent_id}{'' if agent.joined else ' (left)'}{_task_text(agent)}: wins {agent.won_voxels:,} of "
+                f"{agent.voxels:,} voxels, alone lacks {max(status.fused_voxels - agent.voxels, 0):,}; "
+                f"{(agent.roi_bytes + agent.handover_bytes) / 1e6:.1f} MB received"
                 f"{'; ' if agent.alignment.message else ''}{agent.alignment.message}"
                 for agent in status.agents
             ),
@@ -115,3 +120,7 @@ class FusionPanel:
             self._message.content = text_html([str(error)])
         finally:
             self._refine.disabled = False
+
+
+def _task_text(agent: Any) -> str:
+    return f" for {', '.join(agent.targets)}" if agent.targets else ""

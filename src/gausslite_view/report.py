@@ -15,6 +15,7 @@ from gausslite.codec.state_file import read_png, write_atomic
 from gausslite.domain.errors import StorageError
 from gausslite.domain.objects import found_text
 from gausslite.evaluation.compare import MAP_PURPOSES, team_sentence
+from gausslite_view.contents import ColourMode
 from gausslite_view.report_elements import as_html, element, picture, styled
 from gausslite_view.report_parts import (
     MAP_SIZE,
@@ -40,8 +41,8 @@ from gausslite_view.report_pictures import (
     Line,
     PlanCamera,
     bar_chart,
-    kappa_gaussians,
-    kappa_legend,
+    colour_legend,
+    coloured_gaussians,
     line_chart,
     plan_view,
     run_colour,
@@ -135,11 +136,16 @@ def _lead_sentences(runs: Sequence[RunResults]) -> Iterator[str]:
     for run in runs:
         if run.report:
             yield f"{run.name}: {_found(run)} {_quality(run)}"
-    psnr = {f"the region of {task}": _values(runs, _of_task(task, "roi_psnr")) for task in _tasks(runs)}
-    if gain := team_sentence({**psnr, "whole images": _values(runs, lambda run: number(run.scores.get("full_psnr")))}):
+    if gain := team_gain(runs):
         yield gain
     elif best := _best_region(runs):
         yield best
+
+
+def team_gain(runs: Sequence[RunResults]) -> str:
+    """Return what the voted map of a team has and each robot's own map lacks; empty without scores of a team."""
+    psnr = {f"the region of {task}": _values(runs, _of_task(task, "roi_psnr")) for task in _tasks(runs)}
+    return team_sentence({**psnr, "whole images": _values(runs, lambda run: number(run.scores.get("full_psnr")))})
 
 
 def _task_figures(runs: Sequence[RunResults]) -> list[Figure]:
@@ -265,7 +271,9 @@ def _view_note(runs: Sequence[RunResults]) -> Element:
 
 
 def _kappa_legends(runs: Sequence[RunResults]) -> list[Element]:
-    return [styled("div", "legend", f"kappa of {run.name}: ", kappa_legend(run.contents)) for run in runs]
+    return [
+        styled("div", "legend", f"kappa of {run.name}: ", colour_legend(run.contents, ColourMode.KAPPA)) for run in runs
+    ]
 
 
 def _plan_notes() -> list[Element]:
@@ -281,8 +289,26 @@ def _plans(runs: Sequence[RunResults]) -> Element:
     if plan is None:
         return styled("p", "muted", "The maps are empty.")
     cells = [plan_view(run.contents, run.contents.gaussians, plan, run.name) for run in runs]
-    cells += [plan_view(run.contents, kappa_gaussians(run.contents), plan, f"{run.name}: kappa") for run in runs]
-    return element("div", *cells, attributes={"class": "grid", "style": f"--columns:{len(runs)}"})
+    cells += [_coloured_plan(run, plan, ColourMode.KAPPA) for run in runs]
+    grid = element("div", *cells, attributes={"class": "grid", "style": f"--columns:{len(runs)}"})
+    return element("div", *(_shares(run, plan) for run in runs if len(run.contents.agents) > 1), grid)
+
+
+def _coloured_plan(run: RunResults, plan: PlanCamera, mode: ColourMode) -> Element:
+    return plan_view(run.contents, coloured_gaussians(run.contents, mode), plan, f"{run.name}: {mode}")
+
+
+def _shares(run: RunResults, plan: PlanCamera) -> Element:
+    """Return which robot each part of a team's map came from: what the other robots lack alone."""
+    counts = np.bincount(run.contents.agent[run.contents.agent >= 0], minlength=len(run.contents.agents))
+    total = len(run.contents.gaussians)
+    shares = [
+        f"{as_percent(count / total)} from {name}" for name, count in zip(run.contents.agents, counts, strict=True)
+    ]
+    text = f"What no robot has alone: of {run.name}, {', '.join(shares)}."
+    picture = _coloured_plan(run, plan, ColourMode.AGENT)
+    legend = colour_legend(run.contents, ColourMode.AGENT)
+    return styled("div", "shares", styled("p", "muted", text), legend, picture)
 
 
 def _by_world_frame(runs: Sequence[RunResults]) -> list[list[RunResults]]:

@@ -15,11 +15,12 @@ from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.codec.run_files import ViewImage, read_view_images
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.objects import ObjectLandmark
+from gausslite.evaluation.compare import TEAM_MAP
 from gausslite.evaluation.lpips import NAME as LPIPS_NAME
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
 from gausslite.process import print_message, size_text
-from gausslite_view.contents import ViewContents
+from gausslite_view.contents import ViewContents, with_agents
 from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
 
@@ -118,10 +119,13 @@ def _read_team(folder: Path, report: Mapping[str, object]) -> list[RunResults]:
         raise MapFileError(f"{folder}: expected a folder with {_MAP} for each agent of report.json, got none")
     runs = [_read_run(folder / name, name, _mapping(maps.get(name))) for name in present]
     objects = tuple(landmark for run in runs for landmark in run.contents.objects)
+    own = {run.name: run.contents.gaussians for run in runs}
     for name in _FUSED_MAPS:
         file = folder / f"{name}.ply"
         if file.is_file():
             contents = replace(ViewContents.of_one_agent(read_ply(file, print_message)), objects=objects)
+            if name == TEAM_MAP:
+                contents = with_agents(contents, own)
             runs.append(RunResults(name, file, contents, read_world_frame(file), {}, _mapping(maps.get(name))))
     return runs
 

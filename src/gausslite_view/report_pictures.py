@@ -291,15 +291,15 @@ class SharedView:
         return self.view.T_world_camera
 
 
-def kappa_gaussians(contents: ViewContents) -> Gaussians:
-    """Return the map in the colours of kappa, as in the live view."""
-    return replace(contents.gaussians, rgb=(colours_of(contents, ColourMode.KAPPA) / 255).astype(np.float32))
+def coloured_gaussians(contents: ViewContents, mode: ColourMode) -> Gaussians:
+    """Return the map in the colours of a mode, as in the live view."""
+    return replace(contents.gaussians, rgb=(colours_of(contents, mode) / 255).astype(np.float32))
 
 
-def kappa_legend(contents: ViewContents) -> Element:
-    """Return the colours of kappa with their values."""
+def colour_legend(contents: ViewContents, mode: ColourMode) -> Element:
+    """Return the colours of a mode with their meanings."""
     entries = []
-    for name, (red, green, blue) in legend_of(contents, ColourMode.KAPPA):
+    for name, (red, green, blue) in legend_of(contents, mode):
         swatch = element("span", attributes={"class": "swatch", "style": f"background:rgb({red},{green},{blue})"})
         entries.append(styled("span", "legend-entry", swatch, name))
     return styled("div", "legend", *entries)
@@ -331,7 +331,7 @@ def _source_of(run: RunResults) -> str:
 def view_sections(runs: Sequence[RunResults], views: Sequence[SharedView]) -> list[Element]:
     """Return a grid for each view, with a column for the photograph and one for each run."""
     colour = {run.name: view_map(run.contents.gaussians) for run in runs}
-    kappa = {run.name: view_map(kappa_gaussians(run.contents)) for run in runs}
+    kappa = {run.name: view_map(coloured_gaussians(run.contents, ColourMode.KAPPA)) for run in runs}
     return [_section(runs, view, colour, kappa) for view in views]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from gausslite.config.command_parser import CommandParser, bounded
 from gausslite.config.option import build
 from gausslite.config.program import add_flags
+from gausslite.mission.results import read_report
 from gausslite.process import print_message
 from gausslite.wire.security import TlsFiles
 from gausslite_view.contents import DEFAULT_LIMIT
@@ -24,7 +25,11 @@ _DEFAULT_PORT = 8099
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite view`."""
     add = parser.add_argument
-    add("place", metavar="MAP.ply|RUN|HOST:PORT", help="a PLY file, a results folder, an agent or a fusion server")
+    add(
+        "place",
+        metavar="MAP.ply|RUN|HOST:PORT",
+        help="a PLY file, a results folder (a demo's too), an agent or a fusion server",
+    )
     add(
         "--port",
         metavar="PORT",
@@ -45,7 +50,7 @@ def configure(parser: CommandParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C. Raises MapFileError, InvalidInputError, UnavailableError, MismatchError."""
-    with _show_files(options) if _is_path(options.place) else _follow(options) as url:
+    with show_files(options) if _is_path(options.place) else _follow(options) as url:
         print_message(f"{options.place} is shown at {url}; end with Ctrl-C")
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
@@ -53,13 +58,48 @@ def run(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _show_files(options: argparse.Namespace) -> Iterator[str]:
+def show_files(options: argparse.Namespace) -> Iterator[str]:
+    """Serve the page of a PLY file or of results; yield its URL. Raises MapFileError, InvalidInputError."""
     path = Path(options.place)
+    if path.is_dir() and "agents" in read_report(path):
+        with _show_team(path, options) as url:
+            yield url
+        return
     contents = read_contents(path)
     past = read_past(path, contents)
     page = open_page(options.port, f"GaussLite {path.resolve().name}", options.max_shown)
     try:
         page.show_run(contents, past)
+        yield page.url
+    finally:
+        page.close()
+
+
+@contextmanager
+def _show_team(folder: Path, options: argparse.Namespace) -> Iterator[str]:
+    """Show one map of a demo at a time, the voted one first, with what it is for and what a robot alone lacks."""
+    from gausslite.evaluation.compare import TEAM_MAP, map_purpose
+    from gausslite_view.report import team_gain
+    from gausslite_view.report_parts import read_results
+
+    page = open_page(options.port, f"GaussLite {folder.resolve().name}", options.max_shown)
+    try:
+        from gausslite_view.map_page import text_html
+
+        runs = {run.name: run for run in read_results([folder]).runs}
+        with page.server.gui.add_folder("Team", order=0):
+            first = TEAM_MAP if TEAM_MAP in runs else None
+            chosen = page.server.gui.add_dropdown("Shown map", list(runs), initial_value=first)
+            purpose = page.server.gui.add_html("")
+            page.server.gui.add_html(text_html([team_gain(list(runs.values()))]))
+
+        def show() -> None:
+            run = runs[chosen.value]
+            purpose.content = text_html([map_purpose(run.name, str(run.report.get("task") or ""))])
+            page.show(run.contents)
+
+        show()
+        chosen.on_update(lambda _: show())
         yield page.url
     finally:
         page.close()

@@ -57,3 +57,23 @@ def write_run(folder: Path, world_frame: str = "room", frame: int = 3, **report:
         "frame,seconds,iterations,gaussians,roi_share\n0,0.5,8,100,0.1\n1,0.4,8,357,0.2\n"
     )
     return folder
+
+
+def write_team(folder: Path) -> Path:
+    """Write the results of a demo: two agents with equal maps, the voted map, their scores and one comparison sheet."""
+    for agent in ("agent-a", "agent-b"):
+        own = {"agent_id": agent, "bytes_sent": 2_500_000, "map_shared_percent": 2.0}
+        write_run(folder / agent, **own, task="Find the mug", task_graph=TASK)
+    maps: dict[str, dict[str, Any]] = {
+        name: {"full_psnr": full, "tasks": {"agent-a": {"roi_psnr": region}}}
+        for name, full, region in (("agent-a", 16.0, 24.0), ("agent-b", 20.0, 15.0), ("vote", 22.0, 23.5))
+    }
+    maps["vote"]["roi_psnr"] = 23.0
+    for name in ("concatenation", "vote"):
+        (folder / f"{name}.ply").write_bytes((folder / "agent-a" / "map.ply").read_bytes())
+    report = {"agents": {"agent-a": {}, "agent-b": {}, "../agent-a": {}}, "maps": maps}
+    (folder / "report.json").write_text(json.dumps(report))
+    (folder / "pictures").mkdir()
+    sheet = (folder / "agent-a" / "views" / "000003.png").read_bytes()
+    (folder / "pictures" / "000-frame.png").write_bytes(sheet)
+    return folder

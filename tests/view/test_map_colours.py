@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians, random_gaussians
 
+from gausslite.domain.gaussians import Gaussians
 from gausslite_view.contents import (
     NO_AGENT,
     UNASSIGNED_RGB,
@@ -17,6 +18,7 @@ from gausslite_view.contents import (
     colours_of,
     covariances_m2,
     legend_of,
+    with_agents,
 )
 
 
@@ -61,3 +63,18 @@ def test_covariances_have_the_scales_along_the_rotated_axes():
     # a quarter turn about z exchanges the scales of x and y
     turned = plain_gaussians([[0, 0, 0]], quats_wxyz=[0.5**0.5, 0, 0, 0.5**0.5], scales_m=[[1, 2, 3]])
     np.testing.assert_allclose(covariances_m2(turned)[0], np.diag([4, 1, 9]), atol=1e-5)
+
+
+def test_the_agents_of_a_voted_map_follow_from_their_own_maps():
+    rng = np.random.default_rng(0)
+    a, b = (random_gaussians(300, seed) for seed in (1, 2))
+    left, right = a.take(a.means_m[:, 0] < 0), b.take(b.means_m[:, 0] >= 0)
+    rounding = rng.uniform(-1e-4, 1e-4, (len(left) + len(right), 3)).astype(np.float32)
+    fused = Gaussians.concatenate([left, right])
+    fused = dataclasses.replace(fused, means_m=fused.means_m + rounding)
+    contents = with_agents(ViewContents.of_one_agent(fused), {"a": a, "b": b})
+    assert contents.agents == ("a", "b")
+    expected = np.repeat([0, 1], [len(left), len(right)])
+    assert np.mean(contents.agent == expected) > 0.98
+    other = dataclasses.replace(a, means_m=a.means_m + np.float32(50))
+    assert set(with_agents(ViewContents.of_one_agent(other), {"a": a}).agent) == {NO_AGENT}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from argparse import Namespace
 from dataclasses import replace
 from urllib.parse import urlsplit
 
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import open_browser
+from run_folders import write_team
 from sample_gaussians import plain_gaussians
 
 from gausslite.codec.ply import write_ply
@@ -23,6 +25,7 @@ from gausslite_view.run_contents import read_contents, read_past
 
 pytest.importorskip("viser")
 from gausslite_view.pages import open_page
+from gausslite_view.view_command import show_files
 
 HOSTILE = "<img src=http://other.example/x onerror=document.title='broken'>"
 RED, YELLOW = (230, 30, 30), (230, 220, 30)
@@ -214,3 +217,15 @@ def test_a_box_has_twelve_edges_along_its_axes():
     lengths_m = np.abs(edges_m[:, 1] - edges_m[:, 0])
     assert (np.count_nonzero(lengths_m, axis=1) == 1).all()
     assert sorted(lengths_m.max(axis=1).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
+
+
+def test_the_page_of_a_demo_shows_one_map_at_a_time_and_what_it_is_for(tmp_path):
+    team = write_team(tmp_path / "team")
+    with show_files(Namespace(place=str(team), port=0, max_shown=10_000)) as url, open_browser() as browser:
+        tab = browser.new_page()
+        tab.goto(url)
+        tab.get_by_text("the team's map, for all tasks").wait_for()
+        tab.get_by_text("agent-b alone has 8.5 dB less in the region of agent-a").wait_for()
+        tab.get_by_label("Shown map").first.click()
+        tab.get_by_role("option", name="agent-b", exact=True).click()
+        tab.get_by_text("what one robot saw, in detail for its own task (Find the mug)").wait_for()

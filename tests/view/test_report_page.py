@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import open_browser
-from run_folders import MUG, TASK, write_run
+from run_folders import MUG, TASK, write_run, write_team
 
 from gausslite.cli.main import main
 from gausslite_view.report_parts import read_results
@@ -184,28 +184,7 @@ def test_a_run_without_photographs_or_poses_has_a_page(tmp_path):
 
 
 def test_the_maps_of_a_team_are_columns(tmp_path):
-    team = tmp_path / "team"
-    for agent in ("agent-a", "agent-b"):
-        write_run(
-            team / agent,
-            agent_id=agent,
-            bytes_sent=2_500_000,
-            map_shared_percent=2.0,
-            task="Find the mug",
-            task_graph=TASK,
-        )
-    maps = {
-        name: {"full_psnr": full, "tasks": {"agent-a": {"roi_psnr": region}}}
-        for name, full, region in (("agent-a", 16.0, 24.0), ("agent-b", 20.0, 15.0), ("vote", 22.0, 23.5))
-    }
-    maps["vote"]["roi_psnr"] = 23.0
-    (team / "vote.ply").write_bytes((team / "agent-a" / "map.ply").read_bytes())
-    (team / "report.json").write_text(
-        json.dumps({"agents": {"agent-a": {}, "agent-b": {}, "../agent-a": {}}, "maps": maps})
-    )
-    (team / "pictures").mkdir()
-    sheet = (team / "agent-a" / "views" / "000003.png").read_bytes()
-    (team / "pictures" / "000-frame.png").write_bytes(sheet)
+    team = write_team(tmp_path / "team")
     page = report(team, out=tmp_path / "page.html")
     rows = table_rows(tmp_path / "page.html")
     assert rows["region PSNR"] == ["–", "–", "23.00 dB"]
@@ -214,10 +193,12 @@ def test_the_maps_of_a_team_are_columns(tmp_path):
         "One map for all tasks: the voted map has 23.5 dB PSNR in the region of agent-a, 22.0 dB PSNR in whole images; "
         "agent-a alone has 6.0 dB less in whole images, agent-b alone has 8.5 dB less in the region of agent-a."
     ) in page.texts
-    assert rows["sent to the fusion server"] == ["2.5 MB", "2.5 MB", "–"]
-    assert rows["share of the map sent"] == ["2 %", "2 %", "–"]
+    assert rows["sent to the fusion server"] == ["2.5 MB", "2.5 MB", "–", "–"]
+    assert rows["share of the map sent"] == ["2 %", "2 %", "–", "–"]
     assert rows["frame rate"] == ["2.50 Hz", "2.50 Hz"]
     assert "team: 000-frame" in page.texts
+    assert "What no robot has alone: of vote, 100 % from agent-a, 0 % from agent-b." in page.texts
+    assert "vote: agent" in page.texts
     assert {"GaussLite: team", "Find the mug", "on"} <= set(page.texts)
 
 

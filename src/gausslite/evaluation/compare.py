@@ -232,6 +232,11 @@ TEAM_MAP = "vote"
 """What each fused map is for; a robot's own map is for its own task."""
 
 
+def map_purpose(name: str, task: str = "") -> str:
+    """Return what a map of a team is for; task: that of the robot whose own map it is."""
+    return MAP_PURPOSES.get(name) or f"what one robot saw, in detail for its own task{f' ({task})' if task else ''}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TeamScores:
     """Scores by map name, also inside each task's region alone (by task, then map), and a few comparison sheets."""
