@@ -9,12 +9,10 @@ from typing import Any
 
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.errors import GaussLiteError
-from gausslite.domain.objects import ObjectLandmark
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.convert_task import object_from_message
 from gausslite.wire.map_follower import MapFollower
-from gausslite.wire.views import CameraView
-from gausslite_view.cameras import CameraPanel, with_objects, with_region
+from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
 from gausslite_view.map_page import MapPage, text_html
 from gausslite_view.plots import HistoryPlot, QualityPlot
@@ -66,7 +64,7 @@ class AgentPanel:
         self._pointing.show_objects(objects)
         view = self._client.camera_view()
         if view is not None:
-            self._show_images(view, objects)
+            self._camera.show(view, objects)
             rendered, _ = self._client.render(view.camera, view.T_world_camera)
             self._quality.add(time.monotonic() - self._started_s, rendered, view.rgb, view.roi)
             keyframes = [KeyframeView(i, 0, view.camera, T, 0) for i, T in enumerate(view.keyframes)]
@@ -79,13 +77,6 @@ class AgentPanel:
         """Close the client and end the follower."""
         self._client.close()
         self._follower.close()
-
-    def _show_images(self, view: CameraView, objects: tuple[ObjectLandmark, ...]) -> None:
-        image = with_objects(with_region(view.rgb, view.roi), objects, view.camera, view.T_world_camera)
-        time_ns = int(view.times_ns[-1]) if len(view.times_ns) else None
-        self._camera.show_keyframe(view.frame_index, image, time_ns)
-        if view.detected is not None:
-            self._camera.show_detections(view.detected, time_ns)
 
     def _show_status(self, status: Any) -> None:
         now_s, uplink = time.monotonic(), status.uplink

@@ -18,7 +18,7 @@ from gausslite.domain.camera import Camera, project
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import inverse, transform_points
-from gausslite.domain.relevance import DetectedImage
+from gausslite.domain.relevance import CameraView, DetectedImage
 from gausslite.domain.state import EvenHistory
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import KEYFRAME_JPEG_QUALITY, decode_colour, encode_colour
@@ -186,22 +186,23 @@ _KEYFRAME, _DETECTION = "1 keyframe", "2 detection"
 
 
 class CameraPanel:
-    """Owns the images. Use it from one thread. time_ns: the time of the map that belongs to the image."""
+    """Owns the images. Use it from one thread."""
 
     def __init__(self, page: MapPage) -> None:
         with page.server.gui.add_folder("Camera", order=0) as folder:
             pass
         self._images = CameraImages(page, folder)
 
-    def show_keyframe(self, index: int, image: UInt8[ndarray, "h w 3"], time_ns: int | None) -> None:
-        """Show the newest keyframe, which is this frame, with its region and objects."""
-        detail = f"frame {index}, the task's region in red, objects in green"
+    def show(self, view: CameraView, objects: Sequence[ObjectLandmark]) -> None:
+        """Show the newest keyframe with its region and these objects, and the boxes of the newest detection."""
+        time_ns = int(view.times_ns[-1]) if len(view.times_ns) else None
+        image = with_objects(with_region(view.rgb, view.roi), objects, view.camera, view.T_world_camera)
+        detail = f"frame {view.frame_index}, the task's region in red, objects in green"
         self._images.show(_KEYFRAME, CameraImage(image, "Newest keyframe", detail), time_ns)
-
-    def show_detections(self, detected: DetectedImage, time_ns: int | None) -> None:
-        """Show the boxes of the newest detection."""
-        detail = f"frame {detected.index}, boxes with scores, too low ones in grey"
-        self._images.show(_DETECTION, CameraImage(with_detections(detected), "Newest detection", detail), time_ns)
+        if view.detected is not None:
+            image = with_detections(view.detected)
+            detail = f"frame {view.detected.index}, boxes with scores, too low ones in grey"
+            self._images.show(_DETECTION, CameraImage(image, "Newest detection", detail), time_ns)
 
 
 MAX_IMAGES = 6

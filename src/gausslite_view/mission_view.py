@@ -1,25 +1,34 @@
-"""Show a mission of this process on a page while it maps: the map, its keyframes, and the newest keyframe's region."""
+"""Show a mission of this process on a page while it maps, and pass on to it what a person points at there."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
+from queue import SimpleQueue
+from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import Float32, Float64
+from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
-from gausslite.domain.relevance import DetectedImage
+from gausslite.domain.camera import Camera
+from gausslite.domain.errors import UnavailableError
+from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
+from gausslite.mission.schedule import ScheduledTaskMapper
+from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.process import print_message
-from gausslite_view.cameras import CameraPanel, with_objects, with_region
+from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
 from gausslite_view.map_page import MapPage
 from gausslite_view.pages import open_page
 from gausslite_view.plots import HistoryPlot, QualityPlot
+from gausslite_view.pointing import PointingPanel
 
 _INTERVAL_S = 1.0
 _MOST_SHARE = 0.2
@@ -27,15 +36,65 @@ _MOST_SHARE = 0.2
 _NS_PER_S = 1e9
 
 
+_Result = TypeVar("_Result")
+
+
+class MissionRequests:
+    """Takes what a page asks of a mission of this process; the thread that maps answers between two frames."""
+
+    def __init__(self, mission: ScheduledTaskMapper) -> None:
+        self._mission = mission
+        self._waiting: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+        self._has_ended = False
+
+    def camera_view(self) -> CameraView | None:
+        """Return the newest keyframe; None before the first one. Raises UnavailableError at the end of the mission."""
+        return self._ask(self._mission.mapper.camera_view)
+
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
+    ) -> tuple[Float32[ndarray, "h w 3"], Float32[ndarray, "h w"]]:
+        """Return colour and depth in metres of the map. Raises UnavailableError at the end of the mission."""
+        rendering = self._ask(lambda: self._mission.mapper.render(camera, T_world_camera))
+        return rendering.rgb, rendering.expected_depth_m()
+
+    def assign_task(self, *, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()) -> TaskGraph:
+        """Change the task as `ScheduledTaskMapper.point_at`, with its errors and those of `camera_view`."""
+        return self._ask(lambda: self._mission.point_at(pointed, excluded_m))
+
+    def answer(self) -> None:
+        """Answer all requests that wait; call it from the thread that maps."""
+        while not self._waiting.empty():
+            request, future = self._waiting.get()
+            try:
+                future.set_result(request())
+            except Exception as error:  # the thread that asked raises it; the mission continues
+                future.set_exception(error)
+
+    def end(self) -> None:
+        """Refuse the requests that wait, and all later ones."""
+        self._has_ended = True
+        while not self._waiting.empty():
+            self._waiting.get()[1].set_exception(UnavailableError("the mission has ended; its files can be viewed"))
+
+    def _ask(self, request: Callable[[], _Result]) -> _Result:
+        future: Future[_Result] = Future()
+        self._waiting.put((request, future))
+        if self._has_ended:
+            self.end()
+        return future.result()
+
+
 class MissionView:
     """Draws at most once a second, less often where drawing is slow; call it from the thread that maps."""
 
-    def __init__(self, page: MapPage, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]) -> None:
-        self._page, self._mapper, self._task_at = page, mapper, task_at
+    def __init__(self, page: MapPage, mission: ScheduledTaskMapper) -> None:
+        self._page, self._mission = page, mission
         self._started_s = time.monotonic()
         self._due_s = 0.0
-        self._detected: DetectedImage | None = None
+        self._requests = MissionRequests(mission)
         gui = page.server.gui
+        self._pointing = PointingPanel(page, self._requests)
         self._camera = CameraPanel(page)
         with gui.add_folder("History", expand_by_default=False):
             self._rate = HistoryPlot(gui, "mapping (Hz)", ["Hz"])
@@ -43,18 +102,17 @@ class MissionView:
             self._quality = QualityPlot(gui)
 
     def update(self, outcome: FrameOutcome) -> None:
-        """Draw the map after a frame, if the next drawing is due."""
+        """Answer the page after a frame; draw the map if the next drawing is due."""
+        self._requests.answer()
+        self._pointing.show_objects(self._mission.mapper.objects)
         now_s = time.monotonic()
-        self._detected = outcome.detected or self._detected
         if now_s < self._due_s or not outcome.gaussians:
             return
-        keyframes = self._mapper.keyframes()
-        contents = self._contents(outcome.index, keyframes)
-        if keyframes:
-            self._show_image(keyframes[-1], contents.newest_ns)
+        mapper = self._mission.mapper
+        contents, view, keyframes = self._contents(), mapper.camera_view(), mapper.keyframes()
+        if view is not None:
+            self._camera.show(view, mapper.objects)
             self._add_quality(now_s - self._started_s, keyframes[-1])
-        if self._detected is not None:
-            self._camera.show_detections(self._detected, contents.newest_ns)
         if outcome.timing.seconds > 0:
             self._rate.add(now_s - self._started_s, [1 / outcome.timing.seconds])
         self._roi.add(now_s - self._started_s, [100 * outcome.roi_share])
@@ -63,42 +121,41 @@ class MissionView:
         ended_s = time.monotonic()
         self._due_s = max(now_s + _INTERVAL_S, ended_s + (ended_s - now_s) * (1 / _MOST_SHARE - 1))
 
-    def _contents(self, index: int, keyframes: list[Keyframe]) -> ViewContents:
-        graph, trajectory = self._task_at(index), self._mapper.poses.trajectory()
+    def close(self) -> None:
+        """Refuse what the page still asks, and end it."""
+        self._requests.end()
+        self._page.close()
+
+    def _contents(self) -> ViewContents:
+        mapper, graph = self._mission.mapper, self._mission.graph
+        trajectory = mapper.poses.trajectory()
         return replace(
-            ViewContents.of_one_agent(self._mapper.gaussians(), "this run"),
+            ViewContents.of_one_agent(mapper.gaussians(), "this run"),
             targets=() if graph is None else graph.targets,
-            objects=self._mapper.objects,
+            objects=mapper.objects,
             times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
             T_world_camera=trajectory.T_world_camera,
-            keyframes=[_view(keyframe) for keyframe in keyframes],
+            keyframes=[_view(keyframe) for keyframe in mapper.keyframes()],
         )
 
     def _add_quality(self, time_s: float, keyframe: Keyframe) -> None:
-        rendered = np.clip(self._mapper.render(keyframe.frame), 0.0, 1.0)
-        self._quality.add(time_s, rendered, keyframe.frame.rgb, keyframe.relevance.roi)
-
-    def _show_image(self, keyframe: Keyframe, time_ns: int | None) -> None:
         frame = keyframe.frame
-        image = with_region(frame.rgb, keyframe.relevance.roi)
-        image = with_objects(image, self._mapper.objects, frame.camera, frame.T_world_camera)
-        self._camera.show_keyframe(frame.index, image, time_ns)
+        rendered = self._mission.mapper.render(frame.camera, frame.T_world_camera, frame.motion).rgb
+        self._quality.add(time_s, np.clip(rendered, 0.0, 1.0), frame.rgb, keyframe.relevance.roi)
 
 
 @contextmanager
-def mission_view(
-    port: int, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]
-) -> Iterator[Callable[[FrameOutcome], None]]:
+def mission_view(port: int, mission: ScheduledTaskMapper) -> Iterator[Callable[[FrameOutcome], None]]:
     """Serve a page during a mission; yield what to call after each frame.
 
     Raises InvalidInputError for a port in use.
     """
-    page = open_page(port, "GaussLite map")
+    view = MissionView(page := open_page(port, "GaussLite map"), mission)
     try:
         print_message(f"the page is at {page.url}")
-        yield MissionView(page, mapper, task_at).update
+        yield view.update
     finally:
-        page.close()
+        view.close()
 
 
 def _view(keyframe: Keyframe) -> KeyframeView:

@@ -1,13 +1,13 @@
-"""What a person points at on an agent's page: by a click in the map, by a click or a box on the camera's image."""
+"""What a person points at on a page: by a click in the map, by a click or a box on the camera's image."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import viser
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy import ndarray
 from viser.transforms import SO3
 
@@ -15,10 +15,8 @@ from gausslite.domain.camera import Camera, project
 from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.pose import inverse
-from gausslite.domain.relevance import UNNAMED, PointedObject, PointM
-from gausslite.domain.task import noun_of
-from gausslite.wire.clients import AgentClient
-from gausslite.wire.views import CameraView
+from gausslite.domain.relevance import UNNAMED, CameraView, PointedObject, PointM
+from gausslite.domain.task import TaskGraph, noun_of
 from gausslite_view.map_page import MapPage, text_html
 
 _NO_OBJECT = "none yet"
@@ -32,11 +30,30 @@ Prompt = tuple[tuple[float, float], ...]
 """A point (x, y) in pixels of an image, or two opposite corners of a box, the left top one first."""
 
 
+class PointableMission(Protocol):
+    """A mission whose objects a person points at: an agent's, through its client, or one of this process.
+
+    All methods raise GaussLiteError.
+    """
+
+    def camera_view(self) -> CameraView | None:
+        """Return the newest keyframe; None before the first one."""
+        ...
+
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> tuple[object, Float32[ndarray, "h w"]]:
+        """Return colour and depth in metres of the map."""
+        ...
+
+    def assign_task(self, *, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()) -> TaskGraph:
+        """Add pointed objects to the current task, leave out those at points, and return the task."""
+        ...
+
+
 class PointingPanel:
     """Owns the controls with which a person points at objects, and leaves out objects."""
 
-    def __init__(self, page: MapPage, client: AgentClient) -> None:
-        self._scene, self._client = page.server.scene, client
+    def __init__(self, page: MapPage, mission: PointableMission) -> None:
+        self._scene, self._mission = page.server.scene, mission
         self._objects: dict[str, ObjectLandmark] = {}
         gui = page.server.gui
         with gui.add_folder("Point", order=0):
@@ -84,7 +101,7 @@ class PointingPanel:
 
     def _await_prompt(self, browser: viser.ClientHandle | None) -> str:
         """Show the newest keyframe to this browser, and take the next click or box as the object."""
-        view = self._client.camera_view()
+        view = self._mission.camera_view()
         if view is None or browser is None:
             raise InvalidInputError("point: expected a mapped frame first, there is no image yet")
         self._end_wait = ask_on_image(browser, view, lambda prompt: self._answer(lambda: self._point_in(view, prompt)))
@@ -93,13 +110,13 @@ class PointingPanel:
     def _point_at(self, origin_m: PointM, direction: PointM) -> str:
         """Point at the map's surface along a ray. Raises GaussLiteError."""
         T_world_camera = _looking_along(np.array(origin_m), np.array(direction))
-        _, depth_m = self._client.render(_RAY_CAMERA, T_world_camera)
+        _, depth_m = self._mission.render(_RAY_CAMERA, T_world_camera)
         middle_m = float(depth_m[depth_m.shape[0] // 2, depth_m.shape[1] // 2])
         if not middle_m > 0:
             raise InvalidInputError("point: expected a click on the map, there is nothing")
         x, y, z = (T_world_camera[:3, 3] + middle_m * T_world_camera[:3, 2]).tolist()
         noun = self._chosen_noun
-        self._client.assign_task(pointed=[PointedObject(point_m=(x, y, z), noun=noun)])
+        self._mission.assign_task(pointed=[PointedObject(point_m=(x, y, z), noun=noun)])
         return f"{noun} at ({x:.2f}, {y:.2f}, {z:.2f}) m is a target"
 
     def _point_in(self, view: CameraView, prompt: Prompt) -> str:
@@ -107,7 +124,7 @@ class PointingPanel:
         index, noun = view.frame_index, self._chosen_noun
         points_px, boxes_px = (prompt[:1], ()) if len(prompt) == 1 else ((), (prompt[0] + prompt[1],))
         pointed = PointedObject(points_px, boxes_px, frame_index=index, noun=noun)
-        self._client.assign_task(pointed=[pointed])
+        self._mission.assign_task(pointed=[pointed])
         place = " to ".join(f"{x:.0f},{y:.0f}" for x, y in prompt)
         return f"{noun} at {place} of frame {index} is a target"
 
@@ -119,7 +136,7 @@ class PointingPanel:
         chosen = self._objects.get(str(self._object.value))
         if chosen is None:
             raise InvalidInputError("object: expected one of the task's objects, there is none yet")
-        self._client.assign_task(excluded_m=[chosen.centroid_m])
+        self._mission.assign_task(excluded_m=[chosen.centroid_m])
         return f"{chosen.object_id} is left out"
 
     def _run(self, action: Callable[[], str]) -> None:

@@ -70,9 +70,9 @@ def _contents_at(snapshot: MapSnapshot, newest: ViewContents) -> ViewContents:
 
 
 def _targets(report: Mapping[str, object]) -> tuple[str, ...]:
-    """Return the targets: an agent's report lists them, that of `map` has them in its task."""
+    """Return the targets of the last task; reports of earlier versions of `map` have them in the task alone."""
     task = report.get("task")
-    targets = task.get("targets") if isinstance(task, Mapping) else report.get("targets")
+    targets = report.get("targets", task.get("targets") if isinstance(task, Mapping) else None)
     return tuple(str(target) for target in targets) if isinstance(targets, list) else ()
 
 

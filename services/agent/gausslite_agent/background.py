@@ -1,23 +1,18 @@
-"""Work that the agent does beside mapping: training while no frame waits, keyframes for the server and for people."""
+"""Work that the agent does beside mapping: training while no frame waits, keyframes for the server."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from gausslite.domain.errors import InvalidInputError, StorageError
-from gausslite.domain.relevance import DetectedImage
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.keyframe_selection import Coverage, KeyframeAddition, KeyframeSelection, SelectedKeyframe
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.mapper import GaussianMapper
 from gausslite.v1 import geometry_pb2
 from gausslite.wire.convert import KEYFRAME_PNG_COMPRESSION, encode_mask, frame_to_message, transform_from_message
 from gausslite.wire.spool import SpooledKeyframe
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.views import CameraView
 
 _log = logging.getLogger(__name__)
 
@@ -129,25 +124,3 @@ def _selected_keyframes(uplink: Uplink) -> dict[int, SelectedKeyframe]:
             Coverage.from_bytes(selected_keyframe.coverage), T_world_camera
         )
     return known
-
-
-_NS_PER_S = 1e9
-
-
-def newest_camera_view(mapper: GaussianMapper, detected: DetectedImage | None) -> CameraView | None:
-    """Return the newest keyframe, the camera's path and the newest detection; None before the first keyframe."""
-    keyframes = mapper.keyframes()
-    if not keyframes:
-        return None
-    newest, trajectory = keyframes[-1], mapper.poses.trajectory()
-    return CameraView(
-        rgb=newest.as_recorded.rgb,
-        roi=newest.relevance.roi,
-        camera=newest.frame.camera,
-        frame_index=newest.frame.index,
-        T_world_camera=newest.frame.T_world_camera,
-        times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
-        path=trajectory.T_world_camera,
-        keyframes=np.stack([keyframe.frame.T_world_camera for keyframe in keyframes]),
-        detected=detected,
-    )

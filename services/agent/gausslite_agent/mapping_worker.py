@@ -22,7 +22,7 @@ from gausslite.domain.errors import InvalidInputError, MismatchError, StorageErr
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
-from gausslite.domain.relevance import DetectedImage, PointedObject, PointM
+from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.mapper import GaussianMapper
@@ -36,8 +36,7 @@ from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.pointing import pointed_masks
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
-from gausslite.wire.views import CameraView
-from gausslite_agent.background import IdleTraining, KeyframeUpload, newest_camera_view
+from gausslite_agent.background import IdleTraining, KeyframeUpload
 from gausslite_agent.prior import LOCALISING, PriorFrames
 from gausslite_agent.settings import LoadSettings, QueuePolicy
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
@@ -127,7 +126,6 @@ class MappingWorker:
         self._task_mapper: TaskMapper | None = None
         self._last_index = -1
         self._timeline, self._recorder = Timeline(), MapRecorder()
-        self._detected: DetectedImage | None = None
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
@@ -186,7 +184,7 @@ class MappingWorker:
 
     def camera_view(self) -> Future[CameraView | None]:
         """Return what the camera sees, for a person; None before the first keyframe."""
-        return self._submit(lambda: newest_camera_view(self._mapper, self._detected))
+        return self._submit(lambda: None if self._task_mapper is None else self._task_mapper.camera_view())
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame and return the future of its report.
@@ -252,7 +250,7 @@ class MappingWorker:
         self, graph: TaskGraph | None, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM]
     ) -> TaskGraph:
         # before any change: a person may point at nothing
-        masks = pointed_masks(pointed, [keyframe.as_recorded for keyframe in self._mapper.keyframes()])
+        masks = pointed_masks(pointed, ()) if self._task_mapper is None else self._task_mapper.pointed_masks(pointed)
         base = graph or self.status().graph or TaskGraph("", "", (), (), ())
         extended = base.with_pointed(noun for noun, _, _ in masks)
         task_mapper = self._switch(extended, is_extended=graph is None)
@@ -340,7 +338,7 @@ class MappingWorker:
         if frame is None:
             return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
-        self._last_index, self._detected = frame.index, outcome.detected or self._detected
+        self._last_index = frame.index
         self._update_notes(self._task_mapper.notes)
         self._update_objects(self._task_mapper.objects)
         if outcome.skipped is not None:

@@ -102,10 +102,10 @@ class AgentMission:
         worker: MappingWorker,
         parser: TaskParser,
         resumed: MissionCheckpoint | None = None,
-        can_detect: bool = True,
+        can_find: bool = True,
     ) -> None:
-        """Resumed: the checkpoint that the worker was restored from. can_detect: False if any task would fail."""
-        self.can_detect = can_detect
+        """Resumed: the checkpoint that the worker was restored from. can_find: False if any task would fail."""
+        self.can_find = can_find
         self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
         self._state_machine = MissionStateMachine()
         self._start_s = time.monotonic()
@@ -134,7 +134,7 @@ class AgentMission:
     def notes(self) -> tuple[str, ...]:
         """Messages for the operator about the mission itself."""
         failed = (f"the mission failed: {self.failure}",) if self.failure else ()
-        return failed if self.can_detect else (*failed, NO_DETECTOR)
+        return failed if self.can_find else (*failed, NO_DETECTOR)
 
     @property
     def end_by_options(self) -> EndRequest:
@@ -156,7 +156,7 @@ class AgentMission:
         ModelFileError and the like.
         """
         self._state_machine.require_accepting("task")
-        if not self.can_detect and assigned.graph is not None and assigned.graph.queries:
+        if not self.can_find and assigned.graph is not None and assigned.graph.queries:
             raise MismatchError(f"task: {NO_DETECTOR}")
         graph = self._worker.assign(assigned.graph, assigned.pointed, assigned.excluded_m).result()
         self._begin()

@@ -179,8 +179,9 @@ async def _serve(settings: AgentSettings) -> int:
         # only the task of the command line waits for the parser to start
         cancel = parser.close if isinstance(parser, ParserClient) else _do_nothing
         first_parser = WaitingParser(parser, cancel=cancel)
-        can_detect = stream is not None or settings.perception.model is not None
-        mission = AgentMission(settings, worker, first_parser, resumed, can_detect)
+        # on the page a person can point
+        can_find = stream is not None or settings.perception.model is not None or settings.view is not None
+        mission = AgentMission(settings, worker, first_parser, resumed, can_find)
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
         if settings.view is not None:
             live = sibling(Sibling.PAGES)
@@ -217,8 +218,9 @@ def _open_prior(settings: AgentSettings) -> PriorRun | None:
 
 
 def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: PriorFrames) -> EstimatorFactory:
-    """Return the estimator factory. Raises InvalidInputError if the task of the command line has no detector."""
-    estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream, prior))
+    """Return the estimator factory. Raises InvalidInputError if nothing can find the task of the command line."""
+    needs_detector = settings.view is None
+    estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream, prior), needs_detector)
     if settings.task is not None:
         estimators.require_detector()
     if settings.source is not None and stream is not None and settings.perception.model is None:
@@ -230,7 +232,7 @@ def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: Prio
 
 async def _run_mission(mission: _Mission, settings: AgentSettings) -> None:
     """Run the mission, then keep serving unless the agent should exit. On cancellation, end the mission."""
-    if not mission.mission.can_detect:
+    if not mission.mission.can_find:
         _log.warning("every AssignTask will fail: %s", NO_DETECTOR)
     work = asyncio.ensure_future(asyncio.to_thread(mission.run))
     try:

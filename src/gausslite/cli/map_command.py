@@ -32,7 +32,7 @@ from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError, 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, found_text
 from gausslite.domain.relevance import Region
-from gausslite.domain.state import State, encode_text
+from gausslite.domain.state import State, encode_text, get_text
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.evaluation.compare import TrainingFit, score_training_views
 from gausslite.evaluation.metrics import trajectory_error
@@ -100,6 +100,8 @@ def tracking_text(report: Mapping[str, Any]) -> str:
 
 
 _NOT_RESUMED = -1
+_POINTED = "pointed"
+"""Name of the nouns that a person points at, among the extra arrays of a saved run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,8 +179,10 @@ def _map(options: argparse.Namespace) -> int:
     if options.save_state is not None:
         require_additional_file(options.save_state, options.out)
     resumed_after = _NOT_RESUMED if saved is None else saved.last_index
-    estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source))
-    roi = _first_roi(options, inputs, resumed_after)
+    # a person can point on the page
+    needs_detector = options.view is None
+    estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source), needs_detector)
+    roi = _first_roi(options, inputs, saved)
     if saved is None:
         # an estimate takes half a minute; first refuse what cannot be mapped, and name what cannot be found
         choose_rasterizer(inputs.mission.backend, inputs.mission.threads)
@@ -196,16 +200,18 @@ def _map(options: argparse.Namespace) -> int:
     if prior is not None:
         inputs = in_frame_of(prior, recorded)
         estimators = estimators.in_scene(lambda: SceneInfo.of(inputs.stream.source))
-        roi = _first_roi(options, inputs, resumed_after)
+        roi = _first_roi(options, inputs, saved)
     task = "" if inputs.schedule.first is None else inputs.schedule.first.text
     mapper = build_task_mapper(inputs.mission, estimators, roi, None if prior is None else prior.gaussians_for(task))
     if saved is not None:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
-    mapping = _Run(options, inputs, mapper, recorded, prior)
+    graph = roi if isinstance(roi, TaskGraph) else None
+    scheduled = ScheduledTaskMapper(mapper, inputs.schedule, estimators, graph, resumed_after)
+    mapping = _Run(options, inputs, scheduled, recorded, prior)
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
-        result = mapping.map_frames(estimators, resumed_after)
+        result = mapping.map_frames(resumed_after)
         if result.processed > 0 or result.stopped_by is None:
             mapping.write_results(result)
     # an early end keeps the map so far; the exit code reports it
@@ -224,7 +230,7 @@ class _Run:
         self,
         options: argparse.Namespace,
         inputs: MapInputs,
-        mapper: TaskMapper,
+        scheduled: ScheduledTaskMapper,
         recorded: MapInputs,
         prior: PriorRun | None,
     ) -> None:
@@ -232,7 +238,7 @@ class _Run:
         self._options, self._recorded, self._prior = options, recorded, prior
         self._changes: list[Change] = []
         self._inputs = inputs
-        self._mapper = mapper
+        self._scheduled, self._mapper = scheduled, scheduled.mapper
         self._corrupt = CorruptFrames(print_above_bar)
         self._timeline, self._recorder = Timeline(), MapRecorder()
         self._gaussians = Gaussians.empty()
@@ -241,13 +247,12 @@ class _Run:
         self._training_scores: TrainingFit | None = None
         self._save_error: StorageError | None = None
 
-    def map_frames(self, estimators: EstimatorFactory, resumed_after: int) -> MissionResult:
+    def map_frames(self, resumed_after: int) -> MissionResult:
         """Map the frames after an index. Raises DatasetError if frames exist and none of them can be used."""
         inputs, options = self._inputs, self._options
-        stream, schedule = inputs.stream.after(resumed_after), inputs.schedule
-        scheduled = ScheduledTaskMapper(self._mapper, schedule, estimators, schedule.at(resumed_after))
+        stream = inputs.stream.after(resumed_after)
         frames = stream.frames(None if options.strict else self._corrupt)
-        with _view(options.view, self._mapper, schedule.at) as draw, MappingBar(len(stream)) as bar:
+        with _view(options.view, self._scheduled) as draw, MappingBar(len(stream)) as bar:
 
             def report(outcome: FrameOutcome) -> None:
                 bar.count(outcome)
@@ -256,7 +261,7 @@ class _Run:
                 draw(outcome)
 
             checkpoint = None if options.save_state is None else self._save
-            result = MissionRunner(scheduled.process, report, checkpoint).run(frames, resumed_after)
+            result = MissionRunner(self._scheduled.process, report, checkpoint).run(frames, resumed_after)
         if result.processed == 0 and self._corrupt.first_error is not None:
             raise self._corrupt.first_error
         self._gaussians = self._mapper.gaussians()
@@ -266,7 +271,7 @@ class _Run:
 
     def write_results(self, result: MissionResult) -> None:
         """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
-        options, mission = self._options, self._inputs.mission
+        options, mission, graph = self._options, self._inputs.mission, self._scheduled.graph
         self._notes = (
             *self._mapper.notes,
             *_unseen_notes(options, result),
@@ -282,6 +287,7 @@ class _Run:
             "resumed_from": None if options.resume is None else str(options.resume),
             **result.summary(),
             **trajectory_report(self._inputs.source, self._inputs.stream.source, self._mapper),
+            "targets": [] if graph is None else list(graph.targets),
             "loops": asdict(self._mapper.loops),
             "frames_corrupt": self._corrupt.count,
             "gaussians": len(self._gaussians),
@@ -352,11 +358,11 @@ class _Run:
             print(f"  {line}")
         for change in self._changes:
             print(f"  {change.describe()}")
-        print(self._outcome(result.last_index))
+        print(self._outcome())
 
-    def _outcome(self, last_index: int) -> str:
+    def _outcome(self) -> str:
         """Return what was found, where, and how good the map is on views that it was trained on."""
-        graph, gaussians = self._inputs.schedule.at(last_index), self._gaussians
+        graph, gaussians = self._scheduled.graph, self._gaussians
         region_m = gaussians.means_m[gaussians.active]
         parts = [] if graph is None else [f"found: {found_text(self._mapper.objects, graph.targets, region_m)}"]
         if self._training_scores is not None:
@@ -371,6 +377,8 @@ class _Run:
         extra: State = {FRAMES_KEY: encode_text(self._options.frames)}
         if self._prior is not None:
             extra = {**extra, **self._prior.state()}
+        if self._scheduled.graph is not None and self._scheduled.graph.pointed:
+            extra = {**extra, _POINTED: encode_text("\n".join(self._scheduled.graph.pointed))}
         config = self._recorded.resume_config(last_index)
         try:
             save_run(self._options.save_state, self._mapper, config, last_index, extra)
@@ -378,10 +386,14 @@ class _Run:
             self._save_error = error  # the map is worth writing nevertheless
 
 
-def _first_roi(options: argparse.Namespace, inputs: MapInputs, resumed_after: int) -> TaskGraph | list[Region]:
-    """Return the first frame's task or the regions."""
-    graph = inputs.schedule.at(resumed_after)
-    return selected_regions(options, inputs.stream.source) if graph is None else graph
+def _first_roi(options: argparse.Namespace, inputs: MapInputs, saved: SavedRun | None) -> TaskGraph | list[Region]:
+    """Return the first frame's task, with what a person has pointed at in the saved run, or the regions."""
+    graph = inputs.schedule.at(_NOT_RESUMED if saved is None else saved.last_index)
+    if graph is None:
+        return selected_regions(options, inputs.stream.source)
+    if saved is None or _POINTED not in saved.extra:
+        return graph
+    return graph.with_pointed(get_text(saved.extra, _POINTED).split("\n"))
 
 
 def _report_search(options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory) -> None:
@@ -393,14 +405,12 @@ def _report_search(options: argparse.Namespace, inputs: MapInputs, estimators: E
             print_message(match.describe())
 
 
-def _view(
-    port: int | None, mapper: TaskMapper, task_at: Callable[[int], TaskGraph | None]
-) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
+def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
     """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
     if port is None:
         return nullcontext(lambda _outcome: None)
     page: AbstractContextManager[Callable[[FrameOutcome], None]]
-    page = sibling(Sibling.MISSION_PAGE).mission_view(port, mapper, task_at)
+    page = sibling(Sibling.MISSION_PAGE).mission_view(port, mission)
     return page
 
 

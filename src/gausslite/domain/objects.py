@@ -64,7 +64,9 @@ class NounMatch:
             nearest = f"; the nearest are {', '.join(map(repr, self.known))}" if self.known else ""
             return f"no class of the detector matches {self.noun!r}{nearest}"
         if self.basis is MatchBasis.REGION and not self.classes:
-            return f"no region matches {self.noun!r}; the regions are {', '.join(self.known) or 'none'}"
+            if not self.known:
+                return f"nothing searches {self.noun!r}: there is no detector"
+            return f"no region matches {self.noun!r}; the regions are {', '.join(self.known)}"
         if self.basis is not MatchBasis.SIMILAR:
             return None
         similar = f"the class most similar to {self.noun!r} is {self.classes[0]!r} (similarity {self.similarity:.2f})"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int16, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int16, Int64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
-from gausslite.domain.camera import back_project, project
+from gausslite.domain.camera import Camera, back_project, project
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
@@ -212,6 +212,25 @@ class DetectedImage:
                 for detection in detections
             ),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraView:
+    """The newest keyframe, its pose, and the poses of all frames and keyframes, in the map.
+
+    roi: True in the task's region. times_ns: the capture times of the path, oldest first. detected: what the detector
+    found in the image on which it ran last; None without a detector.
+    """
+
+    rgb: UInt8[ndarray, "h w 3"]
+    roi: Bool[ndarray, "h w"]
+    camera: Camera
+    frame_index: int
+    T_world_camera: Float64[ndarray, "4 4"]
+    times_ns: Int64[ndarray, " t"]
+    path: Float64[ndarray, "t 4 4"]
+    keyframes: Float64[ndarray, "k 4 4"]
+    detected: DetectedImage | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

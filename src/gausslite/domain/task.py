@@ -129,10 +129,16 @@ class TaskGraph:
     @property
     def queries(self) -> tuple[str, ...]:
         """The nouns to detect, in order, without duplicates: Q of Sec. III-B.1, and the excluded nouns."""
-        roles = zip(self.targets, self.roles, strict=True)
-        searched = [target for target, role in roles if role is not TargetRole.POINTED]
+        pointed = self.pointed
+        searched = [target for target in self.targets if target not in pointed]
         nouns = dict.fromkeys(noun_of(name) for name in (*searched, *self.anchors))
         return tuple(dict.fromkeys((*nouns, *self.excluded_nouns)))
+
+    @property
+    def pointed(self) -> tuple[str, ...]:
+        """The targets that a person points at, which no detector searches."""
+        roles = zip(self.targets, self.roles, strict=True)
+        return tuple(target for target, role in roles if role is TargetRole.POINTED)
 
     def with_pointed(self, nouns: Iterable[str]) -> TaskGraph:
         """Return the graph with the nouns that a person points at among its targets. Raises TaskError."""

@@ -89,11 +89,14 @@ def build_task_mapper(
 class EstimatorFactory:
     """Builds the relevance estimator of each task of a mission; all of them share the detector's network."""
 
-    def __init__(self, perception: PerceptionSettings, scene: Callable[[], SceneInfo]) -> None:
+    def __init__(
+        self, perception: PerceptionSettings, scene: Callable[[], SceneInfo], needs_detector: bool = True
+    ) -> None:
         """Open the models. The scene is requested with the first task, because a simulated one takes seconds to build.
 
-        Raises ModelFileError, InvalidInputError.
+        needs_detector: False if a person can point at what nothing detects. Raises ModelFileError, InvalidInputError.
         """
+        self._needs_detector = needs_detector
         self._perception = perception
         self._scene = functools.cache(scene)
         self._models = open_models(perception)
@@ -106,8 +109,8 @@ class EstimatorFactory:
         return other
 
     def require_detector(self) -> None:
-        """Raise InvalidInputError if there is neither a model file nor ground truth."""
-        if self._models is None and not self._scene().regions:
+        """Raise InvalidInputError if one is needed, and there is neither a model file nor ground truth."""
+        if self._needs_detector and self._models is None and not self._scene().regions:
             from gausslite.perception.models import detector_advice
 
             raise InvalidInputError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from gausslite.codec.state_file import write_atomic
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.state import EvenHistory
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.poses import PoseHistory
@@ -86,24 +87,49 @@ class TaskSchedule:
 
 
 class ScheduledTaskMapper:
-    """Process frames with a TaskMapper, and assign each scheduled task before its first frame."""
+    """Process frames with a TaskMapper, assign each scheduled task before its first frame, and take pointed objects.
+
+    graph: the task that the mapper has now, with what a person points at; None without a task in natural language.
+    """
 
     def __init__(
-        self, mapper: TaskMapper, schedule: TaskSchedule, estimators: EstimatorFactory, current: TaskGraph | None
+        self,
+        mapper: TaskMapper,
+        schedule: TaskSchedule,
+        estimators: EstimatorFactory,
+        graph: TaskGraph | None,
+        last_index: int,
     ) -> None:
-        """Current is the task that the mapper has now."""
-        self._mapper = mapper
+        """last_index: of the last frame that the mapper has processed, -1 for none."""
+        self.mapper, self.graph = mapper, graph
         self._schedule = schedule
         self._estimators = estimators
-        self._current = current
+        self._scheduled = schedule.at(last_index)
 
     def process(self, frame: Frame) -> FrameOutcome:
         """Process one frame for the task that is scheduled for it."""
-        graph = self._schedule.at(frame.index)
-        if graph is not None and self._current is not None and not graph.is_equivalent_to(self._current):
-            self._mapper.assign(self._estimators.build(graph))
-        self._current = graph
-        return self._mapper.process(frame)
+        scheduled = self._schedule.at(frame.index)
+        if scheduled is not None and self._scheduled is not None and not scheduled.is_equivalent_to(self._scheduled):
+            self.mapper.assign(self._estimators.build(scheduled))
+            self.graph = scheduled
+        self._scheduled = scheduled
+        return self.mapper.process(frame)
+
+    def point_at(self, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM] = ()) -> TaskGraph:
+        """Add the objects that a person points at to the task, leave out those at points, and return the task.
+
+        Call it between two frames. Raises InvalidInputError, TaskError.
+        """
+        if self.graph is None:
+            raise InvalidInputError("pointed object: expected a run with a task, to which it belongs, got none")
+        # before any change: a person may point at nothing
+        masks = self.mapper.pointed_masks(pointed)
+        extended = self.graph.with_pointed(noun for noun, _, _ in masks)
+        if not extended.is_equivalent_to(self.graph):
+            self.mapper.extend(self._estimators.build(extended))
+        self.graph = extended
+        self.mapper.point_at(masks, excluded_m)
+        return extended
 
 
 _FILE = "frames.csv"

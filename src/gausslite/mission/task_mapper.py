@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from jaxtyping import Bool, Float32
+import numpy as np
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounReport, ObjectLandmark
-from gausslite.domain.relevance import DetectedImage, PointM, RelevanceMap
+from gausslite.domain.relevance import CameraView, DetectedImage, PointedObject, PointM, RelevanceMap
 from gausslite.domain.state import State, add_prefix, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
@@ -26,9 +29,13 @@ from gausslite.mapping.tracking import CameraTracker
 from gausslite.mapping.training import SkippableStage, Stage
 from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
+from gausslite.perception.pointing import pointed_masks
 from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
+from gausslite.render.rasterizer import Rendering
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
+_NS_PER_S = 1e9
+_MAX_SHOWN = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,8 +44,7 @@ class FrameOutcome:
 
     skipped: why the frame was not mapped, else None. changed_roi: the changed voxels of the task's region; None
     without a tracker, for a skipped frame, and if publishing waits for the next frame. detection_lag_frames: age of
-    the detection that finished during this frame; detected: what it found. reevaluation: the earlier keyframes
-    evaluated for a new task.
+    the detection that finished during this frame. reevaluation: the earlier keyframes evaluated for a new task.
     """
 
     index: int
@@ -50,7 +56,6 @@ class FrameOutcome:
     changed_roi: VoxelBatch | None
     detection_lag_frames: int | None
     reevaluation: Reevaluation
-    detected: DetectedImage | None = None
 
 
 class TaskMapper:
@@ -76,6 +81,9 @@ class TaskMapper:
         self._scheduler = scheduler or FrameScheduler()
         self._publish = publish
         self._tracker = tracker
+        self._detected: DetectedImage | None = None
+        # a person takes seconds to point, while newer frames replace most of the newest keyframes
+        self._shown: deque[Frame] = deque(maxlen=_MAX_SHOWN)
 
     def assign(self, estimator: RelevanceEstimator) -> None:
         """Switch to another task with the next frame.
@@ -135,9 +143,31 @@ class TaskMapper:
         """Return a copy of the map."""
         return self._mapper.gaussians()
 
-    def render(self, frame: Frame) -> Float32[ndarray, "h w 3"]:
-        """Return the colours of the map, not clipped to [0, 1], from a frame's pose and motion."""
-        return self._mapper.render(frame.camera, frame.T_world_camera, frame.motion).rgb
+    def render(
+        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None = None
+    ) -> Rendering:
+        """Render the map from a pose, with a moving camera if motion is given."""
+        return self._mapper.render(camera, T_world_camera, motion)
+
+    def camera_view(self) -> CameraView | None:
+        """Return the newest keyframe, the camera's path and the newest detection; None before the first keyframe."""
+        keyframes = self._mapper.keyframes()
+        if not keyframes:
+            return None
+        newest, trajectory = keyframes[-1], self._mapper.poses.trajectory()
+        if not self._shown or self._shown[-1].index != newest.frame.index:
+            self._shown.append(newest.as_recorded)
+        return CameraView(
+            rgb=newest.as_recorded.rgb,
+            roi=newest.relevance.roi,
+            camera=newest.frame.camera,
+            frame_index=newest.frame.index,
+            T_world_camera=newest.frame.T_world_camera,
+            times_ns=np.round(trajectory.times_s * _NS_PER_S).astype(np.int64),
+            path=trajectory.T_world_camera,
+            keyframes=np.stack([keyframe.frame.T_world_camera for keyframe in keyframes]),
+            detected=self._detected,
+        )
 
     @property
     def poses(self) -> PoseHistory:
@@ -147,6 +177,14 @@ class TaskMapper:
     def keyframes(self) -> list[Keyframe]:
         """Return the keyframes kept from the whole mission, oldest first."""
         return self._mapper.keyframes()
+
+    def pointed_masks(self, pointed: Iterable[PointedObject]) -> list[tuple[str, Bool[ndarray, "h w"], Frame]]:
+        """Return noun, mask and frame of each object that a person points at, on a keyframe that is kept or was shown.
+
+        Raises InvalidInputError.
+        """
+        frames = [*self._shown, *(keyframe.as_recorded for keyframe in self._mapper.keyframes())]
+        return pointed_masks(pointed, sorted(frames, key=lambda frame: frame.capture_time_ns))
 
     def memory_mib(self) -> dict[str, float]:
         """Return the memory of the map's parts in MiB."""
@@ -188,6 +226,7 @@ class TaskMapper:
         frame = self._without_moving(frame)
         view = self._render(frame)
         estimate = self._estimate_relevance(frame, view)
+        self._detected = estimate.detected or self._detected
         lag_frames = self._apply_delayed(estimate.delayed)
         reevaluation = self._reevaluate_keyframes()
         mapped = self._mapper.map_frame(frame, estimate.relevance, self._scheduler, view, odometry)
@@ -206,7 +245,6 @@ class TaskMapper:
             changed_roi=changed_roi,
             detection_lag_frames=lag_frames,
             reevaluation=reevaluation,
-            detected=estimate.detected,
         )
 
     def idle_step(self) -> bool:

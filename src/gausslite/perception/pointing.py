@@ -111,7 +111,7 @@ def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tup
 def pointed_masks(
     pointed: Iterable[PointedObject], keyframes: Sequence[Frame]
 ) -> list[tuple[str, Bool[ndarray, "h w"], Frame]]:
-    """Return noun, mask and keyframe of each object that a person points at; the keyframes are given oldest first.
+    """Return noun, mask and frame of each object that a person points at; the keyframes are given oldest first.
 
     Raises InvalidInputError.
     """

@@ -76,7 +76,7 @@ class AgentServiceServicer(object):
 
     def AssignTask(self, request, context):
         """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
-        a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
+        a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has neither detector nor page.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

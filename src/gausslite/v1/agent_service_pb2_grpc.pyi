@@ -36,7 +36,7 @@ class AgentServiceStub:
     def __new__(cls, channel: _aio.Channel) -> AgentServiceAsyncStub: ...
     AssignTask: _grpc.UnaryUnaryMultiCallable[_agent_service_pb2.AssignTaskRequest, _agent_service_pb2.AssignTaskResponse]
     """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
-    a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
+    a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has neither detector nor page.
     """
     IngestFrames: _grpc.StreamStreamMultiCallable[_agent_service_pb2.IngestFramesRequest, _agent_service_pb2.IngestFramesResponse]
     """Send frames; one outcome for each, in order. An invalid frame is REJECTED and the stream continues."""
@@ -57,7 +57,7 @@ class AgentServiceAsyncStub(AgentServiceStub):
     def __init__(self, channel: _aio.Channel) -> None: ...
     AssignTask: _aio.UnaryUnaryMultiCallable[_agent_service_pb2.AssignTaskRequest, _agent_service_pb2.AssignTaskResponse]  # type: ignore[assignment]
     """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
-    a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
+    a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has neither detector nor page.
     """
     IngestFrames: _aio.StreamStreamMultiCallable[_agent_service_pb2.IngestFramesRequest, _agent_service_pb2.IngestFramesResponse]  # type: ignore[assignment]
     """Send frames; one outcome for each, in order. An invalid frame is REJECTED and the stream continues."""
@@ -81,7 +81,7 @@ class AgentServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_agent_service_pb2.AssignTaskResponse, _abc.Awaitable[_agent_service_pb2.AssignTaskResponse]]:
         """Map for this task from the next frame. A second task replaces the first; the map is kept. After the end of a mission
-        a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has no detector.
+        a task begins the next one, with the same map. FAILED_PRECONDITION if the agent has neither detector nor page.
         """
 
     @_abc_1.abstractmethod

@@ -20,7 +20,7 @@ from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport, TeamObject
-from gausslite.domain.relevance import PointedObject, PointM
+from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
@@ -38,7 +38,7 @@ from gausslite.wire.channel import DEADLINE_S, MAX_MESSAGE_BYTES, ServiceChannel
 from gausslite.wire.convert import decode_colour, decode_depth, digests_from_messages
 from gausslite.wire.convert_task import report_to_message, team_object_from_message
 from gausslite.wire.security import Tls
-from gausslite.wire.views import CameraView, StoredKeyframe, camera_view_from_message, stored_keyframe_from_message
+from gausslite.wire.views import StoredKeyframe, camera_view_from_message, stored_keyframe_from_message
 
 MAX_END_S = 90_000.0
 """Longer than any agent takes to end a mission: its drain-timeout is at most a day."""

@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.relevance import DetectedBox, DetectedImage
+from gausslite.domain.relevance import CameraView, DetectedBox, DetectedImage
 from gausslite.v1 import agent_service_pb2 as agent_pb
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
@@ -30,25 +30,6 @@ from gausslite.wire.convert import (
 )
 
 MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraView:
-    """The newest keyframe, its pose, and the poses of all frames and keyframes, in the map.
-
-    roi: True in the task's region. times_ns: the capture times of the path, oldest first. detected: what the detector
-    found in the image on which it ran last; None without a detector.
-    """
-
-    rgb: UInt8[ndarray, "h w 3"]
-    roi: Bool[ndarray, "h w"]
-    camera: Camera
-    frame_index: int
-    T_world_camera: Float64[ndarray, "4 4"]
-    times_ns: Int64[ndarray, " t"]
-    path: Float64[ndarray, "t 4 4"]
-    keyframes: Float64[ndarray, "k 4 4"]
-    detected: DetectedImage | None = None
 
 
 def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewResponse:

@@ -18,6 +18,7 @@ from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.domain.errors import InvalidInputError, MismatchError
+from gausslite.domain.relevance import PointedObject
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Spool
@@ -242,3 +243,20 @@ def test_an_agent_without_a_detector_says_so_at_the_start_and_to_assign_task(tmp
         process.terminate()
         assert process.wait(30) == 0
     assert any("every AssignTask will fail" in line and "--detector" in line for line in lines)
+
+
+def test_an_agent_with_a_page_takes_a_task_without_a_detector(tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    address = f"unix:{tmp_path}/agent.sock"
+    command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--set", "threads=1", "--set", "view=0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert any("listening on" in line for line in process.stderr)
+        with AgentClient(address) as client:
+            assert client.assign_task(TASK).warnings[0] == "nothing searches 'mug': there is no detector"
+            [answer] = client.ingest([red_frame(0)])
+            client.assign_task(pointed=[PointedObject(points_px=((16.0, 12.0),), noun="mug")])
+            [pointed_at] = client.ingest([red_frame(1)])
+        process.terminate()
+        assert process.wait(30) == 0
+    assert (answer.roi_share, pointed_at.roi_share > 0) == (0, True)

@@ -1,0 +1,171 @@
+"""The page of `gausslite map` in a real browser: a person points at an object while the run maps."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from browser import open_browser, write
+from mapping_scenes import wall_frame
+from tiny_sequences import write_seven_scenes
+
+from gausslite.cli.main import main
+from gausslite.codec.state_file import read_state, write_state
+from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.domain.relevance import PointedObject
+from gausslite.domain.state import encode_text
+from gausslite.mission.build import EstimatorFactory, build_task_mapper
+from gausslite.mission.schedule import ScheduledTaskMapper, TaskSchedule
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
+from gausslite.task.rules import RuleParser
+
+pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+pytest.importorskip("viser")
+from gausslite_view.mission_view import MissionRequests, MissionView
+from gausslite_view.pages import open_page
+
+WAIT_S = 60.0
+_SOME = 3
+SETTINGS = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
+
+
+def mission(*later: tuple[int, str]) -> ScheduledTaskMapper:
+    """A search for a mug without any detector."""
+    estimators = EstimatorFactory(PerceptionSettings(), SceneInfo, needs_detector=False)
+    graph = RuleParser().parse("Find the mug")
+    schedule = TaskSchedule(graph, tuple((frame, RuleParser().parse(text)) for frame, text in later))
+    return ScheduledTaskMapper(build_task_mapper(SETTINGS, estimators, graph), schedule, estimators, graph, -1)
+
+
+@contextmanager
+def mapped(view: MissionView, mapped_mission: ScheduledTaskMapper) -> Iterator[list[float]]:
+    """Map some frames on another thread, at first and after each request of the page; yield their shares of the region.
+
+    A map that changes in every second would occupy a browser without a GPU.
+    """
+    shares: list[float] = []
+    stopped = threading.Event()
+
+    def map_frames() -> None:
+        end = _SOME
+        while not stopped.wait(1.0):
+            if not view._requests._waiting.empty():
+                end = len(shares) + _SOME
+            if len(shares) < end:
+                outcome = mapped_mission.process(wall_frame(len(shares)))
+                shares.append(outcome.roi_share)
+                view.update(outcome)
+
+    thread = threading.Thread(target=map_frames)
+    thread.start()
+    try:
+        yield shares
+    finally:
+        stopped.set()
+        thread.join(WAIT_S)
+
+
+def test_a_click_on_the_camera_image_is_a_target_until_it_is_left_out() -> None:
+    with open_browser((1200, 900)) as browser:
+        searched = mission()
+        page = open_page(0, "test")
+        view = MissionView(page, searched)
+        try:
+            with mapped(view, searched) as shares:
+                tab = browser.new_page()
+                tab.goto(page.url)
+                tab.get_by_text("Newest keyframe").wait_for()
+                write(tab, 0, "wall")
+                tab.get_by_role("button", name="Point in the image").click()
+                tab.get_by_text("click the object, or drag a box around it").wait_for()
+                tab.wait_for_timeout(1000)
+                tab.mouse.click(430, 430)
+                tab.get_by_text("is a target").wait_for()
+                tab.locator("input[role=combobox][value^='wall']").wait_for()
+                assert shares[-1] > 0
+                assert searched.graph is not None
+                assert (searched.graph.targets, searched.graph.pointed) == (("mug", "wall"), ("wall",))
+                tab.get_by_role("button", name="Not this one").click()
+                tab.get_by_text("is left out").wait_for()
+            assert searched.process(wall_frame(len(shares))).roi_share == 0
+        finally:
+            view.close()
+
+
+def test_the_page_is_answered_between_frames_and_refused_after_the_mission() -> None:
+    searched = mission()
+    requests = MissionRequests(searched)
+    searched.process(wall_frame())
+    asked = threading.Thread(target=lambda: answers.append(requests.camera_view()))
+    answers: list[object] = []
+    asked.start()
+    while asked.is_alive():
+        requests.answer()
+    assert len(answers) == 1
+    assert answers[0] is not None
+    requests.end()
+    with pytest.raises(UnavailableError, match="the mission has ended"):
+        requests.render(wall_frame().camera, wall_frame().T_world_camera)
+
+
+def test_what_a_person_points_at_is_meant_until_the_next_task() -> None:
+    searched = mission((2, "Find the chair"))
+    with pytest.raises(InvalidInputError, match="expected a mapped frame first"):
+        searched.point_at([PointedObject(points_px=((32.0, 24.0),))])
+    assert searched.process(wall_frame()).roi_share == 0
+    graph = searched.point_at([PointedObject(points_px=((32.0, 24.0),), noun="mug")])
+    assert graph.targets == ("mug",)
+    assert searched.process(wall_frame(1)).roi_share > 0
+    assert searched.process(wall_frame(2)).roi_share == 0
+    assert searched.graph is not None
+    assert searched.graph.targets == ("chair",)
+
+
+def test_a_keyframe_that_was_shown_can_be_pointed_at_when_newer_ones_have_replaced_it() -> None:
+    searched, indices = mission(), range(80)
+    shown = 0
+    for index in indices:
+        searched.process(wall_frame(index))
+        if index == 3:
+            view = searched.mapper.camera_view()
+            assert view is not None
+            shown = view.frame_index
+    on_pixel = ((32.0, 24.0),)
+    kept = [keyframe.frame.index for keyframe in searched.mapper.keyframes()]
+    assert shown not in kept
+    with pytest.raises(InvalidInputError, match="expected a keyframe that is kept"):
+        searched.point_at(
+            [PointedObject(points_px=on_pixel, frame_index=next(i for i in indices if i not in {*kept, shown}))]
+        )
+    searched.point_at([PointedObject(points_px=on_pixel, frame_index=shown, noun="mug")])
+    assert searched.process(wall_frame(len(indices))).roi_share > 0
+
+
+def test_a_run_without_a_task_cannot_be_pointed_at() -> None:
+    estimators = EstimatorFactory(PerceptionSettings(), SceneInfo)
+    uniform = ScheduledTaskMapper(
+        build_task_mapper(MissionSettings(policy="uniform", threads=1), estimators, []),
+        TaskSchedule(None),
+        estimators,
+        None,
+        -1,
+    )
+    with pytest.raises(InvalidInputError, match="expected a run with a task"):
+        uniform.point_at([PointedObject(points_px=((32.0, 24.0),))])
+
+
+def test_a_resumed_run_keeps_what_a_person_has_pointed_at(tmp_path: Path) -> None:
+    sequence, state, out = write_seven_scenes(tmp_path / "kitchen"), tmp_path / "run.state", tmp_path / "out"
+    common = ["map", str(sequence), "--task", "Find the mug", "--max-gaussians", "150", "--out", str(out)]
+    keys = ["threads=1", "register-depth=none", "pose-prior=none", "view=0"]
+    options = [*common, *(part for key in keys for part in ("--set", key))]
+    assert main([*options, "--set", f"save-state={state}"]) == 3
+    write_state(state, {**read_state(state), "extra/pointed": encode_text("wall")})
+    write_seven_scenes(tmp_path / "later" / "kitchen", (0, 4, 8, 12))
+    options[1] = str(tmp_path / "later" / "kitchen")
+    assert main([*options, "--set", f"resume={state}"]) == 3
+    assert json.loads((out / "report.json").read_text())["targets"] == ["mug", "wall"]
