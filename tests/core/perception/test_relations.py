@@ -73,6 +73,14 @@ def test_a_bowl_in_the_middle_of_a_table_is_on_it_and_a_table_is_not_on_itself()
     assert not satisfies(Predicate.ON, desk, TABLE)
 
 
+def test_a_mug_at_the_low_end_of_a_tilted_table_is_on_it() -> None:
+    x, z = (axis.ravel() for axis in np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-0.4, 0.4, 30)))
+    table = Observation.from_points("table", np.stack([x, 0.06 * x, z], axis=-1), EYE_M)
+    assert satisfies(Predicate.ON, small_object("mug", 0.9, 0.054 - 0.04, 0.0), table)
+    assert not satisfies(Predicate.ON, small_object("mug", 0.9, 0.054 + 0.1, 0.0), table)
+    assert not satisfies(Predicate.ON, small_object("mug", 1.3, 0.054 - 0.04, 0.0), table)
+
+
 @given(
     st.sampled_from(sorted(MIRRORED)),
     st.floats(-2.5, 2.5).filter(lambda x: abs(x) > 0.1),
