@@ -321,7 +321,11 @@ def test_a_killed_owner_is_replaced_and_acknowledged_messages_are_in_the_map(
             assert own.share.host.owned.slots == ALL_SLOTS
 
 
-def test_a_server_refuses_what_an_owner_that_has_stopped_cannot_take(postgres: PostgresServer, folder: Path) -> None:
+def test_a_server_refuses_what_an_owner_that_has_stopped_cannot_take(
+    postgres: PostgresServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # a tenth of the default, so that the owner is stopped for less time than a connection may be silent
+    monkeypatch.setattr("gausslite_fusion_server.part_sender._OWNER_BYTES", 1_600_000)
     url, peer, address = postgres.new_database(), f"unix:{folder}/stopped.sock", f"unix:{folder}/own.sock"
     with sharing_server(url, address) as own:
         arguments = ["--store", url, "--set", f"peer-address={peer}", "--listen", peer, "--voxel-size", "0.1"]
@@ -330,7 +334,7 @@ def test_a_server_refuses_what_an_owner_that_has_stopped_cannot_take(postgres: P
             owned, refusals = sorted(own.share.host.owned.slots), list[str]()
             names = [f"ant-{number}" for number in range(20)]
             sessions = [own.client.join(name, GRID).session_id for name in names]
-            large = scattered("ant", 1, 1, 40_000).batch
+            large = scattered("ant", 1, 1, 4_000).batch
             foreign = select_keys(large, large.keys[~np.isin(slots_of(large.keys), owned)])
             near = select_keys(large, large.keys[np.isin(slots_of(large.keys), owned)])
 
