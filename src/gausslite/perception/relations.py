@@ -230,7 +230,7 @@ class RelationGeometry:
     def _is_over(self, centroid_m: Float64[ndarray, "3"], anchor: Landmark, sign: float) -> bool:
         """Return True above the anchor's centroid (below for sign -1), within on_m of it or over its footprint.
 
-        Over the footprint, an object above the nearest cell is above the anchor too: an upward direction with an error
+        Over the footprint, an object above all cells near it is above the anchor too: an upward direction with an error
         of a degree lowers the far end of a table of a metre by two centimetres.
         """
         height_m, horizontal_m = self._offset_m(centroid_m, anchor.centroid_m[None])
@@ -238,9 +238,8 @@ class RelationGeometry:
         if is_beyond and horizontal_m[0] < self._settings.on_m:
             return True
         to_cell_m, to_footprint_m = self._offset_m(centroid_m, anchor.footprint_m().astype(np.float64))
-        nearest = int(to_footprint_m.argmin())
-        is_beyond = is_beyond or (sign > 0 and to_cell_m[nearest] > 0.0)
-        return bool(is_beyond and to_footprint_m[nearest] < self._settings.footprint_slack_m)
+        is_near = to_footprint_m < self._settings.footprint_slack_m
+        return bool(is_near.any() and (is_beyond or (sign > 0 and to_cell_m[is_near].min() > 0.0)))
 
     def _is_inside(self, centroid_m: Float64[ndarray, "3"], anchor: Landmark) -> bool:
         """Return True between the anchor's lowest and highest cells, and within its extent on two horizontal axes."""
