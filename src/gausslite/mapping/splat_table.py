@@ -185,14 +185,11 @@ class SplatTable:
         log_scales = self.rows[:, LOG_SCALE]
         log_scales[:] = log_scales.mean(axis=1, keepdims=True)
 
-    def clip_colours(self) -> None:
-        """Clip all colour channels to [0, 1.25]; above 1, so that blended colours still reach white.
-
-        Standard 3DGS renderers show negative colours as 0: a map that needs them looks different there (bench/results).
-        """
+    def clip_colours(self, lowest: float, highest: float) -> None:
+        """Clip all colour channels to this range."""
         # one channel at a time: NumPy takes twice as long for three columns at once
         for channel in self.rows[:, RGB].T:
-            np.clip(channel, 0.0, 1.25, out=channel)
+            np.clip(channel, lowest, highest, out=channel)
 
     def append(self, gaussians: Gaussians, anchor: int = NO_ANCHOR) -> None:
         """Add Gaussians with zero optimiser state. Raises QuotaError if they do not fit."""

@@ -192,6 +192,8 @@ class CountedScheduler:
         return self._iterations < iterations_per_frame
 
 
+_COLOUR_RANGE = (-0.25, 1.25)
+"""Wider than [0, 1], so that blended colours still reach black and white."""
 _RANDOM_BLOCK = 16
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
@@ -272,7 +274,7 @@ class Trainer:
             done, frame_is_done = self._iterate_until_density_control(turns, done, scheduler)
             self._control_density(extent_m, scheduler)
         with scheduler.timing(Stage.FINALISATION):
-            self._table.clip_colours()
+            self._table.clip_colours(*_COLOUR_RANGE)
             if self._settings.optimization.isotropic:
                 self._table.make_isotropic()
             self._update_ema()
@@ -288,7 +290,7 @@ class Trainer:
         with self._rasterizer.bind_tables(*binding.tables):
             self._iterate(binding, stage, turns[stage])
         self._control_density(extent_m, scheduler)
-        self._table.clip_colours()
+        self._table.clip_colours(*_COLOUR_RANGE)
         if self._iterations % self._settings.optimization.iterations == 0:
             self._update_ema()
 

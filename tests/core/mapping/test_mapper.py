@@ -72,17 +72,6 @@ def test_the_error_of_the_map_decreases() -> None:
     assert mapper.revision == 5
 
 
-def test_a_black_and_white_wall_is_mapped_without_negative_colours() -> None:
-    mapper = mapper_of()
-    for index in range(4):
-        frame = wall_frame(index, SIZE, shift_m=0.1 * index)
-        black_and_white = np.where(frame.rgb > 127, 255, 0).astype(np.uint8)
-        mapper.map_frame(replace(frame, rgb=black_and_white), middle_relevance(frame))
-    rgb = mapper.gaussians().rgb
-    assert rgb.min() == pytest.approx(0.0, abs=0.01)
-    assert rgb.max() <= 1.26
-
-
 def test_kappa_counts_active_phase_iterations_of_active_gaussians_only() -> None:
     mapper = mapper_of()
     map_wall(mapper, 2)
