@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from place_scenes import MapCamera, looking, room
@@ -37,6 +39,22 @@ def test_a_displaced_pose_is_refused(view: tuple[float, float, float]) -> None:
 def test_look_alike_rooms_are_refused(view: tuple[float, float, float], other: Gaussians) -> None:
     frame = MapCamera(other).frame(looking(*view))
     assert not verify(MapCamera(room(3)).render, frame, looking(*view)).is_accepted
+
+
+def _tinted(sign: float) -> Gaussians:
+    """Return a grey room that is bluer at one end and yellower at the other."""
+    grey: Gaussians = room(3)
+    rgb = np.repeat(grey.rgb.mean(axis=1, keepdims=True), 3, axis=1)
+    rgb[:, 2] *= 1.0 + sign * 0.06 * (grey.means_m[:, 0] - 2.0)
+    return replace(grey, rgb=rgb)
+
+
+def test_a_look_alike_with_its_colours_elsewhere_is_refused() -> None:
+    frame, pose = MapCamera(_tinted(1.0)).frame(looking(*VIEWS[0])), looking(*VIEWS[0])
+    found = verify(MapCamera(_tinted(-1.0)).render, frame, pose)
+    assert not found.is_accepted
+    assert replace(found, layout=1.0).shows_the_same, "all else agrees"
+    assert verify(MapCamera(_tinted(1.0)).render, frame, pose).is_accepted
 
 
 def test_a_blank_wall_is_refused() -> None:
