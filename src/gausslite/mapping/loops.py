@@ -43,11 +43,11 @@ _ALIGNED_STD = np.array([0.03] * 3 + [np.radians(0.7)] * 3)
 """Error of a registered motion before images refine it: translation (m) and rotation (rad)."""
 _MIN_ALIGNED = 0.5
 """Share of the points in both images whose depth must agree."""
-_MAX_SHARE, _MOVED_M, _MOVED_DEG = 0.5, (0.02, 0.08), (0.5, 2.0)
+_MAX_SHARE, _MOVED_M, _MOVED_DEG = 0.5, (0.03, 0.08), (1.0, 2.0)
 """The rendering may move the pose of a loop by this share of the correction, within these limits. Where depth or images
 of a camera err, surfaces and images agree on a wrong motion, and the map draws the pose back: by 0.8 to 1.05 of the
-correction in the kitchen of 7-Scenes. True loops of homes with drift are moved by a seventh of 19 cm, by two fifths of
-4 cm, and by at most 2 cm where the correction is smaller."""
+correction in the kitchen of 7-Scenes, by 3.6 cm and more. True loops of homes with drift are moved by a seventh of
+19 cm, by two fifths of 4 cm, and by up to 2.6 cm and 0.7 degrees (1.4 pixels of a small image) of smaller ones."""
 _NOISE = 0.006, 0.15
 """A loop that the poses contradict by less, in metres and degrees, moves nothing until another one does."""
 _NOISE_STDS = 2.0 * 2.0**0.5
