@@ -196,7 +196,7 @@ def _compare_colours(rendering: Rendering, photograph: Frame, compared: Bool[nda
     layouts = []
     for i in range(2):
         sums = (_cell_sums(lab[..., i] * compared)[enough] for lab in (rendered, recorded))
-        (a, both), (_, b) = np.cov([each / counts[enough] for each in sums], ddof=0) + _FLAT_CHROMA**2
+        (a, both), (_, b) = np.cov([total / counts[enough] for total in sums], ddof=0) + _FLAT_CHROMA**2
         layouts.append(float(both / np.sqrt(a * b)))  # of flat colours, which correlate by chance, 1
     return chroma, min(layouts)
 
