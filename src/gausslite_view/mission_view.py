@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import numpy as np
@@ -64,8 +64,7 @@ class MissionRequests:
 
     def answer(self) -> None:
         """Answer all requests that wait; call it from the thread that maps."""
-        while not self._waiting.empty():
-            request, future = self._waiting.get()
+        for request, future in self._taken():
             try:
                 future.set_result(request())
             except Exception as error:  # the thread that asked raises it; the mission continues
@@ -74,8 +73,14 @@ class MissionRequests:
     def end(self) -> None:
         """Refuse the requests that wait, and all later ones."""
         self._has_ended = True
-        while not self._waiting.empty():
-            self._waiting.get()[1].set_exception(UnavailableError("the mission has ended; its files can be viewed"))
+        for _, future in self._taken():
+            future.set_exception(UnavailableError("the mission has ended; its files can be viewed"))
+
+    def _taken(self) -> Iterator[tuple[Callable[[], Any], Future[Any]]]:
+        """Take all requests that wait; at the end of the mission two threads may do so."""
+        with suppress(Empty):
+            while True:
+                yield self._waiting.get_nowait()
 
     def _ask(self, request: Callable[[], _Result]) -> _Result:
         future: Future[_Result] = Future()

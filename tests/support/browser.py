@@ -21,13 +21,3 @@ def open_browser(size: tuple[int, int] = (720, 420)) -> Iterator[Any]:
         except InvalidInputError as error:
             pytest.skip(str(error))
         yield context
-
-
-def write(tab: Any, number: int, text: str) -> None:
-    """Write into a field until the text stays, as a page that is still being built ignores it."""
-    field = tab.get_by_role("textbox").nth(number)
-    for _ in range(60):
-        field.fill(text)
-        tab.wait_for_timeout(500)
-        if field.input_value() == text:
-            break

@@ -104,7 +104,10 @@ class AgentMission:
         resumed: MissionCheckpoint | None = None,
         can_find: bool = True,
     ) -> None:
-        """Resumed: the checkpoint that the worker was restored from. can_find: False if any task would fail."""
+        """Wait for a task. resumed: the checkpoint that the worker was restored from.
+
+        can_find: False if any task would fail.
+        """
         self.can_find = can_find
         self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
         self._state_machine = MissionStateMachine()

@@ -1,7 +1,9 @@
-"""Answer the streams on which agents send their voxel updates, wherever these are stored."""
+"""Answer the streams on which agents send their voxel updates, wherever these are stored; pace large keyframes."""
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,6 +23,7 @@ from gausslite.wire.status import code_and_reason
 
 STREAM_ERRORS = (SessionUnknownError, MismatchError, StorageError, UnavailableError)
 """Errors that every later message would raise too, so they end the stream; other errors reject one message."""
+_QUICK_S, _PAUSE = 0.05, 2.0
 
 
 class StoredCount(NamedTuple):
@@ -85,3 +88,26 @@ class Contributions:
         counted = TrafficCounters(subsets_accepted=int(is_accepted), subsets_stale=int(not is_accepted))
         self.record_traffic(session.agent_id, traffic.plus(counted))
         return outcome
+
+
+class PacedLock:
+    """Held by one call at a time; after long work the next call waits twice as long, so that others have the disk."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+        self._begin_s = self._free_s = 0.0
+
+    async def __aenter__(self) -> None:
+        await self._lock.acquire()
+        try:
+            await asyncio.sleep(self._free_s - time.monotonic())
+        except BaseException:
+            self._lock.release()
+            raise
+        self._begin_s = time.monotonic()
+
+    async def __aexit__(self, *_: object) -> None:
+        end_s = time.monotonic()
+        if end_s - self._begin_s > _QUICK_S:
+            self._free_s = end_s + _PAUSE * (end_s - self._begin_s)
+        self._lock.release()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import tempfile
-import time
 from types import TracebackType
 
 import google_crc32c
@@ -36,7 +34,6 @@ from gausslite.wire.security import Caller
 from gausslite.wire.views import region_from_png
 
 _MAX_SELECTED_KEYFRAMES = 10_000
-_QUICK_S, _PAUSE = 0.05, 2.0
 
 
 def agent_of_session(engine: FusionEngine, session_id: str, caller: Caller) -> str:
@@ -219,26 +216,3 @@ def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
         targets=agent.targets,
         alignment=alignment_to_message(agent.alignment),
     )
-
-
-class PacedLock:
-    """Held by one call at a time; after long work the next call waits twice as long, so that others have the disk."""
-
-    def __init__(self) -> None:
-        self._lock = asyncio.Lock()
-        self._begin_s = self._free_s = 0.0
-
-    async def __aenter__(self) -> None:
-        await self._lock.acquire()
-        try:
-            await asyncio.sleep(self._free_s - time.monotonic())
-        except BaseException:
-            self._lock.release()
-            raise
-        self._begin_s = time.monotonic()
-
-    async def __aexit__(self, *_: object) -> None:
-        end_s = time.monotonic()
-        if end_s - self._begin_s > _QUICK_S:
-            self._free_s = end_s + _PAUSE * (end_s - self._begin_s)
-        self._lock.release()

@@ -37,10 +37,9 @@ from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
 from gausslite.wire.views import ChangeNotifier
-from gausslite_fusion_server.contributions import Contributions, StoredCount
+from gausslite_fusion_server.contributions import Contributions, PacedLock, StoredCount
 from gausslite_fusion_server.messages import (
     ExportedFile,
-    PacedLock,
     agent_of_session,
     alignment_to_message,
     contribution_to_message,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from agent_running import TASK, agent
-from browser import open_browser, write
+from browser import open_browser
 from fusion_running import frame
 
 from gausslite.domain.errors import InvalidInputError
@@ -23,6 +23,16 @@ from gausslite_view.pages import live_page, own_address
 pytest.importorskip("viser")
 from gausslite_view.agent_panel import AgentPanel
 from gausslite_view.pages import open_page
+
+
+def write(tab: Any, number: int, text: str) -> None:
+    """Write into a field until the text stays, as a page that is still being built ignores it."""
+    field = tab.get_by_role("textbox").nth(number)
+    for _ in range(60):
+        field.fill(text)
+        tab.wait_for_timeout(500)
+        if field.input_value() == text:
+            break
 
 
 def assign(tab: Any, task: str) -> None:
