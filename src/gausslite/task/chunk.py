@@ -149,17 +149,13 @@ class ChunkBuffer:
     ) -> None:
         """End the noun phrase and add a preposition, negated if a "not" precedes it."""
         self.close()
-        negated, self.negates_next = self.negates_next, False
-        self.chunks.append(
-            Chunk(
-                ChunkKind.PREPOSITION,
-                relation,
-                current_place=current_place,
-                negated=negated,
-                text=text or relation,
-                bounds=bounds,
-            )
-        )
+        negated, self.negates_next = self.negates_next or self.joins_negated(-3), False
+        place = Chunk(ChunkKind.PREPOSITION, relation, current_place=current_place, negated=negated, bounds=bounds)
+        self.chunks.append(replace(place, text=text or relation))
+
+    def joins_negated(self, place: int) -> bool:
+        """Return True after "or" if the chunk at this place is negated: "not near the sink or on the table"."""
+        return len(self.chunks) >= -place and self.chunks[-1].word in ("or", "nor") and self.chunks[place].negated
 
     def close(self) -> None:
         """End the current noun phrase."""
@@ -172,9 +168,7 @@ class ChunkBuffer:
 
 
 # they make a picture: "take a picture of the mug"
-_PICTURING_VERBS = frozenset(
-    {"take", "make", "get", "capture", "shoot", "draw", "snap", "record", "want", "need", "see"}
-)
+_PICTURING_VERBS = word_set("take make get capture shoot draw snap record want need see")
 
 
 def names_object(noun: NounPhrase, pending: str | None, following: Sequence[Chunk], verb: str | None) -> bool:

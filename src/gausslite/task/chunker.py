@@ -105,11 +105,8 @@ class VerbChunker:
             self._negated_verb(verbs.verb_base(word) or word)
             return
         can_start = buffer.has_determiner or before not in _BEFORE_GERUND_TAGS
-        can_start = can_start or (
-            before is Tag.VERB
-            and buffer.last_kind() is ChunkKind.VERB
-            and buffer.chunks[-1].word not in verbs.ASPECT_VERBS
-        )
+        follows_verb = before is Tag.VERB and buffer.last_kind() is ChunkKind.VERB
+        can_start = can_start or (follows_verb and buffer.chunks[-1].word not in verbs.ASPECT_VERBS)
         if can_start and after in NOUN_PHRASE_TAGS and lexicon.ADJECTIVES.issuperset(buffer.words):
             buffer.words.append(word)  # "the leaking pipe"
         elif (
@@ -289,23 +286,25 @@ class _Chunker:
             buffer.words.append(word)
 
     def _joins_state(self) -> bool:
-        """Return True for the "brown" of "it is long and brown"."""
+        """Return True for the "brown" of "it is long and brown", and of "that is not long or brown"."""
         tags = [self._buffer.tag(offset) for offset in (-1, -2, -3)]
-        return tags == [Tag.CONJUNCTION, Tag.ADJECTIVE, Tag.AUXILIARY]
+        return tags[:2] == [Tag.CONJUNCTION, Tag.ADJECTIVE] and tags[2] in (Tag.AUXILIARY, Tag.NEGATION)
 
     def _state(self, word: str) -> None:
         """Emit the colour of "the mug that is red" or "anything red"; other states describe no object ("is empty")."""
         buffer = self._buffer
-        before = (buffer.tag(-3), buffer.tag(-4)) if self._joins_state() else (buffer.tag(-1), buffer.tag(-2))
-        follows_noun = Tag.INDEFINITE in before or Tag.RELATIVE in (buffer.tag(-2), buffer.tag(-3))
+        at = -3 if self._joins_state() else -1
+        before = buffer.tag(at), buffer.tag(at - 1)
+        follows_noun = Tag.INDEFINITE in before or Tag.RELATIVE in (buffer.tag(at - 1), buffer.tag(at - 2))
         is_it = self._is_statement and before == (Tag.AUXILIARY, Tag.ANAPHOR)  # "it is black"
         is_description = not any(other in (Tag.VERB, Tag.INDEFINITE) for _, other in buffer.tagged)
         follows_noun = follows_noun or ((self._is_statement or is_description) and before == (Tag.AUXILIARY, Tag.NOUN))
         if is_attribute(word) and (
             is_it or (follows_noun and buffer.last_kind() in (ChunkKind.NOUN, ChunkKind.CONJUNCTION))
         ):
-            plural = "are" if "are" in (buffer.word(-1), buffer.word(-2)) else ""
-            buffer.chunks.append(Chunk(ChunkKind.ATTRIBUTE, word, negated=buffer.negates_next, text=plural))
+            plural = "are" if "are" in (buffer.word(at), buffer.word(at - 1)) else ""
+            negated = buffer.negates_next or buffer.joins_negated(-2)
+            buffer.chunks.append(Chunk(ChunkKind.ATTRIBUTE, word, negated=negated, text=plural))
         buffer.negates_next = False
 
     def _determiner(self, word: str) -> None:
@@ -383,11 +382,9 @@ class _Chunker:
         if not buffer.words and buffer.chunks and buffer.chunks[-1].word == "via":
             return  # "around the left side of the table"
         directly = not buffer.words and buffer.last_kind() is ChunkKind.VERB and before is Tag.VERB
-        elided = word == "in" and [chunk.kind for chunk in buffer.chunks[-3:-1]] == [
-            ChunkKind.NOUN,
-            ChunkKind.CONJUNCTION,
-        ]
-        elided = elided and buffer.chunks[-1].word in verbs.PLACE_VERBS  # "rinse the plate and put in the rack"
+        elided = [chunk.kind for chunk in buffer.chunks[-3:-1]] == [ChunkKind.NOUN, ChunkKind.CONJUNCTION]
+        # "rinse the plate and put in the rack"
+        elided = elided and word == "in" and buffer.chunks[-1].word in verbs.PLACE_VERBS
         if directly and bounds is None and not elided and verbs.is_particle(buffer.chunks[-1].word, word):
             if relation in _ROUTE_RELATIONS and buffer.chunks[-1].word in verbs.GO_VERBS:
                 buffer.emit_preposition("via", word)

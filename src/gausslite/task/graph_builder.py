@@ -11,14 +11,7 @@ from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
 from gausslite.task.roles import RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
-from gausslite.task.verbs import (
-    BELONGING_VERBS,
-    CONTACT_VERBS,
-    GO_VERBS,
-    LEAVING_VERBS,
-    PLACE_VERBS,
-    TRAVEL_VERBS,
-)
+from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, LEAVING_VERBS, PLACE_VERBS, TRAVEL_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is
@@ -258,7 +251,7 @@ class GraphBuilder:
             return
         conjoined = before is not None and before.kind is ChunkKind.CONJUNCTION
         self._clause.is_alternative = conjoined and before is not None and before.word == "or"
-        contrasts = self._corrects or (before is not None and before.word == "but")
+        contrasts = self._corrects or (before is not None and before.word in ("but", "("))
         if conjoined and contrasts and self._clause.nouns_since_negation:
             self._negated = False  # "not the wooden spoon, the metal one", "not the red one but the blue one"
         if noun.head in ("one", "ones"):
@@ -315,8 +308,9 @@ class GraphBuilder:
     def _lone_adjectives(self, noun: NounPhrase, pending: str | None, conjoined: bool, after: Chunk | None) -> None:
         """Handle adjectives without a noun: "the red" and blue mugs, "the largest" of the boxes."""
         before_noun = after is not None and (after.kind is ChunkKind.NOUN or after.word == "of")
-        if [chunk.kind for chunk in self._following[:2]] == [ChunkKind.CONJUNCTION, ChunkKind.NOUN]:
-            self._adjectives.append(noun)
+        kinds = [chunk.kind for chunk in self._following[:2]]
+        if kinds in ([ChunkKind.CONJUNCTION, ChunkKind.NOUN], [ChunkKind.NEGATION, ChunkKind.NOUN]):
+            self._adjectives.append(noun)  # "the red and blue mugs", "neither the red nor the blue mug"
         elif is_attribute(noun.head) and before_noun:
             self._partitive = noun, pending, conjoined
         elif any(word in SUPERLATIVES for word in noun.words) and self._described is not None:
@@ -339,8 +333,9 @@ class GraphBuilder:
         described = NounPhrase((*one.words[:-1], *same.words), one.has_determiner)
         listed = [chunk.kind for chunk in self._following[:2]] == [ChunkKind.CONJUNCTION, ChunkKind.NOUN]
         # "which jacket, the black one"
-        repeats = before is not None and before.word == "," and named[-1] in clause.objects and one.is_definite
-        repeats = repeats and not one.is_plural and named[-1] == same.text and not listed
+        joint = before.word if before is not None else ""  # "(" stands for "but only"
+        repeats = joint in (",", "(") and named[-1] in clause.objects and one.is_definite
+        repeats = repeats and (joint == "(" or not one.is_plural) and named[-1] == same.text and not listed
         # "there are two mugs on the table, take the red one"
         repeats = repeats or self._draft.is_from_statement(named[-1])
         if self._pending in (None, "purpose") and not self._negated and repeats:

@@ -93,6 +93,9 @@ class RoleAssigner:
         pending_places, self.clause.pending_places = self.clause.pending_places, []
         going = self.clause.verb in verbs.TRAVEL_VERBS
         for terms, noun in pending_places:
+            if self.clause.verb == "turn" and lexicon.is_space(noun.words):
+                self._draft.add_context(noun.text)  # "turn right at the end of the hallway"
+                continue
             passed = (passes and terms.relation in ("between", "past", "under")) or terms.relation == "with"
             self.target(noun, TargetRole.DESTINATION if going and not passed else TargetRole.OBJECT, conjoined=True)
 

@@ -108,8 +108,9 @@ def _number(text: str) -> float:
 _PLACED: Final = (
     r"(?:(?:(?:to|on) the (?:left|right)|in front|on top) of|next to|above|below|under|behind|beside|near|in|on)"
 )
-_END: Final = r"(?=$| ?[,.;])"
+_END: Final = r"(?: instead)?(?=$| ?[,.;])"
 _NAMED: Final = r"(?:the|an?|my|that|this)(?: \w+){1,3}?"
+_CORRECTION: Final = r"(?:(?:no|oh|wait|sorry|actually|rather|scratch that|make (?:that|it)),? )+"
 _IDIOMS_DISTANCE: Final = rf"(?:(?:at least|about) )?(?:a few|several|some|{_VALUE}) {_UNIT}"
 _PLAIN: Final = {
     # short forms
@@ -125,7 +126,6 @@ _PLAIN: Final = {
     r"(?:with|has|have) (?:its|their|the) backs? (?:to|towards?|facing|against)": "near",
     r"belonging to": "of",
     r"in (?:your|my) hands?|(?:(?:that|which) )?you(?: are)? (?:holding|carrying)": "",
-    r"do(?:es)? (?:any|some)(?:one|body) know": "",
     r"^the (?:target|goal|object|item)(?: object)? is(?= (?:an?|the|my|one)\b)": "this is",
     r"^(?:if|when) you (?:are )?(?:stand|sit|enter)\w*[^,;.]*,": "",
     # "a cabinet, above it is a lamp"
@@ -145,9 +145,10 @@ _PLAIN: Final = {
     r",? (?:if|when|while|as)(?: you)?(?: are)? (?:facing|looking(?: at| from)|face|look at|enter|entering) "
     rf"[\w ]{{2,40}}?{_END}": "",
     # a correction, and what is denied of a place
-    rf"({_NAMED}),? (?:no|sorry|i mean|no wait|wait no|(?:or )?rather|actually),? ({_NAMED}){_END}": r"\2, not \1",
+    rf"({_NAMED}),? (?:no|sorry|i mean|no,? wait|wait,? no|(?:or )?rather|actually),? ({_NAMED}){_END}": r"\2, not \1",
+    rf"^(\w+(?: up| me| us)?) ({_NAMED})[.,;]+ {_CORRECTION}(?![\w ]* ones?\b)({_NAMED}){_END}": r"\1 \3, not \2",
     r"(the|an?|my) (\w+)[.;,]? (?:no|sorry),? the (\w+) one\b": r"\1 \3 \2",
-    rf"(\w+) ({_NAMED}),? (?:no|sorry|no wait|wait no|actually|rather),? \1 ({_NAMED}){_END}": r"\1 \3, not \2",
+    rf"(\w+) ({_NAMED})[.,;]* {_CORRECTION}\1 ({_NAMED}){_END}": r"\1 \3, not \2",
     rf"(to|on|in|into|under|behind|near|next to) ({_NAMED})[.,;] (?:no|sorry|wait|actually),? \1 ({_NAMED}){_END}": (
         r"\1 \3, not \1 \2"
     ),
@@ -160,12 +161,19 @@ _PLAIN: Final = {
     r"(?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
     r"|(?:before|when|once|after) you (?:get to|reach|come to|arrive at|hit))": r"\1 at",
     r"out of the way of": "away from",
-    r"(one|two|three) (?:by|at a) (?:one|two|three|time)|side by side": "",
+    r"(?:one|two|three) (?:by|at a) (?:one|two|three|time)|side by side|around the (?:corner|bend)(?! of)": "",
     r"(stop|wait|halt)(?: walking| moving)? (?:once|when|after|as soon as) you(?: are| have)?": r"\1",
     r"(?:and|but) (?:(is|are)(?! (?:the|it|they|there)\b)|(?:it )?(has))": r"and which \1\2",
-    r"but (the [\w ]+?) (?:should|must|can|has to) (?:stay|remain)(?: \w+)*": r"but do not touch \1",
-    r"nothing (?:but|except|other than)": "",
-    r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)": "",
+    r"(^|[.,;] ?|and |but )((?:the|my|an?) [\w ]+?) (?:(?:should|must|can|may|ha(?:s|ve) to) (?:stay|remain|be left)|"
+    rf"stays?|remains?|\w+ off limits)(?: (?:where|as) \w+ (?:is|are)| there| in place)?{_END}": r"\1 do not touch \2",
+    rf"({_PLACED}),? but not (?:{_PLACED}|touching),?(?= (?:the|an?|my)\b)": r"\1",
+    rf"(?:any|(?<=look )every)where(?: else)? (?:but|except|other than)(?= (?:{_PLACED}|inside|at|under)\b)": ", not",
+    r"lacking|devoid of|(?:(?:that |which )?(?:is|are) )?free (?:of|from)|missing(?= (?:an?|its|any|one)\b)": "without",
+    r"(is|are) no longer": r"\1 not",
+    r"(another|different|other) (\w+(?: \w+)?) (?:than|from)(?= (?:the|my|that)\b)": r"\1 \2 except",
+    r"(?:is|are) (?:what|the ones?)(?: that)? (?:i|we|you) (?:want|need|mean|(?:are )?(?:look|search)ing for)": "",
+    r"(?:, ?(?:but |and )?|(?:but|and) )(?:only|just)(?: the| those)?(?= (?:\w+ ){1,2}ones?\b)": " ( the",
+    r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)|nothing (?:but|except|other than)": "",
     # where the robot starts gives nothing; a viewpoint is an object to pass
     r"^(?:you (?:stand|are standing|are starting)|(?:you )?(?:start|begin|starting|beginning) (?:at|in|from|by|next))\b"
     r"[^.;,]*[.;,]": "",
@@ -177,23 +185,21 @@ _PLAIN: Final = {
     r"so(?: that)? you(?: are)? fac(?:e|ing)": "; face",
     r"(?:is |are )?made (?:out )?of (?:(?:solid|dark|light) )?\w+": "",
     r"(?:could|can|would|will) (?:someone|somebody|anyone|anybody|one of you)": "please",
-    r"is it (?:\w+ ){1,2}to(?= \w)": "",
     r"(that|it|he|she|who|which)s? (?:is|has) got": r"\1 has",
     r"throw ((?:[\w']+ ){1,9})(?:away|out)(?=$| ?[,.;]| and )": r"remove \1",
-    r"(?:to|on) your (?:\w+ )?(?:left|right)(?: hand)?(?: side)?(?! of\b)": "",
+    r"(?:to|on) your (?:\w+ )?(?:left|right)(?: hand)?(?: side)?(?! of\b)|back(?= where\b)": "",
     r"(?:on top|at the (?:head|foot))(?! of\b)": "",
     rf"to (?:dry|cool|soak|thaw|rest)(?: off| down)?(?= {_PLACED})": "",
-    r"on the (?:left|right)(?=,? (?:and )?the\b)|upside down|(?:how|what) about(?= \w+ing\b)": "",
+    r"on the (?:left|right)(?=,? (?:and )?the\b)|upside down|(?:how|what) about(?= \w+ing\b)|any ?(?:more|longer)": "",
     r"why (?:don't|do not|not)(?: you| we)?": "please",
-    r"(?:something|anything) wrong with": "",
+    r"is it (?:\w+ ){1,2}to(?= \w)|(?:some|any)thing wrong with|do(?:es)? (?:any|some)(?:one|body) know": "",
     rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED}|{_VALUE} {_UNIT})\b)": (
         "and stop"
     ),
     rf"with ((?!no)(?:\w+ ){{1,4}}?)(?:{_PLACED}|inside|around|over) (?:it|them)": r"holding \1",
-    r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)": "",
     r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
     rf"where (the [\w ]+?) (?:is|are)(?: \w+(?:ed|ing)| kept)?{_END}": r"\1 with \2",
-    r"(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
+    r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)|(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
     r"(?:at the (?:bottom|top),? )?(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
     # a double negation is a request
     r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
@@ -202,7 +208,6 @@ _PLAIN: Final = {
     ),
     r"there (?:is|are|was|were|should be|must be|might be)(?! (?:not?|any)\b)|"
     r"(?:^|(?<=[.;,] ))you (?:will )?(?:see|find|notice)": "i see",
-    r"back(?= where\b)": "",
     r"reach(?:ing)? for": "grab",
     r"(?:head|make|leave|set off|set out) for(?= (?:the|a|an|my|that|this)\b)": "go to",
     r"(there|where|what|who|that)s": r"\1 is",
@@ -217,9 +222,16 @@ _PLAIN: Final = {
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
-    r"be careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|take care not to": "do not",
+    r"(?:be|being) careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|"
+    r"tak(?:e|ing) care not to|there is no need (?:for you )?to|refrain from|"
+    r"(?:under|in) no (?:circumstance|case)s?(?: should you)?": "do not",
+    r"^(\w+) nothing": r"do not \1 anything",
+    r"not (?:that|this|these|those|the \w+)(?: ones?)?[,;](?: but)?(?= the (?:\w+ )?ones?(?! or\b|,))": "",
+    r"(?:keep (?:your|the) )?hands off": "do not touch",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
-    r"(?:stay|keep|steer|remain|stand) (?:well )?(?:clear|away|off) (?:of|from)": "avoid",
+    r"(?:stay|keep|steer|remain|stand|staying|keeping|steering) (?:well )?(?:clear|away|off) (?:of|from)|"
+    r"(?<=, )avoiding|(?:stay|keep) out of": "avoid",
+    r"give (.{2,60}?) a (?:wide )?berth": r"avoid \1",
     r"(?:stay|keep|remain) close to": "follow",
     r"keep (?:your|a safe|some|a) distance (?:from|to)|(?:stay|keep) off(?: of)?(?= \w)": "avoid",
     rf"(?:keep|stay|remain) (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
@@ -227,7 +239,6 @@ _PLAIN: Final = {
     r"(\w+) number (?:\d+|one|two|three|four|five)": r"\1",
     rf"(?:\w+ (?:floor|level|story))(?= (?:\w+room|{'|'.join(lexicon.ROOMS)})\b)": "",
     r"(?:level|floor|storey) (?:one|two|three|four|\d)": "storey",
-    r"around the (?:corner|bend)(?! of)": "",
     r"(?:is|are|am|have run|has run|ran)(?: almost)? out of (?!the\b|my\b)\w+": "is empty",
     r"until you (?:see|find|spot|notice|come to|get to|hit)": "until you reach",
     r"(?:ground|first|second|third|top|upper|lower|next|\w+th|\d+(?:st|nd|rd)) (?:floor|level)\b"
@@ -238,7 +249,7 @@ _PLAIN: Final = {
     r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
     r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
-    r"((?:every|any)(?:thing|one)|all|(?:every|all|any) (?:\w+ ){0,2}\w+(?= but (?:the|an?|my)\b)) but": r"\1 except",
+    r"((?:every|any)(?:thing|one)?|all|(?:every|all|any) (?:\w+ ){0,2}\w+(?= but (?:the|an?|my)\b)) but": r"\1 except",
     r"as well as|along with|together with|in addition to|and also|plus": "and",
     # the last noun carries the meaning
     r"give (.{2,60}?) an? (?:\w+ )?(rinse|wipe|wash|clean|scrub|polish|sweep|shake|push|pull|kick|stir)": r"\2 \1",

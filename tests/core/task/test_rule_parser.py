@@ -57,6 +57,21 @@ def test_no_sentence_of_a_foreign_set_is_read_as_its_opposite(path):
         ("Do not put the vase on the table but on the shelf", "table"),
         ("Bring the plate, no wait, bring the bowl", "plate"),
         ("Take the box to the kitchen. No, to the garage", "kitchen"),
+        ("Drive to the gate, staying clear of the cranes", "crane"),
+        ("Pull the cart to the gate, avoiding people", "person"),
+        ("Give the dog a wide berth and go to the chair", "dog"),
+        ("Collect everything save for the spade", "spade"),
+        ("Bring a spoon, any but the wooden one", "wooden spoon"),
+        ("Dust the shelf. Hands off the globe", "globe"),
+        ("Dust the shelf; the globe stays where it is", "globe"),
+        ("There's no need to mop the hall floor; mop the stairs", "hall floor"),
+        ("Refrain from opening the cabinet; open the drawer", "cabinet"),
+        ("Under no circumstances touch the oven while you wipe the sink", "oven"),
+        ("Cancel the tea pot. Take the jug", "tea pot"),
+        ("Bring the jug. No, wait, the bowl", "jug"),
+        ("Bring a jug. Actually, make that a bowl", "jug"),
+        ("Bring another jug than the glass jug", "glass jug"),
+        ("Stay out of the pantry, and sweep the hall", "pantry"),
     ],
 )
 def test_what_is_denied_is_not_handled(text, denied):
@@ -64,6 +79,43 @@ def test_what_is_denied_is_not_handled(text, denied):
     handled = {name for name, role in zip(graph.targets, graph.roles, strict=True) if role is not TargetRole.OBSTACLE}
     assert denied not in handled
     assert denied in (*graph.excluded, *graph.targets)
+
+
+@pytest.mark.parametrize(
+    ("text", "denied"),
+    [
+        ("Pick up the jug that isn't near the sink or on the bench", {"sink", "bench"}),
+        ("Find a bench lacking a cushion", {"cushion"}),
+        ("Find the bench that is free of tools", {"tool"}),
+        ("The jug is no longer on the bench. Find it", {"bench"}),
+        ("Water the plants, though not the ones on the bench", {"bench"}),
+        ("Look everywhere but in the locker for my boots", {"locker"}),
+    ],
+)
+def test_a_place_that_is_denied_is_negated(text, denied):
+    relations = RuleParser().parse(text).relations
+    assert {relation.anchor for relation in relations} == denied
+    assert all(relation.negated for relation in relations)
+
+
+@pytest.mark.parametrize(
+    ("text", "target", "colour"),
+    [
+        ("Bring the jugs, but only the clean ones", "clean jug", None),
+        ("Bring the jugs from the bench, only the red ones", "jug", "red"),
+        ("Bring the jug, not the green one, the red one", "jug", "red"),
+    ],
+)
+def test_ones_that_narrow_an_object_replace_it(text, target, colour):
+    graph = RuleParser().parse(text)
+    assert graph.targets == (target,)
+    assert [attribute.colour for attribute in graph.attributes] == ([colour] if colour else [])
+
+
+def test_colours_joined_by_or_are_all_denied():
+    graph = RuleParser().parse("Pick up any jug that isn't blue or green")
+    assert graph.targets == ("jug",)
+    assert {attribute.colour for attribute in graph.attributes if attribute.name in graph.excluded} == {"blue", "green"}
 
 
 @pytest.mark.parametrize(
