@@ -111,6 +111,8 @@ def _parse_options(spec: str, query: str) -> BagOptions:
 
 _TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 _ALIASES = {"tf/msg/tfMessage": _TF_MESSAGE}
+_STAMP_END = 12
+"""Bytes of a serialised message before what follows the stamp of its header, in ROS 1 and in ROS 2."""
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _SERIALISATIONS = ("ros1", "cdr")
 _MAX_LATE_NS = 1_500_000_000
@@ -204,6 +206,21 @@ class BagFile:
     def first(self, topic: str) -> Any | None:
         """Return the first message of a topic; None if it has none. Raises DatasetError."""
         return next(self.messages(topic), None)
+
+    def contents(self, topic: str) -> list[tuple[int, Any]]:
+        """Return the messages of a topic that differ from the one before in more than their stamps, with the stamps.
+
+        Raises DatasetError.
+        """
+        found: list[tuple[int, Any]] = []
+        before = None
+        with self._readable(topic):
+            for _, connection, time_ns, data in self._serialised(topic):
+                if data[_STAMP_END:] != before:
+                    before = data[_STAMP_END:]
+                    stamp_ns = _header_stamp_ns(data, _is_ros1(connection)) or time_ns
+                    found.append((stamp_ns, self._deserialise(connection, data)))
+        return found
 
     def messages(self, topic: str) -> Iterator[Any]:
         """Yield all messages of a topic in the order of recording. Raises DatasetError."""

@@ -27,7 +27,14 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
 from gausslite.domain.relevance import Region
 from gausslite_ros.bag_file import BagAddress, BagFile, BagOptions, MessageKey, StampedMessage
-from gausslite_ros.cameras import FrameConverter, RgbdCamera, join_cameras, optical_pose, require_own_camera
+from gausslite_ros.cameras import (
+    CameraPeriods,
+    FrameConverter,
+    RgbdCamera,
+    join_cameras,
+    optical_pose,
+    require_own_camera,
+)
 from gausslite_ros.messages import camera_of, frame_name, quaternion_of, stamp_ns, translation_of
 from gausslite_ros.topics import (
     ImageTopic,
@@ -247,6 +254,7 @@ class BagSource:
         self._poses = poses
         self._require_poses = require_poses
         colours, depths = self._bag.stamps(self._colour.name), self._bag.stamps(self._depth.name)
+        self._periods: dict[str, CameraPeriods] = {}
         self._cameras = self._read_cameras(tree, colours[0].stamp_ns)
         unit_m = address.options.depth_unit_m
         stated_units = 1 / unit_m if unit_m else self._cameras.colour.units_per_metre
@@ -255,7 +263,7 @@ class BagSource:
         self._recorded = len(colours)
         self._repeated = sum(a.stamp_ns == b.stamp_ns for a, b in pairwise(colours))
         self._tree_notes = tree.notes
-        matches = self._associate(colours, depths)
+        matches = self._with_first_camera(self._associate(colours, depths))
         tolerance = f"{1000 * self._options.tolerance_s:g} ms"
         times_s = {"colour": seconds(colour.stamp_ns for colour in colours).tolist()}
         times_s["depth"] = seconds(depth.stamp_ns for depth in depths).tolist()
@@ -329,9 +337,12 @@ class BagSource:
     def notes(self) -> tuple[str, ...]:
         """Messages on images and transforms that are left out, on parts that are cut, on an origin that is not zero."""
         reason = f"without a pose at their stamp or depth within {1000 * self._options.tolerance_s:g} ms"
-        unmatched = excluded_frames_note(self._recorded - self._repeated - len(self), self._recorded, reason)
+        unused = self._recorded - self._repeated - self._other_cameras - len(self)
+        unmatched = excluded_frames_note(unused, self._recorded, reason)
         repeated = repeated_times_note(self._repeated, self._recorded)
-        return tuple(filter(None, (repeated, unmatched, *self._tree_notes, *self._bag.notes, self._origin.note)))
+        others = excluded_frames_note(self._other_cameras, self._recorded, self._other_camera)
+        notes = (repeated, unmatched, others, *self._tree_notes, *self._bag.notes, self._origin.note)
+        return tuple(filter(None, notes))
 
     def __len__(self) -> int:
         return len(self._matches)
@@ -386,11 +397,13 @@ class BagSource:
 
     def _read_camera(self, image: ImageTopic, named: str, option: str) -> FolderCamera:
         topic = choose_info(self._bag, image, named, option)
-        message = self._bag.first(topic)
         location = f"{self._bag.path}: {topic}"
-        if message is None:
+        infos = self._bag.contents(topic)
+        if not infos:
             raise DatasetError(f"{location}: expected a camera_info message, got none")
-        return camera_of(location, message, image.camera_name)
+        cameras = [camera_of(location, message, image.camera_name) for _, message in infos]
+        self._periods[topic] = CameraPeriods(topic, [stamp_ns for stamp_ns, _ in infos], cameras)
+        return cameras[0]
 
     def _read_aligned_camera(self, colour: FolderCamera) -> FolderCamera | None:
         """Return the camera of aligned depth; None if it is colour's, or if the bag does not state it.
@@ -405,6 +418,16 @@ class BagSource:
         sizes = [(camera.camera.width_px, camera.camera.height_px) for camera in (colour, depth)]
         stated = self._options.aligned or self._options.camera_file
         return None if stated and sizes[0] == sizes[1] else depth
+
+    def _with_first_camera(self, matches: list[_Match]) -> list[_Match]:
+        """Return the images taken while every camera_info is that of the start; remember how many others there are."""
+        self._other_camera, recorded = "", len(matches)
+        for periods in self._periods.values():
+            kept = [match for match in matches if periods.is_first(match.stamp_ns)]
+            if len(kept) < len(matches):
+                self._other_camera, matches = str(periods), kept
+        self._other_cameras = recorded - len(matches)
+        return matches
 
     def _associate(self, colours: Sequence[StampedMessage], depths: Sequence[StampedMessage]) -> list[_Match]:
         """Return the colour images with depth and a pose; without poses they get the identity if none is required."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,6 +102,41 @@ def require_own_camera(
             f"{location}: has the intrinsics of colour and the frame of a camera {1000 * beside_m:.0f} mm beside it; "
             "is this depth aligned to colour? State aligned=yes or aligned=no"
         )
+
+
+_SAME_CAMERA = 0.005
+"""Intrinsics that differ by a smaller share of the focal length, as by autofocus, count as equal."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPeriods:
+    """The cameras that a topic of camera_info states over time; starts_ns: when each begins, ascending."""
+
+    topic: str
+    starts_ns: Sequence[int]
+    cameras: Sequence[FolderCamera]
+
+    def is_first(self, time_ns: int) -> bool:
+        """True if the camera at this time is that of the start."""
+        return same_camera(self.cameras[0], self.cameras[max(bisect_right(self.starts_ns, time_ns) - 1, 0)])
+
+    def __str__(self) -> str:
+        """Return the first camera and the first other one."""
+        other = next(camera for camera in self.cameras if not same_camera(self.cameras[0], camera))
+        texts = (
+            f"{found.camera.width_px}x{found.camera.height_px} with fx {found.camera.fx_px:.1f}, lens {found.lens}"
+            for found in (self.cameras[0], other)
+        )
+        return f"{self.topic} states {' and later '.join(texts)}; record each camera as a bag of its own"
+
+
+def same_camera(a: FolderCamera, b: FolderCamera) -> bool:
+    """Return True for cameras of one size and lens with nearly equal intrinsics."""
+    first, second = a.camera, b.camera
+    sizes = (first.width_px, first.height_px), (second.width_px, second.height_px)
+    numbers = np.array([(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) for camera in (first, second)])
+    differs = np.abs(numbers[0] - numbers[1]).max() > _SAME_CAMERA * first.fx_px
+    return sizes[0] == sizes[1] and a.lens == b.lens and not differs
 
 
 def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[ndarray, "4 4"]:

@@ -17,7 +17,7 @@ from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import ClockJumps, Frame
 from gausslite_ros.bag_file import BagOptions
-from gausslite_ros.cameras import FrameConverter, join_cameras, optical_pose, require_own_camera
+from gausslite_ros.cameras import FrameConverter, join_cameras, optical_pose, require_own_camera, same_camera
 from gausslite_ros.messages import TransformMessage, camera_of, frame_name, stamp_ns
 from gausslite_ros.topics import camera_name, is_aligned
 from gausslite_ros.transforms import MAX_GAP_S, TransformWindow, transforms_of
@@ -32,7 +32,8 @@ _PLACE = "topics"
 class LiveCounters:
     """Colour images received, and what became of them; those that wait are not counted yet.
 
-    not_ready: camera_info or the transform to the depth camera was missing. overflow: too many images were waiting.
+    not_ready: camera_info or the transform to the depth camera was missing, or the camera changed.
+    overflow: too many images were waiting.
     clock_jumps: times that the stamps went back, after which all that waited was dropped as out of order.
     """
 
@@ -120,16 +121,32 @@ class LiveFrames:
         del self._depths[:-_MAX_IMAGES]
 
     def add_colour_info(self, message: Any) -> None:
-        """Add the camera_info of colour; the first one counts."""
-        self._colour_info = message if self._colour_info is None else self._colour_info
+        """Add the camera_info of colour; the first one counts until another states another camera."""
+        if self._is_new_camera(self._colour_info, message, self._options.color):
+            self._colour_info = message
 
     def add_depth_info(self, message: Any) -> None:
-        """Add the camera_info of depth; the first one counts. Aligned depth needs none."""
-        self._depth_info = message if self._depth_info is None else self._depth_info
+        """Add the camera_info of depth, as that of colour. Aligned depth needs none."""
+        if self._is_new_camera(self._depth_info, message, self._options.depth):
+            self._depth_info = message
 
     def add_transforms(self, messages: Iterable[TransformMessage], static: bool) -> None:
         """Add the transforms of one tf message; static: of /tf_static. Raises DatasetError for too long names."""
         self._transforms.add(transforms_of(messages, static))
+
+    def _is_new_camera(self, held: Any, message: Any, topic: str) -> bool:
+        """Return True for the first camera_info and for that of another camera; images from before it are dropped."""
+        new = _camera_or_none(message, topic)
+        known = None if held is None else _camera_or_none(held, topic)
+        if held is not None and (new is None or (known is not None and same_camera(known, new))):
+            return False
+        self._converter = None
+        waiting = len(self._pending)
+        if held is not None:
+            self._pending = deque(image for image in self._pending if image.time_ns >= stamp_ns(message.header))
+        for _ in range(waiting - len(self._pending)):
+            self._count("not_ready")
+        return True
 
     def _clear(self) -> None:
         """Drop images, depths and moving transforms, which have stamps of another clock."""
@@ -253,6 +270,13 @@ class LiveFrames:
 
     def _count(self, name: str) -> None:
         self._counters = replace(self._counters, **{name: getattr(self._counters, name) + 1})
+
+
+def _camera_or_none(info: Any, image_topic: str) -> FolderCamera | None:
+    try:
+        return _camera(info, image_topic)
+    except InvalidInputError:
+        return None
 
 
 def _camera(info: Any, image_topic: str) -> FolderCamera:

@@ -341,3 +341,27 @@ def test_a_static_transform_that_is_stated_in_two_ways_is_reported(tmp_path: Pat
     assert BagSource(BagAddress(path)).notes == (
         f"tf: static transforms are stated in several ways, the last one is used: base_link → {OPTICAL}",
     )
+
+
+def change_camera(at: int, *intrinsics: float) -> Callable[[Writer], None]:
+    """Write a camera_info with other intrinsics at the time of frame `at`."""
+    info = load_write_bag().camera_info(time_of(at), OPTICAL, intrinsics, SIZE)
+    return lambda bag: bag.write("/camera/color/camera_info", INFO, time_of(at), info)
+
+
+@pytest.mark.parametrize("name", ["b.bag", "b", "b.mcap"])
+def test_images_after_the_camera_has_changed_are_left_out_with_a_message(tmp_path: Path, name: str) -> None:
+    path = write_small_bag(tmp_path / name, extra=change_camera(5, 45.0, 45.0, 15.5, 11.5))
+    address = BagAddress.parse(str(path))
+    assert address is not None
+    source = BagSource(address)
+    require_small_bag(frames_of(path), count=5)
+    (note,) = source.notes
+    assert note.startswith(f"{FRAMES - 5} of {FRAMES} colour images are skipped: /camera/color/camera_info states")
+    assert "fx 30.0" in note
+    assert "fx 45.0" in note
+
+
+def test_intrinsics_that_autofocus_changes_slightly_are_those_of_one_camera(tmp_path: Path) -> None:
+    path = write_small_bag(tmp_path / "b.mcap", extra=change_camera(5, 30.1, 30.1, 15.5, 11.5))
+    require_small_bag(frames_of(path))

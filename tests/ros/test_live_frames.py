@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from robot_bag import BASE, COLOUR, COLOUR_INFO, DELAYS_NS, DEPTH, arrivals, feed, load_write_bag, write_robot_bag
 from tum_recording import write_home
@@ -180,3 +181,21 @@ def test_images_that_are_a_little_late_are_left_out(tmp_path: Path) -> None:
     assert [frame.capture_time_ns for frame in frames] == sorted(frame.capture_time_ns for frame in frames)
     assert live.counters.out_of_order == 20
     assert live.counters.clock_jumps == 0
+
+
+def test_images_after_a_change_of_the_camera_have_the_new_one(tmp_path: Path) -> None:
+    options = write_robot_bag(tmp_path / "b.mcap")
+    live, frames, infos = LiveFrames(options), [], []
+    for topic, message in arrivals(tmp_path / "b.mcap", {}):
+        infos += [message] if topic == COLOUR_INFO else []
+        feed(live, options, topic, message)
+        frames += live.take()
+        if topic == COLOUR and live.counters.received == 4:
+            changed = copy.deepcopy(infos[0])
+            changed.header.stamp, changed.k = message.header.stamp, np.array(changed.k) * np.where(np.arange(9), 1, 1.5)
+            live.add_colour_info(changed)
+    focal_px = [round(frame.camera.fx_px / frames[0].camera.fx_px, 3) for frame in frames]
+    assert sorted(focal_px) == focal_px
+    assert set(focal_px) == {1.0, 1.5}
+    counters = live.counters
+    assert counters.received == counters.converted + counters.without_depth + counters.not_ready
