@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from gausslite.calibration.camera_estimate import estimate_camera
-from gausslite.calibration.consistency import find_contradiction
+from gausslite.calibration.consistency import Contradiction, find_contradiction
 from gausslite.calibration.errors import estimate_pose_exposure_prior
 from gausslite.calibration.registration import find_registration
 from gausslite.datasets.corrected import CorrectedSource
@@ -66,8 +66,8 @@ class Calibration:
     """A source with registered depth and corrected images, what was applied to it, and the errors of its poses.
 
     registration: None if depth is used as recorded. correction: the identity if images are. evidence: of each value
-    that the user did not state. notes: on poses or depth that contradict the images; then nothing is estimated from
-    pairs of frames.
+    that the user did not state. notes: on poses or depth that contradict the images; if they do everywhere, nothing is
+    estimated from pairs of frames.
     """
 
     source: Source
@@ -87,8 +87,8 @@ def calibrate(
     that contradict the images, PoseError, InvalidInputError.
     """
     stated = stated or StatedValues()
-    notes = () if stated.checked else _contradictions(source, stated.force)
-    if notes:
+    contradiction = None if stated.checked else _contradiction(source, stated.force)
+    if contradiction is not None and not contradiction.in_places:
         correction, prior = stated.correction, stated.pose_prior
         lens = stated.lens or (source.lens if source.depth_registered else None)
         stated = replace(
@@ -114,24 +114,26 @@ def calibrate(
     prior = stated.pose_prior
     if prior is None:
         prior = _pose_prior_of(source, decide)
-    return Calibration(source, registration, correction, prior, tuple(found), notes)
+    return Calibration(
+        source, registration, correction, prior, tuple(found), () if contradiction is None else (str(contradiction),)
+    )
 
 
-def _contradictions(source: Source, force: bool) -> tuple[str, ...]:
-    """Return a note on poses or depth that contradict the images, with `force` or if only an assumed unit is wrong.
+def _contradiction(source: Source, force: bool) -> Contradiction | None:
+    """Return how poses or depth contradict the images: in some places, with `force`, or by an assumed unit alone.
 
     Otherwise raises DatasetError.
     """
     if source.poses_exact or source.camera_ideal:
-        return ()
+        return None
     found = find_contradiction(source)
-    if found is None:
-        return ()
+    if found is None or found.in_places:
+        return found
     way = "state it as scale in cam_params.json, or as depth_unit=Xmm in the address of a bag"
     if found.only_unit and not source.depth_unit_stated:
-        return (f"{found}; the files do not state the unit of depth: {way}",)
+        return replace(found, text=f"{found}; the files do not state the unit of depth: {way}")
     if force:
-        return (str(found),)
+        return found
     advice = way if found.only_unit else "correct the recording"
     raise DatasetError(f"{source.name}: {found}; {advice}, or map it as it is with --set force=true")
 

@@ -2,7 +2,7 @@
 
 Features of two frames and measured depth show how the camera moved. Where the stated poses move the points of the first
 frame elsewhere, other conventions are tried: the inverse poses, other axes of the camera, another order of the
-quaternion, another clock, another unit of depth.
+quaternion, another clock, another unit of depth, another focal length.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -36,6 +37,12 @@ also with unregistered depth; poses of another convention 0.16 to 1.8, and the r
 _CONVENTION_GAIN, _SCALE_GAIN = 0.4, 0.7
 _LEAST_FACTOR = 1.5
 """Depth counts as wrong beyond this factor; right recordings reach 1.2."""
+_JUMP = 0.03
+"""A share of the image's width. Points of consecutive frames of real recordings are off by 0.005, of every fourth frame
+with unregistered depth by 0.023; a jump by 15 cm at a distance of 2 m by 0.032."""
+_JUMP_RATIO, _LEAST_JUMP_M, _LEAST_JUMP_RAD, _MAX_JUMPS = 2.0, 0.05, 0.1, 6
+"""A step of the poses is compared with the images if it is by this ratio longer than the median and not small."""
+_MAX_FOCAL_FACTOR, _FOCAL_FACTORS = 3.0, 25
 _MIN_CLOCK_S, _MAX_CLOCK_S = 0.1, 3.0
 """A smaller difference of the clocks is a time offset, which `estimate_camera` finds."""
 
@@ -59,14 +66,29 @@ class _Pair:
 
         NaN where neither the images nor the poses move enough, and for unknown motions.
         """
+        return self._errors_px(motions)[1]
+
+    def contradicts(self, motion: Float64[ndarray, "4 4"]) -> bool:
+        """True if the image shows a clearly different motion of the points."""
+        error_px, share = self._errors_px(motion[None])
+        return bool(error_px[0] > _JUMP * self.camera.width_px and share[0] > _RIGHT)
+
+    def _errors_px(self, motions: Float64[ndarray, "h 4 4"]) -> tuple[Float64[ndarray, " h"], Float64[ndarray, " h"]]:
+        """Return the median errors in pixels and as shares, see `errors`."""
         points = self.matched.points_m @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
         # points behind the camera lie far away
         z_m = np.maximum(points[..., 2], _LEAST_DEPTH_M)
         predicted = np.stack(self.camera.pixels(points[..., 0] / z_m, points[..., 1] / z_m), axis=-1) - 0.5
         largest_px = np.maximum(_median_distance(predicted, self.matched.reference_px), self.motion_px)
         largest_px[largest_px < _MIN_MOTION * self.camera.width_px] = np.nan
-        errors: Float64[ndarray, " h"] = _median_distance(predicted, self.matched.pixels) / largest_px
-        return errors
+        errors_px = _median_distance(predicted, self.matched.pixels)
+        return errors_px, errors_px / largest_px
+
+    def with_focal_length(self, factor: float) -> _Pair:
+        """Return the pair of a camera whose focal length is multiplied."""
+        camera = replace(self.camera, fx_px=factor * self.camera.fx_px, fy_px=factor * self.camera.fy_px)
+        points_m = self.matched.points_m * (1 / factor, 1 / factor, 1.0)
+        return replace(self, matched=replace(self.matched, points_m=points_m), camera=camera)
 
     def scale(self, motion: Float64[ndarray, "4 4"]) -> float:
         """Return the factor of the motion's translation that fits the points best; NaN if they do not show it."""
@@ -123,11 +145,12 @@ def _errors(readings: Sequence[_Reading], pairs: Sequence[_Pair]) -> Float64[nda
 class Contradiction:
     """How poses or depth contradict the images, and what would agree, as one line.
 
-    only_unit: the stated poses and another unit of depth would agree.
+    only_unit: the stated poses and another unit of depth would agree. in_places: other frames do not contradict.
     """
 
     text: str
     only_unit: bool = False
+    in_places: bool = False
 
     def __str__(self) -> str:
         return self.text
@@ -138,17 +161,20 @@ def find_contradiction(source: Source) -> Contradiction | None:
 
     Frames that cannot be read are ignored. Takes about a second. Raises DatasetError, PoseError.
     """
-    pairs = _matched_pairs(source)
-    if len(pairs) < _MIN_PAIRS:
-        return None
-    trajectory = source.trajectory()
+    pairs, trajectory = _matched_pairs(source), source.trajectory()
+    found = _find_everywhere(trajectory, pairs) if len(pairs) >= _MIN_PAIRS else None
+    return found or _find_in_places(source, trajectory.T_world_camera, pairs)
+
+
+def _find_everywhere(trajectory: Trajectory, pairs: Sequence[_Pair]) -> Contradiction | None:
+    """Return the contradiction of most pairs; None without one."""
     stated = _Reading("", _motions(trajectory.T_world_camera, pairs))
     error = float(_errors([stated], pairs)[0])
     depth = _scaled_to_agree(stated, pairs, error)
     if not math.isfinite(error) or (error < _DOUBTFUL and depth is None):
         return None
     off = f"points of {len(pairs)} pairs of frames are off by {error:.0%} of their motion"
-    best = _best_reading(list(_readings(trajectory, pairs)), pairs, error, depth)
+    best = _best_reading(list(_readings(trajectory, pairs)), pairs, error, depth) or _focal_length(stated, pairs, error)
     if best is not None:
         only_unit = depth is not None and best == depth.words
         return Contradiction(f"poses and depth do not fit the images ({off}); {best} would agree", only_unit)
@@ -158,6 +184,60 @@ def find_contradiction(source: Source) -> Contradiction | None:
         f"poses and depth do not fit the images ({off}); no other convention, clock or unit of depth agrees; "
         "do they belong to this recording and this camera?"
     )
+
+
+def _find_in_places(
+    source: Source, T_world_camera: Float64[ndarray, "n 4 4"], pairs: Sequence[_Pair]
+) -> Contradiction | None:
+    """Return the contradiction of some pairs, as where poses jump or a tracker or a camera stands still; None without.
+
+    Beside the given pairs, steps of the poses that are far longer than most, and some without motion, are tried.
+    """
+    images = _rectified(source)
+    wrong = [pair for pair in pairs if pair.contradicts(_motions(T_world_camera, [pair])[0])]
+    for first in _unusual_steps(T_world_camera):
+        with suppress(DatasetError, PoseError):  # a frame that cannot be read is reported when it is mapped
+            pair = _match(images, first, first + 1)
+            if pair is not None and pair.contradicts(_motions(T_world_camera, [pair])[0]):
+                wrong.append(pair)
+    if not wrong:
+        return None
+    pair, numbers = min(wrong, key=lambda pair: pair.second - pair.first), source.indices()
+    stated_m = float(np.linalg.norm(_motions(T_world_camera, [pair])[0, :3, 3]))
+    shown_m = float(np.linalg.norm(pair.matched.T_current_reference[:3, 3]))
+    more = f", and in {len(wrong) - 1} or more other places" if len(wrong) > 1 else ""
+    return Contradiction(
+        f"poses do not fit the images from frame {numbers[pair.first]} to {numbers[pair.second]}{more}: they move by "
+        f"{stated_m:.2f} m, the images show {shown_m:.2f} m; was tracking lost there? The map may show things twice",
+        in_places=True,
+    )
+
+
+def _unusual_steps(T_world_camera: Float64[ndarray, "n 4 4"]) -> list[int]:
+    """Return the positions before steps that are far longer than most, and some before no motion."""
+    if len(T_world_camera) < 3:
+        return []
+    steps = np.linalg.inv(T_world_camera[:-1]) @ T_world_camera[1:]
+    length_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    angle_rad = np.arccos(np.clip((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+    excess = np.zeros(len(steps))
+    for values, least in ((length_m, _LEAST_JUMP_M), (angle_rad, _LEAST_JUMP_RAD)):
+        excess = np.maximum(excess, values / max(_JUMP_RATIO * float(np.median(values)), least))
+    longest = np.argsort(-excess, kind="stable")[:_MAX_JUMPS]
+    still = np.flatnonzero((T_world_camera[1:] == T_world_camera[:-1]).all(axis=(1, 2)))
+    spread = still[np.linspace(0, max(len(still) - 1, 0), min(len(still), _MAX_JUMPS)).round().astype(int)]
+    return sorted({*longest[excess[longest] > 1].tolist(), *spread.tolist()})
+
+
+def _focal_length(stated: _Reading, pairs: Sequence[_Pair], error: float) -> str | None:
+    """Return the factor of the focal length, in words, that lowers the error far; None without one."""
+    factors = np.geomspace(1 / _MAX_FOCAL_FACTOR, _MAX_FOCAL_FACTOR, _FOCAL_FACTORS)
+    errors = [float(_errors([stated], [pair.with_focal_length(factor) for pair in pairs])[0]) for factor in factors]
+    if min(errors) > min(_RIGHT, _CONVENTION_GAIN * error):
+        return None
+    factor = float(factors[int(np.argmin(errors))])
+    change = f"multiplied by {factor:.2g}" if factor > 1 else f"divided by {1 / factor:.2g}"
+    return f"the camera's focal length {change} (intrinsics of another size or camera)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,24 +282,32 @@ def _scaled_to_agree(reading: _Reading, pairs: Sequence[_Pair], error: float) ->
 
 def _matched_pairs(source: Source) -> list[_Pair]:
     """Return pairs of frames, spread over the source, between which the points move by a part of the image."""
-    lens = source.lens
-    images: Source = source if lens is None else CorrectedSource(source, CameraCorrection(lens))
-    size, count, gap = downscaled_size(source.camera), len(source), 2
+    images, count, gap = _rectified(source), len(source), 2
     pairs = []
     for first in sorted({round(position) for position in np.linspace(0, max(count - 2, 0), _MAX_PAIRS)}):
-        second = min(first + gap, count - 1)
         try:
-            reference, current = images.frame(first, size), images.frame(second, size)
+            pair = _match(images, first, min(first + gap, count - 1))
         except (DatasetError, PoseError):
             continue
-        matched = relative_pose(detect_features(reference), detect_features(current), reference.camera)
-        if matched is None:
+        if pair is None:
             gap = max(gap // 2, 1)
             continue
-        pairs.append(_Pair(first, second, matched, reference.camera))
-        if pairs[-1].motion_px < _SMALL_MOTION * reference.camera.width_px:
+        pairs.append(pair)
+        if pair.motion_px < _SMALL_MOTION * pair.camera.width_px:
             gap = min(2 * gap, _MAX_GAP)
     return pairs
+
+
+def _rectified(source: Source) -> Source:
+    return source if source.lens is None else CorrectedSource(source, CameraCorrection(source.lens))
+
+
+def _match(images: Source, first: int, second: int) -> _Pair | None:
+    """Return the pair of these positions; None without enough common points. Raises DatasetError, PoseError."""
+    size = downscaled_size(images.camera)
+    reference, current = images.frame(first, size), images.frame(second, size)
+    matched = relative_pose(detect_features(reference), detect_features(current), reference.camera)
+    return None if matched is None else _Pair(first, second, matched, reference.camera)
 
 
 def _motions(T_world_camera: Float64[ndarray, "n 4 4"], pairs: Sequence[_Pair]) -> Float64[ndarray, "p 4 4"]:

@@ -170,3 +170,38 @@ def test_a_wrong_unit_that_the_files_do_not_state_is_noted(recording: Recording)
 @pytest.mark.parametrize("name", ["tum_fr1", "redkitchen", "hololens_kitchenette"])
 def test_real_recordings_agree(shared_dir, name: str) -> None:
     assert find_contradiction(open_source(str(shared_dir / "data" / name))) is None
+
+
+def test_another_focal_length_is_named(recording: Recording) -> None:
+    camera = recording.frames[0].camera
+    wrong = replace(camera, fx_px=2.0 * camera.fx_px, fy_px=2.0 * camera.fy_px)
+    recording.frames = [replace(frame, camera=wrong) for frame in recording.frames]
+    with pytest.raises(DatasetError, match=r"focal length divided by (1\.9|2|2\.1) \(intrinsics of another size"):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def jump(poses: Poses) -> Poses:
+    moved = poses.copy()
+    moved[7:, 0, 3] += 0.4
+    return moved
+
+
+def spikes(poses: Poses) -> Poses:
+    moved = poses.copy()
+    moved[[3, 10], 1, 3] += 0.4
+    return moved
+
+
+def standstill(poses: Poses) -> Poses:
+    still = poses.copy()
+    still[9:] = poses[9]
+    return still
+
+
+@pytest.mark.parametrize("change", [jump, spikes, standstill])
+def test_poses_that_do_not_fit_in_places_are_noted(home: Source, change: Callable[[Poses], Poses]) -> None:
+    recording = Recording(home, list(range(0, 42, 3)))
+    recording.poses = change(recording.poses)
+    [note] = calibrate(recording, NOTHING_ESTIMATED).notes
+    assert note.startswith("poses do not fit the images from frame ")
+    assert "was tracking lost there?" in note
