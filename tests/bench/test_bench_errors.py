@@ -10,14 +10,9 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.recording import CameraCorrection
-from gausslite.mission.settings import MissionSettings
-from gausslite_bench.camera_study import CameraStudy
 from gausslite_bench.cli.argument_types import read_counts, read_image_sizes, read_percentages
-from gausslite_bench.quality.home_tasks import HOME_TASKS
 from gausslite_bench.raster.procedural_room import seed_rows
 from gausslite_bench.raster.region_costs import Layout, regions_of_share
-from gausslite_bench.task_change import TaskChange
 from gausslite_bench.team.frame_errors import FrameError
 from gausslite_bench.team.scenes import HomeTeamPlan
 
@@ -30,12 +25,8 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "loop", "server")
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("camera", "--pair", "home-1"), "one task"),
-        (("camera", "--speeds", "5000"), "1 to 1000"),
-        (("camera", "--shutter", "-3"), "readout"),
         (("chaos", "--kills", "0"), "--kills"),
         (("chaos", "--agents", "33"), "--agents"),
-        (("codec", "--pairs", "home-9-search"), "home-9-search"),
         (("fuzz", "--corpus", "."), "expected folders of messages"),
         (("loop", "--loop", "1"), "--loop: expected at least 2, got 1"),
         ((*LOOP, "--unlimited", "9"), "--unlimited: expected regions"),
@@ -55,11 +46,6 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "loop", "server")
         (("server", "--held", "many"), "--held"),
         (("server", "--agents", "0"), "--agents"),
         (("server", "--seconds", "0"), "--seconds"),
-        (("task-change", "--rate", "0"), "rate: expected 0.01 to 1000 Hz, got 0.0"),
-        (("task-change", "--rate", "nan"), "rate: expected 0.01 to 1000 Hz, got nan"),
-        (("task-change", "--rate=-4"), "rate: expected 0.01 to 1000 Hz, got -4.0"),
-        (("task-change", "--changes", ""), "such as home-4-manipulation:home-4-navigation, got none"),
-        (("task-change", "--before", "0"), "task-change before: expected at least 1, got 0"),
         (("team", "--homes", "9"), "homes"),
         (("team", "--homes", "x"), "homes"),
         (("team", "--team-sizes", "7"), "agents"),
@@ -104,16 +90,9 @@ def test_a_wrong_list_of_numbers_is_refused(
             read(text)
 
 
-def test_a_change_is_between_two_tasks_of_one_home() -> None:
-    for text in ("home-8-search", "home-8-search:home-7-search", "home-8-search:home-8-search", ""):
-        with pytest.raises(InvalidInputError, match="task change"):
-            TaskChange.parse(text)
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: CameraStudy(HOME_TASKS[0], CameraCorrection(time_offset_s=0.01), MissionSettings()), "time offset"),
         (lambda: HomeTeamPlan(1, 5), "agents"),
         (lambda: FrameError(shift_m=-1.0), "frame error"),
         (lambda: seed_rows(5), "at least 12, one per view, got 5"),

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gausslite.config.command_parser import CommandParser
-from gausslite_bench.cli.budget import configure_budget
-from gausslite_bench.cli.camera import configure_camera
 from gausslite_bench.cli.chaos import configure_chaos
-from gausslite_bench.cli.codec import configure_codec
 from gausslite_bench.cli.fuzz import configure_fuzz
 from gausslite_bench.cli.gpu import configure_gpu
 from gausslite_bench.cli.loop import configure_loop
@@ -17,9 +14,7 @@ from gausslite_bench.cli.perception import configure_perception
 from gausslite_bench.cli.places import configure_places
 from gausslite_bench.cli.quality import configure_ablation, configure_quality
 from gausslite_bench.cli.raster import configure_raster
-from gausslite_bench.cli.registration import configure_registration
 from gausslite_bench.cli.server import configure_server
-from gausslite_bench.cli.task_change import configure_task_change
 from gausslite_bench.cli.team import configure_team
 from gausslite_bench.cli.view import configure_view
 
@@ -82,24 +77,6 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str, str]] = {
         "Map scenes while enabling the components of the method one after the other, and score the maps on held-out "
         "views.",
     ),
-    "budget": (
-        configure_budget,
-        "gain of the task policy against Gaussians, image size and iterations",
-        "Map scenes with the task policy and with uniform mapping at several budgets. The table, and with the extra "
-        "plots a figure, show the gain in the region and over the full image.",
-    ),
-    "camera": (
-        configure_camera,
-        "map quality with rolling shutter, motion blur and lens distortion",
-        "Map one walk with an ideal camera and with a real one at several angular speeds: uncorrected, corrected with "
-        "the true values, and corrected with estimates.",
-    ),
-    "codec": (
-        configure_codec,
-        "size and loss of the subset codec beside other formats",
-        "Map scenes and encode the region and the whole map: bytes a Gaussian, lost ROI PSNR, and time to encode and "
-        "decode.",
-    ),
     "team": (
         configure_team,
         "quality of the fused map of several agents, by strategy and policy",
@@ -112,23 +89,12 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str, str]] = {
         "Serve synthetic maps on the page of `gausslite view`, open it in a headless Chromium with software rendering, "
         "and measure the time until the map is drawn and the frame rates at rest and while the camera moves.",
     ),
-    "task-change": (
-        configure_task_change,
-        "recovery of map quality after a task change",
-        "Change the task during a mission. Compare the map with one restarted at the change and with one that had the "
-        "new task from the start.",
-    ),
     "places": (
         configure_places,
         "frames of a sequence that are localised in a saved map",
         "Localise each frame in the map of a run, from any start. Report how many poses are right, wrong and refused, "
         "the time, and after how many frames a run is localised. With mirrored images, or in another place, every pose "
         "is wrong. --loops presents the frames as keyframes that may close a loop instead.",
-    ),
-    "registration": (
-        configure_registration,
-        "map quality with a given registration of depth to colour",
-        "Map all but every eighth frame of a sequence with --register-depth and score the map on the held-out frames.",
     ),
 }
 

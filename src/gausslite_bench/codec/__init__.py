@@ -1,1 +1,0 @@
-"""Size and loss of the subset codec beside other formats."""
