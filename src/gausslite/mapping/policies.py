@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.settings import (
@@ -22,7 +23,6 @@ from gausslite.mapping.settings import (
     KeyframeSettings,
     MapperSettings,
     OptimizationSettings,
-    SaturationSettings,
     SeedingSettings,
 )
 from gausslite.render.rasterizer import AdamSettings, LossWeights
@@ -95,30 +95,17 @@ def paper_policy() -> MapperSettings:
     The scene is static: pixels of things that move are used like all others.
     Poses are an external input (III-C): combine this policy with an exact `MapperSettings.pose_prior`, the default.
     """
-    return MapperSettings(
+    published = MapperSettings(
         seeding=SeedingSettings(
-            roi_min_alpha=0.6,
-            roi_pixels_per_gaussian=1.0,
-            fill_sparse_roi=False,
-            min_density_ratio=1.0,
-            background_share=0.0,
-            fill_depth=False,
+            roi_min_alpha=0.6, roi_pixels_per_gaussian=1.0, fill_sparse_roi=False, min_density_ratio=1.0
         ),
-        keyframes=KeyframeSettings(
-            long_term_keyframes=0, roi_context_weight=0.0, pose_updates_per_frame=0, depth_edge_px=0, rotates=False
-        ),
+        keyframes=KeyframeSettings(pose_updates_per_frame=0),
         optimization=OptimizationSettings(
-            active_views=1,
-            active_phase=ActivePhase.ACTIVE_ONLY,
-            loss=LossWeights(),
-            adam=AdamSettings(),
-            decay_after_updates=math.inf,
-            ema_updates=0.0,
+            active_phase=ActivePhase.ACTIVE_ONLY, loss=LossWeights(), adam=AdamSettings()
         ),
-        saturation=SaturationSettings(max_released=0.0),
         density=DensitySettings(max_growth=1.0),
-        leaves_out_moving=False,
     )
+    return disable(published, EXTENSION_FLAGS)
 
 
 TASK = "task"
@@ -148,71 +135,26 @@ def follows_task(name: str) -> bool:
     return policy(name).components.follow_task
 
 
-PAPER_FLAGS = ("sb", "mvo", "roi", "sis", "gfd")
-"""The paper's components (Sec. III-C, III-D), in the order of its ablation (Table III)."""
-
-
-def _without_long_term_keyframes(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, keyframes=replace(settings.keyframes, long_term_keyframes=0))
-
-
-def _without_roi_context(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, keyframes=replace(settings.keyframes, roi_context_weight=0.0))
-
-
-def _without_depth_edge_mask(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, keyframes=replace(settings.keyframes, depth_edge_px=0))
-
-
-def _without_depth_fill(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, seeding=replace(settings.seeding, fill_depth=False))
-
-
-def _without_background_reserve(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, seeding=replace(settings.seeding, background_share=0.0))
-
-
-def _without_ema(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, optimization=replace(settings.optimization, ema_updates=0.0))
-
-
-def _without_lr_decay(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, optimization=replace(settings.optimization, decay_after_updates=math.inf))
-
-
-def _without_saturation(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, saturation=replace(settings.saturation, max_released=0.0))
-
-
-def _without_motion_mask(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, leaves_out_moving=False)
-
-
-def _without_view_rotation(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, keyframes=replace(settings.keyframes, rotates=False))
-
-
-def _without_active_views(settings: MapperSettings) -> MapperSettings:
-    return replace(settings, optimization=replace(settings.optimization, active_views=1))
-
-
-EXTENSION_FLAGS: dict[str, Callable[[MapperSettings], MapperSettings]] = {
-    "long-term-keyframes": _without_long_term_keyframes,
-    "roi-context": _without_roi_context,
-    "depth-edge-mask": _without_depth_edge_mask,
-    "depth-fill": _without_depth_fill,
-    "background-reserve": _without_background_reserve,
-    "ema": _without_ema,
-    "lr-decay": _without_lr_decay,
-    "saturation": _without_saturation,
-    "motion-mask": _without_motion_mask,
-    "view-rotation": _without_view_rotation,
-    "active-views": _without_active_views,
+_PARTS: dict[str, tuple[str, float | bool]] = {
+    **{name: (f"components.{name}", False) for name in ("sb", "mvo", "roi", "sis", "gfd")},
+    "long-term-keyframes": ("keyframes.long_term_keyframes", 0),
+    "roi-context": ("keyframes.roi_context_weight", 0.0),
+    "depth-edge-mask": ("keyframes.depth_edge_px", 0),
+    "depth-fill": ("seeding.fill_depth", False),
+    "background-reserve": ("seeding.background_share", 0.0),
+    "ema": ("optimization.ema_updates", 0.0),
+    "lr-decay": ("optimization.decay_after_updates", math.inf),
+    "saturation": ("saturation.max_released", 0.0),
+    "motion-mask": ("leaves_out_moving", False),
+    "view-rotation": ("keyframes.rotates", False),
+    "active-views": ("optimization.active_views", 1),
 }
-"""Extensions of the paper's method that can be disabled, in the order of the ablation in bench/results."""
+"""The field of `MapperSettings` that each part of the task policy has, and the field's value without the part."""
 
-ABLATION_FLAGS = (*PAPER_FLAGS, *EXTENSION_FLAGS)
-"""All names that `disable` accepts."""
+ABLATION_FLAGS = tuple(_PARTS)
+"""All names that `disable` accepts, in the order of the ablation in bench/results."""
+PAPER_FLAGS, EXTENSION_FLAGS = ABLATION_FLAGS[:5], ABLATION_FLAGS[5:]
+"""The paper's components (Sec. III-C, III-D) in the order of its ablation (Table III), and the extensions."""
 
 
 def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
@@ -220,8 +162,14 @@ def disable(settings: MapperSettings, names: Collection[str]) -> MapperSettings:
     unknown = sorted(set(names) - set(ABLATION_FLAGS))
     if unknown:
         raise InvalidInputError(f"disable: expected names among {', '.join(ABLATION_FLAGS)}, got {', '.join(unknown)}")
-    off = dict.fromkeys((name for name in PAPER_FLAGS if name in names), False)
-    settings = replace(settings, components=replace(settings.components, **off))
-    for name in (flag for flag in EXTENSION_FLAGS if flag in names):
-        settings = EXTENSION_FLAGS[name](settings)
+    for name in names:
+        settings = _with_field(settings, *_PARTS[name])
     return settings
+
+
+def _with_field(settings: MapperSettings, path: str, value: Any) -> MapperSettings:
+    """Return the settings with another value of "field" or of "section.field"."""
+    section, _, name = path.rpartition(".")
+    if section:
+        name, value = section, replace(getattr(settings, section), **{name: value})
+    return replace(settings, **{name: value})
