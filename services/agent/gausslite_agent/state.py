@@ -280,7 +280,7 @@ class WorkerStatus:
         """One line for each kind of work that was dropped for lack of time or space."""
         counts = (
             (self.dropped, "frames were dropped"),
-            (self.under_trained, "frames trained fewer iterations than min-iterations"),
+            (self.under_trained, "frames trained fewer iterations than they should"),
             (self.publishing_skipped, "frames published their changes with a later frame"),
             (self.seeding_skipped, "frames were not seeded"),
         )

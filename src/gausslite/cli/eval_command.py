@@ -67,9 +67,6 @@ class EvalOptions:
         metavar="N",
         low=1,
     )
-    fit_views: bool | None = option(
-        None, "fit pose and exposure of each view before scoring, for real cameras (default: as poses)"
-    )
     poses: PoseMode | None = option(
         None,
         f"given: score views from the given poses; refine: fit each view first; track: also start from {TRAJECTORY} "
@@ -169,7 +166,6 @@ class _Conditions:
         lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights, options.threads)
         report, from_report = read_report(options.map.parent), []
         registration, correction = options.register_depth, options.camera_correction
-        fit_views = options.fit_views
         if registration is None and "colour_camera" in report:
             registration = read_registration_or_auto(str(report["colour_camera"] or NONE))
             from_report += [f"register-depth {registration}"] if registration != NONE else []
@@ -179,8 +175,8 @@ class _Conditions:
         poses = options.poses
         if poses is None and report.get("view_error") is not None:
             poses = PoseMode.TRACK if report.get("poses") == PoseMode.TRACK else PoseMode.REFINE
-            from_report += [f"--poses {poses}"] if fit_views is None or poses == PoseMode.TRACK else []
-        fit_views = poses in (PoseMode.REFINE, PoseMode.TRACK) if fit_views is None else fit_views
+            from_report.append(f"--poses {poses}")
+        fit_views = poses in (PoseMode.REFINE, PoseMode.TRACK)
         if from_report:
             print_message(f"from the report next to {options.map.name}: {' '.join(from_report)}")
         # views are scored from the poses as they are, or fitted; `map` has compared them with the images

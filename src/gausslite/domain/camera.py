@@ -360,12 +360,3 @@ class Lens:
             f"lens {self}: expected a model that can be inverted over the image, "
             f"got none at the slope ({x[worst]:.2f}, {y[worst]:.2f})"
         )
-
-
-class MotionModel(StrEnum):
-    """What predicts the motion since the last frame where features do not."""
-
-    VELOCITY = "velocity"
-    """The velocity between the last two frames."""
-    ODOMETRY = "odometry"
-    """The motion between the poses of the frames."""

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from gausslite.calibration.alignment import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
 from gausslite.calibration.features import FeatureView, detect_features, relative_pose
-from gausslite.domain.camera import Camera, CameraMotion, MotionModel
+from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import (
@@ -133,7 +133,6 @@ class TrackingMethod(StrEnum):
 @dataclass(frozen=True, slots=True, eq=False)
 class _LastFrame:
     time_ns: int
-    T_world_odometry: Float64[ndarray, "4 4"]
     T_world_camera: Float64[ndarray, "4 4"]
     features: FeatureView
 
@@ -141,18 +140,13 @@ class _LastFrame:
 class CameraTracker:
     """Tracks one camera. Call `track` with each frame, map it, then call `confirm` with the pose it was mapped with.
 
-    The first frame's own pose is the start, so the map lies in its world frame; of later frames, only
-    MotionModel.ODOMETRY uses the pose. Not thread-safe.
+    The first frame's own pose is the start, so the map lies in its world frame; poses of later frames are not used. Not
+    thread-safe.
     """
 
-    def __init__(
-        self,
-        render: Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering],
-        motion: MotionModel = MotionModel.VELOCITY,
-    ) -> None:
+    def __init__(self, render: Callable[[Camera, Float64[ndarray, "4 4"], CameraMotion | None], Rendering]) -> None:
         """Render: renders the map from T_world_camera, for the camera's motion while a frame was exposed."""
         self._render = render
-        self._motion = motion
         self._keyframes = KeyframeIndex()
         self._last: _LastFrame | None = None
         self._velocity = np.zeros(6)
@@ -181,7 +175,7 @@ class CameraTracker:
             self._keyframes.restart()
         self._counts[tracked_by] += 1
         T_world_camera = orthonormal(T_world_camera)
-        self._pending = _LastFrame(frame.capture_time_ns, frame.T_world_camera, T_world_camera, features)
+        self._pending = _LastFrame(frame.capture_time_ns, T_world_camera, features)
         return T_world_camera
 
     def confirm(self, T_world_camera: Float64[ndarray, "4 4"], anchor: int = 0) -> None:
@@ -189,7 +183,7 @@ class CameraTracker:
         pending, last = self._pending, self._last
         if pending is None:
             return
-        current = _LastFrame(pending.time_ns, pending.T_world_odometry, orthonormal(T_world_camera), pending.features)
+        current = _LastFrame(pending.time_ns, orthonormal(T_world_camera), pending.features)
         if last is not None and current.time_ns > last.time_ns:
             step = twist_of(inverse(last.T_world_camera) @ current.T_world_camera)
             self._velocity = step / (1e-9 * (current.time_ns - last.time_ns))
@@ -223,10 +217,7 @@ class CameraTracker:
         return self._relocalise(frame, features)
 
     def _predict(self, frame: Frame, last: _LastFrame) -> Float64[ndarray, "4 4"]:
-        if self._motion is MotionModel.ODOMETRY:
-            T_last_frame = inverse(last.T_world_odometry) @ frame.T_world_camera
-        else:
-            T_last_frame = transform_of(self._velocity * 1e-9 * (frame.capture_time_ns - last.time_ns))
+        T_last_frame = transform_of(self._velocity * 1e-9 * (frame.capture_time_ns - last.time_ns))
         T_world_camera: Float64[ndarray, "4 4"] = last.T_world_camera @ T_last_frame
         return T_world_camera
 
@@ -260,7 +251,6 @@ class CameraTracker:
         if last is not None:
             stored = {
                 "time_ns": int_array(last.time_ns),
-                "T_world_odometry": last.T_world_odometry,
                 "T_world_camera": last.T_world_camera,
                 **add_prefix("features", last.features.state()),
             }
@@ -283,9 +273,8 @@ class CameraTracker:
         last = select_prefix(state, "last")
         if not last:
             return
-        poses = [get_array(last, name, (4, 4), np.float64) for name in ("T_world_odometry", "T_world_camera")]
-        for T in poses:
-            require_rigid("state tracked pose", T)
+        T_world_camera = get_array(last, "T_world_camera", (4, 4), np.float64)
+        require_rigid("state tracked pose", T_world_camera)
         [time_ns] = get_array(last, "time_ns", (1,), np.int64)
         features = FeatureView.from_state(select_prefix(last, "features"))
-        self._last = _LastFrame(int(time_ns), poses[0].copy(), poses[1].copy(), features)
+        self._last = _LastFrame(int(time_ns), T_world_camera.copy(), features)

@@ -49,7 +49,7 @@ def build_mapper(settings: MissionSettings, prior: Gaussians | None = None) -> G
 
 def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTracker | None:
     """Return a tracker against the mapper's map; None if frames are mapped with their own poses."""
-    return CameraTracker(mapper.render, settings.motion) if settings.poses is PoseMode.TRACK else None
+    return CameraTracker(mapper.render) if settings.poses is PoseMode.TRACK else None
 
 
 def open_models(perception: PerceptionSettings) -> ModelRegistry | None:

@@ -26,7 +26,6 @@ from gausslite.config.values import (
     write_target_points,
 )
 from gausslite.datasets.source import Source
-from gausslite.domain.camera import MotionModel
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import meant_by
 from gausslite.domain.pose import UpAxis, require_up_axis
@@ -34,7 +33,6 @@ from gausslite.domain.recording import TRACKED_PRIOR, CameraCorrection, DepthReg
 from gausslite.domain.relevance import Region, TargetPoint
 from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM, disable, follows_task, policy
 from gausslite.mapping.settings import MapperSettings
-from gausslite.mapping.training import SkippableStage
 from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
 from gausslite.perception.settings import RelevanceTrackerSettings
@@ -46,7 +44,6 @@ DEFAULT_MAX_GAUSSIANS = 150_000
 MAX_ITERATIONS = 10_000
 MAX_SEED = (1 << 32) - 1
 MIN_RATE_HZ, MAX_RATE_HZ = 0.01, 1000.0
-_SCHEDULER = SchedulerSettings()
 
 MAY_CHANGE = {"may_change": True}
 """Metadata of a settings field that may differ when a saved run is resumed."""
@@ -55,6 +52,8 @@ FILE = {"is_file": True}
 
 REMOVED = {
     "roi-ball": "target-at=X,Y,Z,R maps the ball, and target-at=X,Y,Z the object at a point",
+    "track-motion": "the last velocity predicts the motion; odometry is refined with --poses refine",
+    **dict.fromkeys(("min-iterations", "skip-stages", "deadline-slack"), "--rate divides each frame's time by itself"),
     "resegment": "masks between detections are cut by depth, which is as accurate in a third of the time",
 }
 """Options of earlier versions, and what has replaced them."""
@@ -275,8 +274,7 @@ class MissionSettings:
     """Policy, budget, scheduling and hardware settings of one robot's mapping.
 
     disabled: see `gausslite.mapping.policies.disable`. rate_hz: each frame then trains as many iterations as fit into
-    its time instead of a fixed number. min_iterations, skip_stages and deadline_slack: see `SchedulerSettings`.
-    pose_prior: tracked poses have TRACKED_PRIOR if it allows no pose error.
+    its time instead of a fixed number. pose_prior: tracked poses have TRACKED_PRIOR if it allows no pose error.
     """
 
     policy: str = option(
@@ -306,23 +304,6 @@ class MissionSettings:
         unit="Hz",
         low=MIN_RATE_HZ,
         high=MAX_RATE_HZ,
-    )
-    min_iterations: int = option(
-        _SCHEDULER.min_iterations,
-        "iterations that every frame should get",
-        low=0,
-        high=MAX_ITERATIONS,
-        needs="rate",
-    )
-    skip_stages: tuple[SkippableStage, ...] = option(
-        _SCHEDULER.skip_stages, "stages that a frame without enough time skips, in this order", needs="rate"
-    )
-    deadline_slack: float = option(
-        _SCHEDULER.deadline_slack,
-        "share of a frame's time that it may overrun for its minimum iterations",
-        low=0,
-        high=1,
-        needs="rate",
     )
     seed: int = option(0, "seed of every random choice (default: 0)", low=0, high=MAX_SEED)
     threads: int | None = option(
@@ -355,13 +336,6 @@ class MissionSettings:
         "a keyframe that sees an earlier place again corrects poses and map, unless poses are exact (extra: slam); "
         "auto: if the extra is installed",
     )
-    motion: MotionModel = option(
-        MotionModel.VELOCITY,
-        "what predicts the motion between two frames without enough common features: the last velocity or the given "
-        "odometry",
-        key="track-motion",
-        needs="poses=track",
-    )
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -378,7 +352,7 @@ class MissionSettings:
         """Settings of the frame scheduler; None if iterations are counted."""
         if self.rate_hz is None:
             return None
-        return SchedulerSettings(1.0 / self.rate_hz, self.min_iterations, self.skip_stages, self.deadline_slack)
+        return SchedulerSettings(1.0 / self.rate_hz)
 
     def mapper_settings(self) -> MapperSettings:
         """Return the settings of the named policy, with this mission's cap, iterations and disabled parts."""

@@ -21,7 +21,6 @@ from gausslite.config.option import plain_options
 from gausslite.config.plain_values import to_toml
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.mapping.training import SkippableStage
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite_agent.settings import parse_arguments
 
@@ -45,12 +44,8 @@ def test_the_log_of_a_failed_agent_is_reported(tmp_path: Path) -> None:
         MissionSettings(
             disabled=frozenset({"sb", "gfd"}),
             rate_hz=4.5,
-            min_iterations=3,
-            skip_stages=(),
-            deadline_slack=0.25,
             pose_prior=PoseExposurePrior(0.01, 0.5, 0.1, 0.03),
         ),
-        MissionSettings(rate_hz=2.0, skip_stages=(SkippableStage.SEEDING,)),
     ],
 )
 def test_an_agent_restores_the_settings_of_its_configuration_file(tmp_path: Path, mission: MissionSettings) -> None:

@@ -21,17 +21,15 @@ from gausslite.config.program import PROGRAM, Program, choices_of, parse_options
 from gausslite.domain.errors import InvalidInputError
 
 COMMANDS = ("map", "demo", "eval", "parse")
-BENCHMARKS = ("loop", "perception", "registration", "parser")
+BENCHMARKS = ("loop", "perception", "parser")
 TEXTS = {
     "up": "0,1,0",
     "target-at": "0,0,1,0.5",
     "register-depth": "500,500,320,240,0,0,0,0,0,0",
-    "masks": "500,500,320,240,0,0,0,0,0,0",
     "camera-correction": "lens=radtan:0.1,0,0,0,0",
     "pose-prior": "0.01,0.5,0.1,0.1",
     "fused-from-agent": "1,2,3,0,0,0,1",
     "disable": "mvo,sb",
-    "skip-stages": "seeding",
     "task-at": "3:Find the mug",
     "parser": "localhost:1",
     "fusion": "localhost:2",

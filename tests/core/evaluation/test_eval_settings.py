@@ -43,8 +43,8 @@ def test_the_report_next_to_a_map_sets_the_registration_and_fitting(
 
     scores, message = score()
     assert message == f"from the report next to map.ply: register-depth {CAMERA} --poses refine\n{TRAINED}\n"
-    assert scores == score("--set", f"register-depth={CAMERA}", "--set", "fit-views=true")[0]
-    raw, message = score("--set", f"register-depth={CAMERA}", "--set", "fit-views=false")
+    assert scores == score("--set", f"register-depth={CAMERA}", "--poses", "refine")[0]
+    raw, message = score("--set", f"register-depth={CAMERA}", "--poses", "given")
     assert (scores["fitted"], raw["fitted"], message) == (True, False, f"{TRAINED}\n")
     (map_path.parent / "report.json").write_text("[]")
     assert read_report(map_path.parent) == {}

@@ -115,7 +115,8 @@ def test_a_stopped_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_
 def test_settings_survive_the_file(saved: Path) -> None:
     run = SavedRun.read(saved)
     assert run.value(MissionSettings, "pose_prior") == SETTINGS[0].pose_prior
-    assert run.value(MissionSettings, "skip_stages") == SETTINGS[0].skip_stages
+    assert run.value(MissionSettings, "disabled") == SETTINGS[0].disabled
+    assert run.value(MissionSettings, "poses") is SETTINGS[0].poses
     with pytest.raises(MapFileError, match=r"MissionSettings\.threads"):
         run.value(MissionSettings, "threads")
 

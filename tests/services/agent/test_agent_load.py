@@ -74,7 +74,7 @@ def test_a_cancelled_report_does_not_keep_its_frame_in_the_queue() -> None:
 
 def test_a_frame_that_waited_gets_less_time() -> None:
     now_us = itertools.count(step=10)
-    settings = replace(SETTINGS, rate_hz=5.0, min_iterations=15)
+    settings = replace(SETTINGS, rate_hz=5.0)
     worker = MappingWorker(settings, GRID, ball_estimator, clock=lambda: (next(now_us) + stalled_us) / 1e6)
     stalled_us = 0
     worker.assign(RuleParser().parse(TASK)).result(20)
