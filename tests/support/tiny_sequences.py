@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 
 WIDTH, HEIGHT = 16, 12
+FEW_GAUSSIANS = ("--max-gaussians", "150", "--set", "threads=1", "--set", "register-depth=none")
+WITHOUT_ESTIMATES = (*FEW_GAUSSIANS, "--set", "pose-prior=none")
+"""Options of `gausslite map` for a tiny sequence."""
 IDENTITY_ROWS = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 
 

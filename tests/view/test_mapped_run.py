@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_sequences import HEIGHT, WIDTH, write_seven_scenes
+from tiny_sequences import HEIGHT, WIDTH, WITHOUT_ESTIMATES, write_seven_scenes
 
 from gausslite.cli.main import main
 from gausslite.codec.run_files import read_keyframe_views, read_view_images
@@ -23,29 +23,8 @@ def kitchen(tmp_path: Path) -> Path:
 
 
 def map_region(sequence: Path, out: Path, *more: str) -> None:
-    common = [
-        "--set",
-        "threads=1",
-        "--max-gaussians",
-        "150",
-        "--set",
-        "register-depth=none",
-        "--set",
-        "pose-prior=none",
-    ]
-    command = [
-        "map",
-        str(sequence),
-        *common,
-        "--set",
-        "target-at=0,0,2,0.4",
-        "--test-every",
-        "5",
-        "--out",
-        str(out),
-        *more,
-    ]
-    assert main(command) == 0
+    region = ("--set", "target-at=0,0,2,0.4", "--test-every", "5")
+    assert main(["map", str(sequence), *WITHOUT_ESTIMATES, *region, "--out", str(out), *more]) == 0
 
 
 def test_map_writes_photographs_of_keyframes_and_a_row_for_each_frame(kitchen: Path, tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ the view's own image is not used.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -36,20 +37,20 @@ _COVERED_ALPHA = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class RoiScore:
-    """Scores of one view inside the region.
+class ImageScore:
+    """Scores of one view over the whole image, or inside the region.
 
-    covered: share of the region's pixels with measured depth where the map's alpha exceeds 0.5. The depth error uses
-    only those pixels. laplacian_ratio, gradient_deviation: `sharpness`.
+    covered: share of the pixels with measured depth where the map's alpha exceeds 0.5. The depth error uses only those
+    pixels. laplacian_ratio, gradient_deviation: `sharpness`.
     """
 
     psnr: float
     ssim: float
     depth_l1_m: float | None
     covered: float | None
-    lpips: float | None = None
-    laplacian_ratio: float | None = None
-    gradient_deviation: float | None = None
+    lpips: float | None
+    laplacian_ratio: float | None
+    gradient_deviation: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +58,9 @@ class ViewScore:
     """Scores of one view; roi is None if the view shows too little of the region."""
 
     index: int
-    psnr: float
-    ssim: float
     roi_pixels: int
-    roi: RoiScore | None
-    depth_l1_m: float | None = None
-    lpips: float | None = None
-    laplacian_ratio: float | None = None
-    gradient_deviation: float | None = None
+    full: ImageScore
+    roi: ImageScore | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +82,7 @@ class MapScores:
     n_roi_views: int
     roi_pixels: int
     full_depth_l1_m: float | None = None
+    full_covered: float | None = None
     roi_lpips: float | None = None
     full_lpips: float | None = None
     roi_laplacian_ratio: float | None = None
@@ -131,31 +128,22 @@ def score_training_views(
 
 def score_view(rendering: Rendering, view: HeldOutView, lpips: Lpips | None = None) -> ViewScore:
     """Return the scores of one rendering against its frame."""
-    rgb = view.frame.rgb
-    similarity = ssim_map(rendering.rgb, rgb)
-    depth_m = rendering.expected_depth_m(_COVERED_ALPHA)
-    roi = None
-    if view.shows_region:
-        roi = RoiScore(
-            psnr=min(psnr(rendering.rgb, rgb, view.roi), MAX_PSNR_DB),
-            ssim=float(similarity[view.roi].mean()),
-            depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m, view.roi),
-            covered=covered_share(depth_m, view.frame.depth_m, view.roi),
-            lpips=None if lpips is None else lpips.distance(rendering.rgb, rgb, view.roi),
-            laplacian_ratio=laplacian_ratio(rendering.rgb, rgb, view.roi),
-            gradient_deviation=gradient_deviation(rendering.rgb, rgb, view.roi),
+    rgb, measured_m = view.frame.rgb, view.frame.depth_m
+    similarity, depth_m = ssim_map(rendering.rgb, rgb), rendering.expected_depth_m(_COVERED_ALPHA)
+
+    def score(mask: Bool[ndarray, "h w"] | None) -> ImageScore:
+        return ImageScore(
+            psnr=min(psnr(rendering.rgb, rgb, mask), MAX_PSNR_DB),
+            ssim=float((similarity if mask is None else similarity[mask]).mean()),
+            depth_l1_m=depth_l1_m(depth_m, measured_m, mask),
+            covered=covered_share(depth_m, measured_m, mask),
+            lpips=None if lpips is None else lpips.distance(rendering.rgb, rgb, mask),
+            laplacian_ratio=laplacian_ratio(rendering.rgb, rgb, mask),
+            gradient_deviation=gradient_deviation(rendering.rgb, rgb, mask),
         )
-    return ViewScore(
-        index=view.frame.index,
-        psnr=min(psnr(rendering.rgb, rgb), MAX_PSNR_DB),
-        ssim=float(similarity.mean()),
-        roi_pixels=int(np.count_nonzero(view.roi)),
-        roi=roi,
-        depth_l1_m=depth_l1_m(depth_m, view.frame.depth_m),
-        lpips=None if lpips is None else lpips.distance(rendering.rgb, rgb),
-        laplacian_ratio=laplacian_ratio(rendering.rgb, rgb),
-        gradient_deviation=gradient_deviation(rendering.rgb, rgb),
-    )
+
+    roi = score(view.roi) if view.shows_region else None
+    return ViewScore(view.frame.index, int(np.count_nonzero(view.roi)), score(None), roi)
 
 
 def average(scores: Sequence[ViewScore]) -> MapScores:
@@ -163,29 +151,19 @@ def average(scores: Sequence[ViewScore]) -> MapScores:
     if not scores:
         raise InvalidInputError("held-out views: expected at least one, got none")
     rois = [score.roi for score in scores if score.roi is not None]
-    return MapScores(
-        roi_psnr=_mean_or_none(rois, "psnr"),
-        roi_ssim=_mean_or_none(rois, "ssim"),
-        full_psnr=fmean(score.psnr for score in scores),
-        full_ssim=fmean(score.ssim for score in scores),
-        roi_depth_l1_m=_mean_or_none(rois, "depth_l1_m"),
-        roi_covered=_mean_or_none(rois, "covered"),
-        n_views=len(scores),
-        n_roi_views=len(rois),
-        roi_pixels=sum(score.roi_pixels for score in scores if score.roi is not None),
-        full_depth_l1_m=_mean_or_none(scores, "depth_l1_m"),
-        roi_lpips=_mean_or_none(rois, "lpips"),
-        full_lpips=_mean_or_none(scores, "lpips"),
-        roi_laplacian_ratio=_mean_or_none(rois, "laplacian_ratio"),
-        full_laplacian_ratio=_mean_or_none(scores, "laplacian_ratio"),
-        roi_gradient_deviation=_mean_or_none(rois, "gradient_deviation"),
-        full_gradient_deviation=_mean_or_none(scores, "gradient_deviation"),
-    )
+    images = {"roi": rois, "full": [score.full for score in scores]}
+    means: dict[str, Any] = {
+        f"{part}_{figure.name}": _mean_or_none(of_part, figure.name)
+        for part, of_part in images.items()
+        for figure in fields(ImageScore)
+    }
+    roi_pixels = sum(score.roi_pixels for score in scores if score.roi is not None)
+    return MapScores(**means, n_views=len(scores), n_roi_views=len(rois), roi_pixels=roi_pixels)
 
 
-def _mean_or_none(scores: Sequence[RoiScore | ViewScore], name: str) -> float | None:
-    """Return the mean of a field over the scores that have it."""
-    listed = [value for score in scores if (value := getattr(score, name)) is not None]
+def _mean_or_none(scores: Sequence[ImageScore], figure: str) -> float | None:
+    """Return the mean of a figure over the scores that have it."""
+    listed = [value for score in scores if (value := getattr(score, figure)) is not None]
     return fmean(listed) if listed else None
 
 

@@ -114,7 +114,7 @@ def test_scores_are_means_over_views() -> None:
     frames = [frame_of(wall(seed=seed)) for seed in (1, 2)]
     viewer = MapViewer(gaussians, ReferenceRasterizer())
     each = [score_view(viewer.render_frame(frame), view_with(frame, 300)) for frame in frames]
-    assert average(each).full_psnr == pytest.approx((each[0].psnr + each[1].psnr) / 2)
+    assert average(each).full_psnr == pytest.approx((each[0].full.psnr + each[1].full.psnr) / 2)
 
 
 def test_regions_are_merged_into_one_mask() -> None:

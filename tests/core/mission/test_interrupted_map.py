@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_sequences import write_seven_scenes
+from tiny_sequences import WITHOUT_ESTIMATES, write_seven_scenes
 
 from gausslite.cli import map_command
 from gausslite.cli.main import main
@@ -25,9 +25,8 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 
 def mapped(sequence: Path, out: Path, *more: str) -> int:
     # without estimates, because these tests count which frames are read
-    common = ["--set", "target-at=0,0,2,0.4", "--set", "threads=1", "--max-gaussians", "150"]
-    common += ["--set", "register-depth=none", "--set", "pose-prior=none"]
-    return main(["map", str(sequence), *common, "--out", str(out), *more])
+    region = ("--set", "target-at=0,0,2,0.4")
+    return main(["map", str(sequence), *WITHOUT_ESTIMATES, *region, "--out", str(out), *more])
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
-from tiny_sequences import write_seven_scenes
+from tiny_sequences import WITHOUT_ESTIMATES, write_seven_scenes
 from tum_recording import write_home
 
 from gausslite.cli.main import main
@@ -22,17 +22,7 @@ FRAMES = tuple(range(0, 24, 4))
 
 
 def map_command(sequence: Path, out: Path, *more: str) -> int:
-    common = [
-        "--set",
-        "threads=1",
-        "--max-gaussians",
-        "150",
-        "--set",
-        "register-depth=none",
-        "--set",
-        "pose-prior=none",
-    ]
-    return main(["map", str(sequence), *common, "--out", str(out), *more])
+    return main(["map", str(sequence), *WITHOUT_ESTIMATES, "--out", str(out), *more])
 
 
 def report_of(out: Path) -> dict[str, object]:

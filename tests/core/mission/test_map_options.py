@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tiny_sequences import write_seven_scenes, write_tum
+from tiny_sequences import WITHOUT_ESTIMATES, write_seven_scenes, write_tum
 
 import gausslite as gl
 from gausslite.calibration.registration import find_registration
@@ -19,17 +19,7 @@ FRAMES = tuple(range(0, 24, 4))
 
 
 def map_command(sequence: Path | str, out: Path | str, *more: str) -> int:
-    common = [
-        "--set",
-        "threads=1",
-        "--max-gaussians",
-        "150",
-        "--set",
-        "register-depth=none",
-        "--set",
-        "pose-prior=none",
-    ]
-    return main(["map", str(sequence), *common, "--out", str(out), *more])
+    return main(["map", str(sequence), *WITHOUT_ESTIMATES, "--out", str(out), *more])
 
 
 def test_a_map_names_the_folder_or_the_given_world_frame(tmp_path: Path) -> None:

@@ -6,23 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-from tiny_sequences import write_seven_scenes
+from tiny_sequences import FEW_GAUSSIANS, write_seven_scenes
 
 from gausslite.cli.main import main
 
 
 def map_command(folder: Path, out: Path, *more: str) -> list[str]:
-    common = [
-        "--set",
-        "target-at=0,0,2,0.4",
-        "--set",
-        "threads=1",
-        "--max-gaussians",
-        "150",
-        "--set",
-        "register-depth=none",
-    ]
-    return ["map", str(folder), *common, "--out", str(out), *more]
+    return ["map", str(folder), *FEW_GAUSSIANS, "--set", "target-at=0,0,2,0.4", "--out", str(out), *more]
 
 
 def test_other_options_are_named_before_the_work_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
