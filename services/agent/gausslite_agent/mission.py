@@ -103,12 +103,13 @@ class AgentMission:
         parser: TaskParser,
         resumed: MissionCheckpoint | None = None,
         can_find: bool = True,
+        source_notes: tuple[str, ...] = (),
     ) -> None:
         """Wait for a task. resumed: the checkpoint that the worker was restored from.
 
-        can_find: False if any task would fail.
+        can_find: False if any task would fail. source_notes: messages on the recording.
         """
-        self.can_find = can_find
+        self.can_find, self._source_notes = can_find, source_notes
         self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
         self._state_machine = MissionStateMachine()
         self._start_s = time.monotonic()
@@ -137,7 +138,7 @@ class AgentMission:
     def notes(self) -> tuple[str, ...]:
         """Messages for the operator about the mission itself."""
         failed = (f"the mission failed: {self.failure}",) if self.failure else ()
-        return failed if self.can_find else (*failed, NO_DETECTOR)
+        return (*failed, *self._source_notes, *(() if self.can_find else (NO_DETECTOR,)))
 
     @property
     def end_by_options(self) -> EndRequest:
@@ -347,6 +348,7 @@ class AgentMission:
             "stopped_by": ended_by,
             "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
         }
+        report["notes"] = [*self._source_notes, *report["notes"]]
         prior, world_frame = self._worker.prior.run, self._settings.link.uplink.world_frame
         motion = None if prior is None else prior.motion
         if prior is not None:

@@ -11,7 +11,9 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
+from gausslite.calibration.calibrate import recording_notes
 from gausslite.config.values import NONE
+from gausslite.datasets.source import Source
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph
@@ -20,7 +22,7 @@ from gausslite.mission.prior import SavedMap
 from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import prepare_file, prepare_folder
 from gausslite.mission.runner import FrameStream, region_file_note
-from gausslite.mission.settings import SceneInfo
+from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.process import Sibling, sibling
 from gausslite.task.grounding import TaskParser
 from gausslite.task.rules import RuleParser
@@ -153,6 +155,7 @@ async def _serve(settings: AgentSettings) -> int:
     """Build the agent, serve it and run its mission; close in reverse order. Returns the exit code."""
     _require_usable(settings)
     stream = None if settings.source is None else FrameStream.open(settings.source)
+    source_notes = () if stream is None or settings.source is None else _report_source(settings.source, stream.source)
     saved = _read_saved(settings)
     loop, changes = asyncio.get_running_loop(), ChangeNotifier()
     with ExitStack() as stack:
@@ -181,7 +184,7 @@ async def _serve(settings: AgentSettings) -> int:
         first_parser = WaitingParser(parser, cancel=cancel)
         # on the page a person can point
         can_find = stream is not None or settings.perception.model is not None or settings.view is not None
-        mission = AgentMission(settings, worker, first_parser, resumed, can_find)
+        mission = AgentMission(settings, worker, first_parser, resumed, can_find, source_notes)
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
         if settings.view is not None:
             live = sibling(Sibling.PAGES)
@@ -210,6 +213,14 @@ def _read_saved(settings: AgentSettings) -> SavedMission | None:
     if settings.state is None or not settings.state.exists():
         return None
     return SavedMission.read(settings.state, *settings.fixed_settings)
+
+
+def _report_source(settings: SourceSettings, source: Source) -> tuple[str, ...]:
+    """Log what the recording leaves out or contradicts, and return it for the status."""
+    notes = recording_notes(source) if settings.require_poses else source.notes
+    for note in notes:
+        _log.warning("%s: %s", settings.spec, note)
+    return notes
 
 
 def _open_prior(settings: AgentSettings) -> PriorRun | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from gausslite.calibration.camera_estimate import estimate_camera
@@ -19,7 +20,7 @@ from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Lens
-from gausslite.domain.errors import DatasetError
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 
 _NONE = "none"
@@ -117,6 +118,24 @@ def calibrate(
     return Calibration(
         source, registration, correction, prior, tuple(found), () if contradiction is None else (str(contradiction),)
     )
+
+
+def recording_notes(source: Source) -> tuple[str, ...]:
+    """Return what an operator has to know of a source that is mapped as it is, without estimates.
+
+    These are its notes, depth that may not belong to colour, and poses or depth that contradict the images.
+    """
+    notes = list(source.notes)
+    if not source.depth_registered:
+        notes.append(
+            "this layout does not state whether depth is registered to colour, and it is used as recorded; "
+            "`gausslite calibrate` estimates register-depth"
+        )
+    if not (source.poses_exact or source.camera_ideal):
+        with suppress(DatasetError, PoseError):  # a damaged pose is reported with its frame
+            found = find_contradiction(source)
+            notes += [] if found is None else [str(found)]
+    return tuple(notes)
 
 
 def _contradiction(source: Source, force: bool) -> Contradiction | None:

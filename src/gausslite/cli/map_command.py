@@ -273,6 +273,7 @@ class _Run:
         """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
         options, mission, graph = self._options, self._inputs.mission, self._scheduled.graph
         self._notes = (
+            *self._inputs.notes,
             *self._mapper.notes,
             *_unseen_notes(options, result),
             *_unreached_notes(self._inputs.schedule, result.last_index),

@@ -47,7 +47,8 @@ class _Sequence:
 class MapInputs:
     """The settings of one run, its frames and its tasks.
 
-    Depth registration and pose prior are not estimated yet, see `calibrated` and `resumed`.
+    Depth registration and pose prior are not estimated yet, see `calibrated` and `resumed`. notes: on poses or depth
+    that contradict the images.
     """
 
     mission: MissionSettings
@@ -56,6 +57,7 @@ class MapInputs:
     task: TaskSettings
     stream: FrameStream
     schedule: TaskSchedule
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> MapInputs:
@@ -92,6 +94,7 @@ class MapInputs:
             mission=replace(mission, pose_prior=mission.refinement_prior),
             source=replace(self.source, depth_registration=found.registration, camera_correction=correction),
             stream=replace(self.stream, source=found.source),
+            notes=found.notes,
         )
 
     def resumed(self, options: argparse.Namespace, saved: SavedRun) -> MapInputs:

@@ -43,11 +43,14 @@ class FrameStream:
     def open(cls, settings: SourceSettings) -> FrameStream:
         """Open the sequence of the settings, registered and corrected, and select its frames.
 
-        Raises DatasetError, PoseError, InvalidInputError.
+        Without a stated correction, the lens that the files state is corrected. Raises DatasetError, PoseError,
+        InvalidInputError.
         """
         source = open_source(settings.spec, settings.up_axis, settings.depth_registration, settings.require_poses)
         correction = settings.camera_correction
-        if correction is not None and not correction.is_identity:
+        if correction is None:
+            correction = CameraCorrection(source.lens)
+        if not correction.is_identity:
             source = CorrectedSource(source, correction)
         return cls.select(source, settings)
 

@@ -137,7 +137,7 @@ class SourceSettings:
     """A sequence and which of its frames a mission uses.
 
     depth_registration: the colour camera to register depth to, None if depth is registered already.
-    camera_correction: lens, rolling shutter and time offset, None for images as recorded. require_poses: False also
+    camera_correction: lens, rolling shutter and time offset, None for the lens of the files. require_poses: False also
     uses frames without a pose, for tracking.
     """
 

@@ -10,7 +10,7 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.calibration.calibrate import StatedValues, calibrate
+from gausslite.calibration.calibrate import StatedValues, calibrate, recording_notes
 from gausslite.calibration.consistency import find_contradiction
 from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.open import open_source
@@ -29,7 +29,7 @@ class Recording(WrappedSource):
     """Frames of a simulated home that state neither exact poses nor an ideal camera; 30 frames a second."""
 
     camera_ideal = poses_exact = False
-    depth_unit_stated = True
+    depth_unit_stated = depth_registered = True
 
     def __init__(self, home: Source, positions: list[int]) -> None:
         super().__init__(home)
@@ -205,3 +205,11 @@ def test_poses_that_do_not_fit_in_places_are_noted(home: Source, change: Callabl
     [note] = calibrate(recording, NOTHING_ESTIMATED).notes
     assert note.startswith("poses do not fit the images from frame ")
     assert "was tracking lost there?" in note
+
+
+def test_a_recording_used_as_it_is_has_notes_on_its_depth_and_poses(recording: Recording) -> None:
+    recording.depth_registered = False
+    recording.poses = np.linalg.inv(recording.poses)
+    depth, poses = recording_notes(recording)
+    assert "does not state whether depth is registered" in depth
+    assert "world-to-camera poses would agree" in poses

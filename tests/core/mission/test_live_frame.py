@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from tum_recording import write_home
 
-from gausslite.datasets.corrected import ideal_camera, undistort_frame
+from gausslite.datasets.corrected import CorrectedSource, ideal_camera, undistort_frame
+from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Twist
 from gausslite.domain.recording import CameraCorrection
-from gausslite.mission.runner import correct_live_frame
+from gausslite.mission.runner import FrameStream, correct_live_frame
+from gausslite.mission.settings import SourceSettings
 
 CAMERA = Camera(500.0, 501.0, 32.5, 24.5, 64, 48)
 MOTION = CameraMotion(Twist(np.array([0.3, -0.1, 0.2]), np.array([0.5, 1.5, -0.4])), readout_s=0.03, exposure_s=0.01)
@@ -52,3 +57,15 @@ def test_a_live_frame_without_lens_and_motion_is_used_as_sent() -> None:
 def test_a_lens_without_a_pinhole_camera_is_named_in_the_error(text: str) -> None:
     with pytest.raises(InvalidInputError, match=f"lens {text}: expected one that can be inverted"):
         correct_live_frame(sample_frame(), Lens.parse(text))
+
+
+def test_an_agents_recording_is_corrected_by_the_lens_that_its_files_state(tmp_path: Path) -> None:
+    folder = write_home(tmp_path / "home", frames=2)
+    stated = json.loads((folder / "cam_params.json").read_text())
+    stated["camera"]["distortion"] = [0.2, 0.0, 0.0, 0.0]
+    (folder / "cam_params.json").write_text(json.dumps(stated))
+    recorded, settings = open_source(str(folder)), SourceSettings(str(folder))
+    corrected = CorrectedSource(recorded, CameraCorrection(recorded.lens)).frame(0)
+    assert FrameStream.open(settings).source.frame(0).rgb.tobytes() == corrected.rgb.tobytes()
+    as_recorded = FrameStream.open(replace(settings, camera_correction=CameraCorrection()))
+    assert as_recorded.source.frame(0).rgb.tobytes() == recorded.frame(0).rgb.tobytes() != corrected.rgb.tobytes()
