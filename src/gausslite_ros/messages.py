@@ -15,7 +15,7 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.datasets.camera_files import FolderCamera, lens_of
-from gausslite.datasets.files import decode_image, depth_in_metres, require_pixel_count
+from gausslite.datasets.files import decode_image, depth_in_metres, high_bytes, require_pixel_count
 from gausslite.domain.camera import FileIntrinsics
 from gausslite.domain.errors import DatasetError
 
@@ -213,7 +213,7 @@ def decode_colour(location: str, message: ImageMessage) -> UInt8[ndarray, "h w 3
         channels, order = _CHANNEL_ORDERS[encoding]
         has_16_bits = "16" in encoding
         pixels = _pixels(location, message, np.dtype(np.uint16 if has_16_bits else np.uint8), channels)[..., order]
-        return np.ascontiguousarray((pixels >> 8).astype(np.uint8) if has_16_bits else pixels)
+        return np.ascontiguousarray(high_bytes(location, pixels) if has_16_bits else pixels)
     if encoding in _PLANAR:
         rows, channels, code = int(message.height) * 3 // 2, 1, _PLANAR[encoding]
     elif encoding in _CONVERSION_CODES:

@@ -81,6 +81,14 @@ def test_encodings_of_drivers_are_decoded(tmp_path: Path, encoding: str, change:
     require_small_bag(frames_of(write_small_bag(tmp_path / "b.mcap", colour=colour)), tolerance=tolerance)
 
 
+def test_colours_of_12_bits_in_16_are_refused_and_not_mapped_in_black(tmp_path: Path) -> None:
+    bag = write_small_bag(tmp_path / "b.mcap", colour=colour_as("rgb16", lambda rgb: rgb.astype(np.uint16) * 16))
+    with pytest.raises(
+        DatasetError, match=r"color/image_raw: .* got 16 bits with values up to \d+, .* multiply them by 16"
+    ):
+        frames_of(bag)
+
+
 def test_an_unknown_encoding_is_named_with_the_option(tmp_path: Path) -> None:
     bag = write_small_bag(tmp_path / "b.mcap", colour=colour_as("nv24", lambda rgb: rgb))
     with pytest.raises(DatasetError, match=r"got /camera/color/image_raw \(nv24\).*choose one with color=TOPIC"):

@@ -27,6 +27,7 @@ _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\x01\xd0-\xd7])", re.DOTALL)
 """The start of a JPEG segment; other bytes after FF belong to compressed pixels."""
 _JPEG_START, _JPEG_END = b"\xd8", b"\xd9"
 _SATURATED = np.iinfo(np.uint16).max
+_MAX_OF_12_BITS, _WHOLE_RANGE = (1 << 12) - 1, 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +52,26 @@ class RgbdImage:
 
 def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:
     """Return an 8-bit RGB image. Raises DatasetError with the file name."""
-    bgr = _decode(path, cv2.IMREAD_COLOR)
+    bgr = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if bgr.dtype == np.uint16:
+        bgr = high_bytes(str(path), bgr)
     rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
     return rgb
+
+
+def high_bytes(location: str, pixels: UInt16[ndarray, "h w c"]) -> UInt8[ndarray, "h w c"]:
+    """Return 16-bit colours with 8 bits. Raises DatasetError if they use at most 12 bits: the image would be black."""
+    largest = int(pixels.max(initial=0))
+    if largest <= _MAX_OF_12_BITS:
+        raise DatasetError(
+            f"{location}: expected colours of 8 bits, or of 16 bits over their whole range, got 16 bits with values up "
+            f"to {largest}, as a camera of 10 or 12 bits writes; multiply them by {_WHOLE_RANGE // _range_of(largest)}"
+        )
+    return (pixels >> 8).astype(np.uint8)
+
+
+def _range_of(largest: int) -> int:
+    return next(size for size in (1 << 10, 1 << 12) if largest < size)
 
 
 def first_readable_size(paths: Iterable[Path]) -> tuple[int, int]:

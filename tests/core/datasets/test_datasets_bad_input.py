@@ -58,6 +58,12 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
     ("tum", lambda f: flip(f / "depth/1.png"), DatasetError, "depth/1.png: expected an undamaged image"),
     ("tum", lambda f: declare_huge(f / "rgb/1.png"), DatasetError, "rgb/1.png: .* got 30000x30000"),
     ("tum", lambda f: write_depth(f / "depth/1.png", width=8), DatasetError, "depth/1.png: expected the size of 1.png"),
+    (
+        "tum",
+        lambda f: write_depth(f / "rgb/1.png"),
+        DatasetError,
+        "rgb/1.png: .* values up to 2000, .* multiply them by 16",
+    ),
     ("tum", lambda f: (f / "depth.txt").unlink(), DatasetError, "depth.txt: expected a text file"),
     ("tum", lambda f: (f / "groundtruth.txt").unlink(), DatasetError, "groundtruth.txt: expected a text file"),
     ("tum", lambda f: (f / "rgb.txt").write_text("# nothing\n"), DatasetError, "rgb.txt: expected rows"),
