@@ -222,14 +222,20 @@ class UpdateQueue:
         return bool(self._waiting)
 
     def take(self, max_bytes: int) -> list[PendingUpdate]:
-        """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue."""
+        """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue.
+
+        Together they cost `max_bytes` at most, so that small messages do not wait for a large one in their group.
+        """
         taken: list[PendingUpdate] = []
         cost = 0
         with self._lock:
-            while self._waiting and cost < max_bytes:
-                agent_id = heapq.heappop(self._waiting)[2]
+            while self._waiting:
+                agent_id = self._waiting[0][2]
                 update = self._pending[agent_id][0]
                 own_cost = update.cost
+                if taken and cost + own_cost > max_bytes:
+                    break
+                heapq.heappop(self._waiting)
                 self._round += own_cost / len(self._pending)
                 cost += own_cost
                 # it is decoded now
@@ -264,7 +270,8 @@ def _encoded_bytes(update: PendingUpdate) -> int:
     return update.encoded_bytes
 
 
-_GROUP_BYTES = 2 << 20
+_GROUP_BYTES = 1 << 19
+"""Of about 20 messages of a robot; a message that comes during a commit waits for its end."""
 Check = Callable[[PendingUpdate], None]
 """Raises GaussLiteError to refuse a message."""
 Record = Callable[[Sequence[tuple[str, Int64[ndarray, " _"]]]], None]
