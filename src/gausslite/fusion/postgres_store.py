@@ -20,7 +20,7 @@ from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots, slots_of
 from gausslite.fusion.store import Execute, FusionStore
 from gausslite.fusion.store_rows import SLOT_BITS, LogChange, require_intact
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
 _SCHEMA = """
 CREATE SCHEMA gausslite;
@@ -31,8 +31,8 @@ ALTER TABLE gausslite.voxel_updates ALTER COLUMN voxels SET STORAGE EXTERNAL;
 CREATE TABLE gausslite.servers (pid INTEGER PRIMARY KEY, address TEXT NOT NULL);
 CREATE TABLE gausslite.sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
 CREATE TABLE gausslite.keyframes (
-    agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
-    PRIMARY KEY (agent_id, frame_index));
+    agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, part INTEGER NOT NULL, parts INTEGER NOT NULL,
+    checksum BIGINT NOT NULL, data BYTEA NOT NULL, PRIMARY KEY (agent_id, frame_index, part));
 CREATE TABLE gausslite.records (
     name TEXT NOT NULL, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
     PRIMARY KEY (name, agent_id));

@@ -19,7 +19,7 @@ from gausslite.fusion.store import Execute, FusionStore
 from gausslite.fusion.store_rows import LogChange, require_intact
 
 _IN_MEMORY = Path(":memory:")
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 PAGE_BYTES = 4096
 RESTORE_ADVICE = (
     "restore a backup (gausslite-fusion-server restore BACKUP STORE), or delete the damaged rows "
@@ -34,8 +34,8 @@ CREATE TABLE voxel_updates (
     number INTEGER PRIMARY KEY, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, voxels BLOB NOT NULL);
 CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
 CREATE TABLE keyframes (
-    agent_id TEXT NOT NULL, frame_index INTEGER NOT NULL, checksum INTEGER NOT NULL, data BLOB NOT NULL,
-    PRIMARY KEY (agent_id, frame_index));
+    agent_id TEXT NOT NULL, frame_index INTEGER NOT NULL, part INTEGER NOT NULL, parts INTEGER NOT NULL,
+    checksum INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (agent_id, frame_index, part));
 CREATE TABLE records (
     name TEXT NOT NULL, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, data BLOB NOT NULL,
     PRIMARY KEY (name, agent_id));

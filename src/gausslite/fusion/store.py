@@ -8,8 +8,10 @@ still arrive.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from threading import RLock
 from typing import Any
 
@@ -34,6 +36,12 @@ from gausslite.fusion.store_values import (
 
 Execute = Callable[[str, tuple[Any, ...]], object]
 """Executes a statement, with ? for each value, in the transaction that is open."""
+_PART_BYTES = 1 << 19
+_DELETE_KEYFRAME = "DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?"
+_SELECT_SIZES = """
+SELECT agent_id, frame_index, sum(length(data)) FROM keyframes GROUP BY agent_id, frame_index
+HAVING count(*) = max(parts)
+"""
 
 
 class FusionStore(ABC):
@@ -154,30 +162,41 @@ class FusionStore(ABC):
         self._write(lambda execute: execute("DELETE FROM sessions WHERE session_id = ?", (session_id,)))
 
     def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
-        """Store an encoded keyframe; it replaces the agent's one of this frame index."""
-        row = agent_id, index, data_checksum(agent_id, index, data), data
-        self._write_row("keyframes", ("agent_id", "frame_index"), ("checksum", "data"), row)
+        """Store an encoded keyframe; it replaces the agent's one of this frame index. One thread for each keyframe.
+
+        A large one takes several transactions, so that others need not wait for all of it, and exists after the last.
+        """
+        parts = [data[start : start + _PART_BYTES] for start in range(0, max(len(data), 1), _PART_BYTES)]
+        for part, content in enumerate(parts):
+            row = agent_id, index, part, len(parts), data_checksum(agent_id, index, content), content
+            begin_s = time.monotonic()
+            self._write(partial(_insert_part, row))
+            if part + 1 < len(parts):
+                # the lock is not fair: who waits for it must come first
+                time.sleep(time.monotonic() - begin_s)
 
     def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
         """Delete these keyframes of an agent, if they exist."""
 
         def delete(execute: Execute) -> None:
             for index in indices:
-                execute("DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?", (agent_id, index))
+                execute(_DELETE_KEYFRAME, (agent_id, index))
 
         self._write(delete)
 
     def keyframe_sizes(self) -> dict[str, dict[int, int]]:
         """Return the number of bytes of each agent's keyframes by frame index."""
         sizes: dict[str, dict[int, int]] = {}
-        for agent_id, index, size in self._read("SELECT agent_id, frame_index, length(data) FROM keyframes"):
-            sizes.setdefault(agent_id, {})[index] = size
+        for agent_id, index, size in self._read(_SELECT_SIZES):
+            sizes.setdefault(agent_id, {})[index] = int(size)
         return sizes
 
     def keyframe(self, agent_id: str, index: int) -> bytes:
         """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT agent_id, data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ?"
-        return self._intact(index, self._read(query, (agent_id, index))).get(agent_id, b"")
+        query = "SELECT parts, data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ? ORDER BY part"
+        rows = self._read(query, (agent_id, index))
+        found = [self._intact(index, [(agent_id, *row)])[agent_id] for _, *row in rows]
+        return b"".join(found) if all(parts == len(found) for parts, *_ in rows) else b""
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
         """Store a named record of an agent; it replaces the earlier one."""
@@ -237,9 +256,21 @@ class FusionStore(ABC):
 
     def _write_row(self, table: str, key: Sequence[str], columns: Sequence[str], row: tuple[Any, ...]) -> None:
         """Insert a row, or replace the columns of the one with its key."""
-        names, places = ", ".join((*key, *columns)), ", ".join(["?"] * len(row))
-        newer = ", ".join(f"{name} = excluded.{name}" for name in columns)
-        query = f"""
-            INSERT INTO {table} ({names}) VALUES ({places}) ON CONFLICT ({", ".join(key)}) DO UPDATE SET {newer}
-        """  # noqa: S608 - the names are constants
-        self._write(lambda execute: execute(query, row))
+        self._write(lambda execute: execute(_upsert(table, key, columns), row))
+
+
+def _insert_part(row: tuple[str, int, int, int, int, bytes], execute: Execute) -> None:
+    """Insert a part of a keyframe; the first one deletes the earlier keyframe of its frame index."""
+    if row[2] == 0:
+        execute(_DELETE_KEYFRAME, row[:2])
+    execute(_upsert("keyframes", ("agent_id", "frame_index", "part"), ("parts", "checksum", "data")), row)
+
+
+def _upsert(table: str, key: Sequence[str], columns: Sequence[str]) -> str:
+    """Return the statement that inserts a row of a key and its columns, or replaces the columns."""
+    names, places = ", ".join((*key, *columns)), ", ".join(["?"] * (len(key) + len(columns)))
+    newer = ", ".join(f"{name} = excluded.{name}" for name in columns)
+    return (
+        f"INSERT INTO {table} ({names}) VALUES ({places}) "  # noqa: S608 - the names are constants
+        f"ON CONFLICT ({', '.join(key)}) DO UPDATE SET {newer}"
+    )

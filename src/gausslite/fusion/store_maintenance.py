@@ -106,7 +106,7 @@ def _check(db: sqlite3.Connection, path: Path) -> tuple[StoreReport, list[tuple[
     log.load(intact())
     totals = [log.index.totals(agent_id) for agent_id in log.index.agents]
     voxels, gaussians = (sum(getattr(own, name) for own in totals) for name in ("voxels", "gaussians"))
-    keyframes = db.execute("SELECT count(*) FROM keyframes").fetchone()[0]
+    keyframes = db.execute("SELECT count(*) FROM keyframes WHERE part = 0").fetchone()[0]
     return StoreReport(len(totals), voxels, gaussians, keyframes, len(damaged)), damaged
 
 

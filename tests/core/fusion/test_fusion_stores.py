@@ -8,10 +8,12 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from threading import Thread
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
@@ -224,6 +226,25 @@ def test_keyframes_and_records_are_stored_and_leave_with_their_agent(store: Fusi
     assert store.keyframe_sizes() == {"ant": {5: 5}, "bee": {5: 0}}
     store.remove_agent("ant")
     assert (store.keyframe_sizes(), store.records("objects")) == ({"bee": {5: 0}}, {"bee": b""})
+
+
+def test_a_large_keyframe_takes_several_transactions_and_exists_after_the_last(
+    store: FusionStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    large, seen = bytes(range(256)) * 5000, []
+
+    def write_between(_: float) -> None:
+        seen.append((store.keyframe("ant", 1), store.keyframe_sizes()))
+        store.put(make_subset("bee", len(seen), {11: 1}))
+
+    monkeypatch.setattr("gausslite.fusion.store.time", SimpleNamespace(monotonic=time.monotonic, sleep=write_between))
+    store.save_keyframe("ant", 1, b"small")
+    store.save_keyframe("ant", 1, large)
+    assert seen == [(b"", {})] * 2
+    assert store.totals("bee").highest_update_seq == 2
+    assert (store.keyframe("ant", 1), store.keyframe_sizes()) == (large, {"ant": {1: len(large)}})
+    store.save_keyframe("ant", 1, b"small")
+    assert (store.keyframe("ant", 1), store.keyframe_sizes()) == (b"small", {"ant": {1: 5}})
 
 
 def test_a_reopened_store_has_the_same_content(open_durable: OpenStore) -> None:
