@@ -129,6 +129,7 @@ class PartSender:
                     largest, largest_owner = max((largest, largest_owner), (len(part.voxels), owner or ""))
             if unavailable is None:
                 return StoredCount(accepted, stale, "" if largest_owner == self._host.server else largest_owner)
+            self._host.wake()
             if loop.time() > end_s:
                 raise unavailable
             with suppress(TimeoutError):

@@ -54,13 +54,14 @@ class Peers:
 
     def __init__(self, tls: Tls | None) -> None:
         self._tls = tls
-        self._channels: dict[str, grpc.aio.Channel] = {}
+        self._connected: dict[str, tuple[grpc.aio.Channel, Any]] = {}
 
     def stub(self, server: str) -> Any:
         """Return the methods of a server."""
-        if server not in self._channels:
-            self._channels[server] = open_async_channel(server, self._tls)
-        return region_pb_grpc.RegionServiceStub(self._channels[server])
+        if server not in self._connected:
+            channel = open_async_channel(server, self._tls)
+            self._connected[server] = channel, region_pb_grpc.RegionServiceStub(channel)
+        return self._connected[server][1]
 
     async def call(self, server: str, method: str, request: Any) -> Any:
         """Return the answer of one server. Raises GaussLiteError."""
@@ -105,5 +106,5 @@ class Peers:
 
     async def close(self) -> None:
         """Close the connections; open calls end."""
-        for channel in self._channels.values():
+        for channel, _ in self._connected.values():
             await channel.close(None)

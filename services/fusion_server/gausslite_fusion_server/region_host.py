@@ -22,7 +22,8 @@ from gausslite.wire.convert import decode_frame
 from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.servicer import FusionServicer
 
-_POLL_S = 0.5
+_POLL_S, _QUICK_POLL_S, _PAUSE_S = 2.0, 0.5, 0.1
+"""Times between two looks at the owners: while nothing changes, while regions move, and after a call that failed."""
 WAIT_S = 10.0
 """Longest wait for the owner of a slot: a message or a call waits for a server that takes over."""
 _log = logging.getLogger(__name__)
@@ -45,6 +46,9 @@ class RegionHost:
         self._opened: tuple[int, frozenset[int]] | None = None
         self._owned = OwnedSlots(frozenset())
         self._owners = Owners()
+        # those at the latest look that had nothing to do
+        self._steady: Owners | None = None
+        self._woken = asyncio.Event()
         self._failure = ""
         self.changes = ChangeNotifier()
         """Notified when the owners, or the open engine, have changed."""
@@ -73,6 +77,10 @@ class RegionHost:
             raise UnavailableError(f"server {self.server}: it is taking its regions; try again in a moment")
         return self._local
 
+    def wake(self) -> None:
+        """Look at the owners soon, because a server did not answer."""
+        self._woken.set()
+
     def check(self) -> None:
         """Raise UnavailableError or StorageError while this server cannot store its part."""
         self.local().engine.storage.check()
@@ -89,6 +97,7 @@ class RegionHost:
             try:
                 return find()
             except UnavailableError:
+                self.wake()
                 remaining_s = end_s - asyncio.get_running_loop().time()
                 if remaining_s <= 0:
                     raise
@@ -102,7 +111,11 @@ class RegionHost:
         """
         await self._look()
         while True:
-            await asyncio.sleep(_POLL_S)
+            await asyncio.sleep(_PAUSE_S)
+            with contextlib.suppress(TimeoutError):
+                pause_s = _QUICK_POLL_S if self._steady is None else _POLL_S
+                await asyncio.wait_for(self._woken.wait(), pause_s - _PAUSE_S)
+            self._woken.clear()
             try:
                 await self._look()
                 if self._failure:
@@ -130,9 +143,13 @@ class RegionHost:
 
     async def _follow(self) -> None:
         owners = await asyncio.to_thread(self._slots.owners)
+        is_open = self._opened == (self._slots.connection, self._slots.held)
+        if owners is self._steady and is_open:
+            return
         wanted = wanted_slots(owners.servers, self.server)
         await asyncio.to_thread(self._slots.take, wanted)
         surplus = self._slots.held - wanted
+        self._steady = owners if owners.are_complete and is_open and self._slots.held == wanted else None
         if surplus or self._opened != (self._slots.connection, self._slots.held):
             await self._close_local()
             await asyncio.to_thread(self._slots.release, surplus)

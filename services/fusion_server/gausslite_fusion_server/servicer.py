@@ -209,8 +209,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             joined = await self._work(self.engine.join, request.agent_id, requested, request.fresh_map, request.token)
         await self._work(declare_frame, self.engine, request)
         if task is not None:
-            report = ObjectReport(task, self.engine.reported_objects(request.agent_id, task))
-            await self._work(self.engine.report_objects, joined.session.session_id, report)
+            objects = await self._work(self.engine.reported_objects, request.agent_id, task)
+            await self._work(self.engine.report_objects, joined.session.session_id, ObjectReport(task, objects))
         self._map_changes.notify()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,

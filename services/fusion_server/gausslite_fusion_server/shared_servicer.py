@@ -23,7 +23,6 @@ from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.wire.channel import MAX_MESSAGE_BYTES
 from gausslite.wire.convert import box_from_message, digests_from_messages, digests_to_messages
-from gausslite.wire.convert_task import object_to_message
 from gausslite.wire.map_changes import read_deadline
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
@@ -175,17 +174,14 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         return pb.RenderFusedViewResponse()
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
-        """Replace the agent's task graph and objects at its home."""
-        session = await self._session(request.session_id, Caller.of(context))
-        response: pb.ReportObjectsResponse = await self._at_home(session.agent_id, "ReportObjects", request, context)
-        return response
+        """Replace the agent's task graph and objects; every server reads them in the store."""
+        await self._session(request.session_id, Caller.of(context))
+        return await (await self._host.ready()).ReportObjects(request, context)
 
     async def QueryObjects(self, request: pb.QueryObjectsRequest, context: Any) -> pb.QueryObjectsResponse:
         """Return the team's objects that a noun names, or all, of the reports as they are stored now."""
-        await self._require_mission(request.mission_id)
-        engine = (await self._host.ready()).engine
-        found = await asyncio.to_thread(engine.query_stored_objects, request.noun)
-        return pb.QueryObjectsResponse(objects=[object_to_message(shown.landmark, shown.observers) for shown in found])
+        self._gate.require_open()
+        return await (await self._host.ready()).QueryObjects(request, context)
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent, summed over the owners."""
@@ -231,7 +227,9 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
     async def _session(self, session_id: str, caller: Caller) -> SessionRecord:
         """Return a session, whoever opened it. Raises SessionUnknownError, NotPermittedError for another robot."""
         engine = (await self._host.ready()).engine
-        session = await asyncio.to_thread(engine.session, session_id)
+        session = engine.known_session(session_id)
+        if session is None:
+            session = await asyncio.to_thread(engine.session, session_id)
         caller.require_agent(session.agent_id)
         return session
 
@@ -253,7 +251,12 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
             await self._host.ready()
             return await self._regions.call_home(agent_id, method, request, context)
         call = region_pb.CallHomeRequest(agent_id=agent_id, method=method, request=request.SerializeToString())
-        return AT_HOME[method].response.FromString((await self._peers.call(server, "CallHome", call)).response)
+        try:
+            answer = await self._peers.call(server, "CallHome", call)
+        except UnavailableError:
+            self._host.wake()
+            raise
+        return AT_HOME[method].response.FromString(answer.response)
 
     async def _read_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
         if request.strategy == pb.FUSION_STRATEGY_REFINED:

@@ -90,6 +90,7 @@ class SharedWatch:
                         with read_deadline():
                             yield pb.WatchFusedMapResponse(block=latest)
             except UnavailableError:
+                self.host.wake()
                 require_open()
                 if time.monotonic() > end_s or (latest.snapshot and not latest.last):
                     raise

@@ -36,6 +36,7 @@ from gausslite.fusion.keyframes import (
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.membership import Membership
 from gausslite.fusion.mission_clock import MissionClock
+from gausslite.fusion.objects import RECORD as OBJECTS
 from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, require_storable
@@ -171,6 +172,8 @@ class FusionEngine:
             voxels = self._store.totals(agent_id).voxels
             self._members.sessions.forget_elsewhere(agent_id)
             self._agents.remove(agent_id)
+            # one that came here while the session ended
+            self._store.remove_record(agent_id, OBJECTS)
             return voxels
 
     @property
@@ -182,11 +185,15 @@ class FusionEngine:
     def session(self, session_id: str) -> SessionRecord:
         """Return the session of this id. Raises SessionUnknownError, and MismatchError for a replaced session."""
         # each message asks, also on the event loop: it must not wait for the lock, which a slow disk holds
-        live = self._members.sessions.live(session_id)
-        if live is not None:
-            return live
+        known = self.known_session(session_id)
+        if known is not None:
+            return known
         with self._lock:
             return self._members.sessions.get(session_id)
+
+    def known_session(self, session_id: str) -> SessionRecord | None:
+        """Return the session of this id if it is found at once, without the store."""
+        return self._members.sessions.known(session_id)
 
     def contribute(self, session_id: str, subset: RoiSubset, grid: VoxelGrid) -> PutOutcome:
         """Store an agent's voxel updates; they are durable on return, if the store is.
@@ -270,20 +277,16 @@ class FusionEngine:
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
-        with self._lock:
-            return self._objects.of_task(agent_id, graph)
+        return self._objects.of_task(agent_id, graph)
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first. Raises InvalidInputError."""
+        reports = self._objects.reports()
         with self._lock:
-            reports, frames = self._objects.reports(), self._alignments.transforms()
+            frames = self._alignments.transforms()
             unlocalised = self._alignments.unlocalised
         used = {name: report for name, report in reports.items() if name not in unlocalised}
         return find_objects(self._merged_objects.of(used, frames), noun)
-
-    def query_stored_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
-        """Return the same of the reports as they are in the store, whichever server has written them."""
-        return find_objects(self._merged_objects.of(TeamObjects(self._store).reports(), {}), noun)
 
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.
@@ -347,6 +350,7 @@ class FusionEngine:
 
     def status(self) -> MissionStatus:
         """Return the totals of the mission and of each agent."""
+        reports = self._objects.reports()
         with self._lock:
             fused_voxels, fused_gaussians = self.maps.size()
             return MissionStatus(
@@ -356,11 +360,11 @@ class FusionEngine:
                 fused_voxels=fused_voxels,
                 keyframes=len(self._keyframes),
                 refined=self.maps.is_refined,
-                agents=tuple(map(self._contribution, sorted(self._members.sources))),
+                agents=tuple(self._contribution(name, reports.get(name)) for name in sorted(self._members.sources)),
                 banned_agents=self._members.bans.agents,
             )
 
-    def _contribution(self, agent_id: str) -> AgentContribution:
+    def _contribution(self, agent_id: str, report: ObjectReport | None) -> AgentContribution:
         totals = self._store.totals(agent_id)
         return AgentContribution(
             agent_id,
@@ -371,7 +375,7 @@ class FusionEngine:
             won_voxels=self.maps.won_voxels(agent_id),
             last_update_seq=totals.highest_update_seq,
             keyframes=self._keyframes.count(agent_id),
-            targets=self._objects.targets(agent_id),
+            targets=() if report is None else report.graph.targets,
             alignment=self._alignments.get(agent_id),
             traffic=self.traffic.of(agent_id),
         )

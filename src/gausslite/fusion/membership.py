@@ -118,11 +118,15 @@ class SessionRegistry:
         self._store.save_record(agent_id, TOKEN_RECORD, _hash(token))
         self._token_hashes[agent_id] = _hash(token)
 
-    def live(self, session_id: str) -> SessionRecord | None:
-        """Return the session if it was opened here, and renew its lease. Any thread may call it, without the lock."""
+    def known(self, session_id: str) -> SessionRecord | None:
+        """Return the session if it was opened here, and renew its lease, or if it was found in the store before.
+
+        Any thread may call it, without the lock.
+        """
         session = self._sessions.get(session_id)
-        if session is not None:
-            self._renew(session.agent_id)
+        if session is None:
+            return self._elsewhere.get(session_id)
+        self._renew(session.agent_id)
         return session
 
     def get(self, session_id: str) -> SessionRecord:
@@ -132,7 +136,7 @@ class SessionRegistry:
         MismatchError if a second robot with the same token has joined: an agent never uses a session after it has
         joined again, and two such robots would end each other's sessions forever.
         """
-        session = self.live(session_id)
+        session = self.known(session_id)
         if session is not None:
             return session
         if (session_id, True) in self._replaced:
@@ -141,7 +145,7 @@ class SessionRegistry:
             error = NameInUseError(f"session: {_NAME_TAKEN}")
             error.retry_after_s = self._lease_s
             raise error
-        elsewhere = self._elsewhere.get(session_id) or self._store.find_session(session_id)
+        elsewhere = self._store.find_session(session_id)
         if elsewhere is None:
             raise SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
         self._elsewhere[session_id] = elsewhere

@@ -226,37 +226,47 @@ RECORD = "objects"
 
 
 class TeamObjects:
-    """Keeps each agent's report in the store. Not thread-safe; FusionEngine holds a lock.
+    """Keeps each agent's report in the store. FusionEngine holds a lock while a report changes.
 
+    Where servers share the store, each of them writes the reports that it receives and reads them when it is asked.
     Raises CodecError if a stored report is damaged.
     """
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
-        self._reports = {agent_id: decode_object_report(data) for agent_id, data in store.records(RECORD).items()}
+        self._encoded: dict[str, bytes] = {}
+        self._reports: dict[str, ObjectReport] = {}
+        self._read()
 
     def report(self, agent_id: str, report: ObjectReport) -> None:
         """Replace the agent's report. Raises StorageError."""
-        self._store.save_record(agent_id, RECORD, encode_object_report(report))
-        self._reports[agent_id] = report
-
-    def targets(self, agent_id: str) -> tuple[str, ...]:
-        """Return the noun phrases of an agent's targets, by the `target` of its Gaussians; empty without a report."""
-        report = self._reports.get(agent_id)
-        return () if report is None else report.graph.targets
+        encoded = encode_object_report(report)
+        self._store.save_record(agent_id, RECORD, encoded)
+        self._encoded[agent_id], self._reports[agent_id] = encoded, report
 
     def of_task(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
-        report = self._reports.get(agent_id)
+        report = self.reports().get(agent_id)
         return report.objects if report is not None and report.graph.is_equivalent_to(graph) else ()
 
     def remove_agent(self, agent_id: str) -> None:
-        """Delete the agent's report; the store deletes it with the agent's updates."""
+        """Forget the agent's report; the store deletes it with the agent's updates."""
+        self._encoded.pop(agent_id, None)
         self._reports.pop(agent_id, None)
 
     def reports(self) -> dict[str, ObjectReport]:
-        """Return the latest report of each agent."""
+        """Return the latest report of each agent, the same object as before if it has not changed."""
+        if self._store.is_shared:
+            self._read()
         return dict(self._reports)
+
+    def _read(self) -> None:
+        encoded, known = self._store.records(RECORD), dict(self._reports)
+        unchanged = {name for name, data in encoded.items() if name in known and self._encoded.get(name) == data}
+        self._reports = {
+            name: known[name] if name in unchanged else decode_object_report(data) for name, data in encoded.items()
+        }
+        self._encoded = encoded
 
 
 class MergedObjects:

@@ -17,11 +17,12 @@ from gausslite.fusion.regions import OwnedSlots, Owners
 
 _SLOT_LOCKS = 0x47534C53  # "GSLS"
 _OWNERS = """
-SELECT locks.classid::bigint, locks.objid::bigint, servers.address
+SELECT servers.address, string_agg(locks.objid::text, ',' ORDER BY locks.objid) FILTER (WHERE locks.classid <> 0)
 FROM pg_locks AS locks JOIN gausslite.servers AS servers USING (pid)
 WHERE locks.locktype = 'advisory' AND locks.granted
     AND locks.database = (SELECT oid FROM pg_database WHERE datname = current_database())
     AND (locks.classid = 0 AND locks.objid = %s AND locks.objsubid = 1 OR locks.classid = %s AND locks.objsubid = 2)
+GROUP BY servers.address ORDER BY servers.address
 """
 _DELETE_ENDED = """
 DELETE FROM gausslite.servers
@@ -43,6 +44,8 @@ class SharedSlots:
         self._holder: Database | None = None
         self._connections = 0
         self._held: frozenset[int] = frozenset()
+        self._rows: list[tuple[str, str | None]] = []
+        self._owners = Owners()
         self._locks = PostgresConnection(url, self._enter)
 
     @property
@@ -56,12 +59,15 @@ class SharedSlots:
         return self._connections
 
     def owners(self) -> Owners:
-        """Return who owns which slot now; a lost connection is opened again, without locks. Raises StorageError."""
+        """Return who owns which slot now, the same object as before if nothing has changed.
+
+        A lost connection is opened again, without locks. Raises StorageError.
+        """
         rows = self._locks.run(lambda db: db.execute(_OWNERS, (LOCK, _SLOT_LOCKS)).fetchall())
-        return Owners(
-            tuple(sorted({address for kind, _, address in rows if kind != _SLOT_LOCKS})),
-            {slot: address for kind, slot, address in rows if kind == _SLOT_LOCKS},
-        )
+        if rows != self._rows:
+            server_of = {int(slot): address for address, own in rows for slot in (own or "").split(",") if slot}
+            self._rows, self._owners = rows, Owners(tuple(address for address, _ in rows), server_of)
+        return self._owners
 
     def take(self, slots: Collection[int]) -> frozenset[int]:
         """Lock those of these slots that nobody owns; returns them. Raises StorageError."""
@@ -96,7 +102,7 @@ class SharedSlots:
                 db.execute("SELECT pg_advisory_xact_lock(%s, -1)", (_SLOT_LOCKS,))
                 create_or_check(db, self._name)
                 db.execute(_DELETE_ENDED)
-                if any(address == self.server for *_, address in db.execute(_OWNERS, (LOCK, _SLOT_LOCKS))):
+                if any(address == self.server for address, _ in db.execute(_OWNERS, (LOCK, _SLOT_LOCKS))):
                     raise StorageError(f"store {self._name}: another server has the peer-address {self.server}")
                 db.execute(_REGISTER, (self.server,))
                 begin_opening(db)

@@ -1,7 +1,7 @@
 """Divide a mission among servers: voxels belong to regions, regions to slots, and each slot has one server as owner.
 
 A region is a cube of 4 x 4 x 4 tiles, so that what one robot sends at a time lies in few of them. What a mission knows
-of an agent besides its voxels (session, keyframes, objects) belongs to the agent's own slot, its home.
+of an agent besides its voxels (session, keyframes) belongs to the agent's own slot, its home.
 """
 
 from __future__ import annotations

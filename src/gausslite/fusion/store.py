@@ -203,6 +203,10 @@ class FusionStore(ABC):
         row = name, agent_id, data_checksum(agent_id, name, data), data
         self._write_row("records", ("name", "agent_id"), ("checksum", "data"), row)
 
+    def remove_record(self, agent_id: str, name: str) -> None:
+        """Delete a named record of an agent, if it exists."""
+        self._write(lambda execute: execute("DELETE FROM records WHERE name = ? AND agent_id = ?", (name, agent_id)))
+
     def records(self, name: str) -> dict[str, bytes]:
         """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
         return self._intact(name, self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,)))

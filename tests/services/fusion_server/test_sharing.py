@@ -229,8 +229,10 @@ def test_what_is_known_of_an_agent_is_the_same_at_every_server(servers: list[Sha
     last = dict(zip(keys.tolist(), latest.tolist(), strict=True))
     expected = TileDigests.of(np.array(list(last), np.int64), np.array(list(last.values()), np.int64))
     assert all(len(own.differing(expected)) == len(expected.differing(own)) == 0 for own in digests)
-    two.report_objects(session, ObjectReport(GRAPH, (MUG,)))
-    assert [len(client.query_objects("mug")) for client in (one, two, three)] == [1, 1, 1]
+    for client in (one, two, three):
+        for objects in ((), (MUG,)):
+            client.report_objects(session, ObjectReport(GRAPH, objects))
+            assert [len(other.query_objects("mug")) for other in (one, two, three)] == [len(objects)] * 3
     assert three.contribute_keyframes(session, [frame(3), frame(4)]) == 2
     stored = [client.keyframe("ant") for client in (one, two, three)]
     assert [keyframe is not None and keyframe.index for keyframe in stored] == [4, 4, 4]
@@ -245,6 +247,7 @@ def test_what_is_known_of_an_agent_is_the_same_at_every_server(servers: list[Sha
         one.render(CAMERA, np.eye(4))
     assert two.evict("ant", ban=True) == len(last)
     assert [client.status().fused_voxels for client in (one, two, three)] == [0, 0, 0]
+    assert [len(client.query_objects()) for client in (one, two, three)] == [0, 0, 0]
     with pytest.raises(SessionUnknownError):
         list(two.contribute([request(session, subsets[0])], 20.0))
     with pytest.raises(NotPermittedError, match="banned"):
