@@ -14,72 +14,60 @@ from gausslite.domain.voxels import tile_of, tiles_of
 from gausslite.fusion.vote import VoteResult
 
 
-class TileIndex:
-    """The voxels of each tile of 16 x 16 x 16 voxels, and the revision of its last change. Not thread-safe."""
+class VoxelLog:
+    """One layer of the fused map: its voxels, and the revision of the last change of each and of each tile.
 
-    def __init__(self) -> None:
+    A tile has 16 x 16 x 16 voxels; its name is the smallest key that it can hold. Not thread-safe.
+    """
+
+    def __init__(self, first_revision: int, max_removed: int) -> None:
+        self.revisions = RevisionLog(first_revision, max_removed)
         self._keys: dict[int, set[int]] = {}
-        self._revisions: dict[int, int] = {}
+        self._tile_revisions: dict[int, int] = {}
 
     def __contains__(self, key: int) -> bool:
         return key in self._keys.get(tile_of(key), ())
 
-    def copy(self) -> TileIndex:
-        """Return an equal index that changes on its own."""
-        other = TileIndex()
+    def copy(self) -> VoxelLog:
+        """Return an equal log that changes on its own."""
+        other = copy(self)
+        other.revisions, other._tile_revisions = self.revisions.copy(), dict(self._tile_revisions)
         other._keys = {tile: set(keys) for tile, keys in self._keys.items()}
-        other._revisions = dict(self._revisions)
         return other
 
     def tiles(self) -> Int64[ndarray, " t"]:
-        """Return the tiles that have voxels, ascending; a tile is named by the smallest key that it can hold."""
+        """Return the tiles that have voxels, ascending."""
         return np.sort(np.fromiter(self._keys, np.int64, len(self._keys)))
 
     def keys(self, tile: int) -> Int64[ndarray, " k"]:
         """Return the voxels of a tile, ascending."""
         return np.array(sorted(self._keys.get(tile, ())), np.int64)
 
-    def all_keys(self) -> set[int]:
-        """Return the voxels of all tiles."""
-        return set().union(*self._keys.values())
+    def all_keys(self) -> Int64[ndarray, " k"]:
+        """Return the voxels of all tiles, ascending."""
+        return np.array(sorted(set().union(*self._keys.values())), np.int64)
 
-    def revision(self, tile: int) -> int:
+    def tile_revision(self, tile: int) -> int:
         """Return the revision of the last change in a tile; 0 if it never had voxels."""
-        return self._revisions.get(tile, 0)
+        return self._tile_revisions.get(tile, 0)
 
-    def record(self, changed: Collection[int], removed: Collection[int], revision: int) -> None:
-        """Record that these voxels changed or became empty at this revision."""
+    def record(self, changed: Collection[int], removed: Collection[int] = ()) -> None:
+        """Record as one revision that these voxels changed or became empty; nothing without any."""
+        if not (changed or removed):
+            return
+        revision = self.revisions.revision + 1
+        self.revisions.record(changed, removed, revision)
         tiles = tiles_of(np.fromiter(changed, np.int64, len(changed))).tolist()
         for key, tile in zip(changed, tiles, strict=True):
             self._keys.setdefault(tile, set()).add(key)
-        self._revisions.update(dict.fromkeys(tiles, revision))
+        self._tile_revisions.update(dict.fromkeys(tiles, revision))
         for key in removed:
             tile = tile_of(key)
             own = self._keys.get(tile, set())
             own.discard(key)
             if not own:
                 self._keys.pop(tile, None)
-            self._revisions[tile] = revision
-
-
-class VoxelLog:
-    """The revisions of one layer of the fused map: when each voxel last changed, by voxel and by tile."""
-
-    def __init__(self, first_revision: int, max_removed: int) -> None:
-        self.revisions = RevisionLog(first_revision, max_removed)
-        self.tiles = TileIndex()
-
-    def copy(self) -> VoxelLog:
-        """Return an equal log that changes on its own."""
-        other = copy(self)
-        other.revisions, other.tiles = self.revisions.copy(), self.tiles.copy()
-        return other
-
-    def record(self, changed: Collection[int], removed: Collection[int]) -> None:
-        """Record as one revision that these voxels changed or became empty."""
-        revision = self.revisions.revision + 1
-        self.revisions.record(changed, removed, revision)
-        self.tiles.record(changed, removed, revision)
+            self._tile_revisions[tile] = revision
 
 
 class ChangeLog:
@@ -88,16 +76,11 @@ class ChangeLog:
     `first_revision` must exceed all revisions from before a restart.
     """
 
-    def __init__(self, first_revision: int = 1, max_removed: int = MAX_REMOVED_VOXELS) -> None:
+    def __init__(self, first_revision: int, max_removed: int = MAX_REMOVED_VOXELS) -> None:
         self.voxels = VoxelLog(first_revision, max_removed)
         self._winner: dict[int, tuple[str, int]] = {}
         self._won_voxels: dict[str, int] = {}
         self._fused_gaussians = 0
-
-    @property
-    def revision(self) -> int:
-        """The fused map's current revision."""
-        return self.voxels.revisions.revision
 
     @property
     def fused_voxels(self) -> int:
@@ -113,11 +96,6 @@ class ChangeLog:
         """Return the number of voxels that the agent wins."""
         return self._won_voxels.get(agent_id, 0)
 
-    @property
-    def tiles(self) -> TileIndex:
-        """The voxels of the fused map by tile."""
-        return self.voxels.tiles
-
     def winners(self, keys: Iterable[int]) -> dict[str, list[int]]:
         """Return those of the voxels that are in the fused map, by winner."""
         won: dict[str, list[int]] = {}
@@ -129,27 +107,17 @@ class ChangeLog:
 
     def load(self, vote: VoteResult) -> None:
         """Record the first result of the vote, on all voxels."""
-        names = [vote.agents[index] for index in vote.winner_index.tolist()]
-        counts = vote.counts[vote.offsets[:-1]].tolist()
-        keys = vote.keys.tolist()
-        for key, name, count in zip(keys, names, counts, strict=True):
-            self._set(key, (name, count))
-        if keys:
-            self.voxels.record(keys, [])
-
-    def mark_changed(self, keys: Int64[ndarray, " k"]) -> None:
-        """Record that these voxels of the fused map have changed, with the winners that are recorded already."""
-        if len(keys):
-            self.voxels.record(keys.tolist(), [])
+        winners = _winners(vote)
+        for key, winner in winners.items():
+            self._set(key, winner)
+        self.voxels.record(winners.keys())
 
     def record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]], vote: VoteResult) -> Int64[ndarray, " c"]:
         """Record which voxels changed by agent, as one revision; `vote` is the new result on these voxels.
 
         Returns the voxels where the fused map changed: those that such an agent wins now or won before.
         """
-        counts = vote.counts[vote.offsets[:-1]].tolist()
-        winners = zip((vote.agents[index] for index in vote.winner_index.tolist()), counts, strict=True)
-        new_winner = dict(zip(vote.keys.tolist(), winners, strict=True))
+        new_winner = _winners(vote)
         changed: dict[int, None] = {}
         removed: dict[int, None] = {}
         for agent_id, keys in changed_keys.items():
@@ -160,17 +128,8 @@ class ChangeLog:
                     if new != old:
                         self._set(key, new)
                     (removed if new is None else changed)[key] = None
-        if changed or removed:
-            self.voxels.record(list(changed), list(removed))
+        self.voxels.record(changed.keys(), removed.keys())
         return np.array(sorted([*changed, *removed]), np.int64)
-
-    def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
-        """Return the voxels that changed or became empty after this revision, ascending. Raises RevisionGoneError."""
-        return self.voxels.revisions.changed_since(revision)
-
-    def changed_after(self, keys: Iterable[int], revision: int) -> list[int]:
-        """Return those of the voxels of the fused map that changed after this revision."""
-        return [key for key in keys if self.voxels.revisions.changed_at(key) > revision]
 
     def _set(self, key: int, new: tuple[str, int] | None) -> None:
         old = self._winner.pop(key, None)
@@ -181,3 +140,11 @@ class ChangeLog:
             self._winner[key] = new
             self._won_voxels[new[0]] = self._won_voxels.get(new[0], 0) + 1
             self._fused_gaussians += new[1]
+
+
+def _winners(vote: VoteResult) -> dict[int, tuple[str, int]]:
+    """Return the winner of each voxel and the number of its Gaussians."""
+    winners = vote.winners
+    names = (winners.agents[index] for index in winners.agent_index.tolist())
+    counts = winners.scores["counts"].tolist()
+    return dict(zip(winners.scores["keys"].tolist(), zip(names, counts, strict=True), strict=True))

@@ -32,7 +32,6 @@ from gausslite.fusion.vote_input import SLICE_VOXELS
 _log = logging.getLogger(__name__)
 _MAX_VOXELS = 4096
 _MAX_THINNED_VOXELS = 12_000
-_NO_KEYS = np.zeros(0, np.int64)
 _SAMPLE_BLOCK = 8
 """Voxels on a side of the blocks that are sampled completely or not at all, so that surfaces stay dense."""
 _MAX_WITNESSES = 4
@@ -162,8 +161,7 @@ class FrameAligner:
     def samples(self, agent_id: str) -> SurfaceSamples:
         """Return samples of the agent's whole map, a large one thinned evenly, in the fused frame if that is known."""
         with self._lock:
-            alignment, table = self._alignments.get(agent_id), self._store.scores()
-        keys = table.keys[table.agent_index == table.agents.index(agent_id)] if agent_id in table.agents else _NO_KEYS
+            alignment, keys = self._alignments.get(agent_id), self._store.keys(agent_id)
         # the blocks of maps in different frames never coincide, so single voxels are chosen
         keys = keys[np.argsort(hash_columns(keys), kind="stable")[:_MAX_THINNED_VOXELS]]
         whole = _AgentMap(epoch=0)
@@ -368,7 +366,7 @@ class FrameAligner:
         for start in range(0, len(keys), SLICE_VOXELS):
             part = keys[start : start + SLICE_VOXELS]
             batch = self._store.batch(agent_id, part)
-            yield part, batch, self._store.stored(agent_id, batch.keys).update_seqs
+            yield part, batch, self._store.stored(agent_id, batch.keys)["update_seqs"]
 
     def _due(self) -> list[str]:
         """Return the agents with enough new data, those first whose latest comparison is the oldest."""
@@ -385,11 +383,10 @@ class FrameAligner:
 
     def _restore(self) -> None:
         """Read every agent's map with the next run; who was quarantined is tested again, and stays so until then."""
-        table = self._store.scores()
-        for index, agent_id in enumerate(table.agents):
-            keys = table.keys[table.agent_index == index].tolist()
+        for agent_id in self._store.agents():
             own = self._map_of(agent_id)
-            own.unread, own.changed = set(keys), len(keys)
+            own.unread = set(self._store.keys(agent_id).tolist())
+            own.changed = len(own.unread)
             own.first_seq = self._store.totals(agent_id).highest_update_seq + 1
         for name in self._alignments.unused:
             alignment = self._alignments.get(name)

@@ -30,7 +30,7 @@ from gausslite.domain.voxels import (
     select_voxels,
     tiles_of,
 )
-from gausslite.fusion.change_log import ChangeLog, TileIndex, VoxelLog
+from gausslite.fusion.change_log import ChangeLog, VoxelLog
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import VoteResult, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
@@ -109,9 +109,10 @@ def _decode_refinement(data: bytes) -> StoredRefinement:
 
 
 def _winner_hashes(vote: VoteResult) -> UInt64[ndarray, " v"]:
-    first = vote.offsets[:-1]
-    names = np.array([zlib.crc32(name.encode()) for name in vote.agents], np.uint64)
-    return hash_columns(names[vote.winner_index], vote.update_seqs[first], vote.kappa_sums[first], vote.counts[first])
+    winners = vote.winners
+    names = np.array([zlib.crc32(name.encode()) for name in winners.agents], np.uint64)
+    numbers = (winners.scores[name] for name in ("update_seqs", "kappa_sums", "counts"))
+    return hash_columns(names[winners.agent_index], *numbers)
 
 
 class MapLayer(StrEnum):
@@ -169,12 +170,10 @@ class FusedMapLayers:
         vote = rank_voxels(votes.scores())
         self._change_log.load(vote)
         # until the first refinement, the refined layer is the vote
-        self._refined_log = self._change_log.voxels
+        self._voted_log = self._refined_log = self._change_log.voxels
         if stored is not None:
             self._refined_log = VoxelLog(first_revision, max_removed_voxels)
-            shown = self._restore_refined(stored, vote)
-            if len(shown):
-                self._refined_log.record(shown.tolist(), [])
+            self._refined_log.record(self._restore_refined(stored, vote).tolist())
 
     def revision(self, layer: MapLayer = MapLayer.VOTE) -> int:
         """Return the layer's revision; it increases with every change."""
@@ -202,21 +201,25 @@ class FusedMapLayers:
 
     def record_all(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
         """Record that what the vote reads changed in these voxels of each agent, with one vote on all of them."""
-        if changed_keys:
-            with self._lock:
-                self._record(changed_keys)
+        if not changed_keys:
+            return
+        with self._lock:
+            vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
+            fused_changes = self._change_log.record(changed_keys, vote)
+            if self._refined is not None:
+                present = set(vote.keys.tolist())
+                changed = [key for key in fused_changes.tolist() if key in present]
+                removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_log]
+                self._refined_log.record(changed, removed)
 
     def changes(self, since_revision: int = 0, layer: MapLayer = MapLayer.VOTE) -> FusedMapChanges:
         """Return the changes of a layer since a revision; the whole map for 0. Raises RevisionGoneError."""
         with self._lock:
-            log = self._log_of(layer).revisions
-            if since_revision:
-                keys = log.changed_since(since_revision)
-            else:
-                keys = np.array(sorted(self._tiles_of(layer).all_keys()), np.int64)
+            log = self._log_of(layer)
+            keys = log.revisions.changed_since(since_revision) if since_revision else log.all_keys()
             won = self._won_voxels(layer, keys)
             removed = np.setdiff1d(keys, won.batch.keys) if since_revision else np.zeros(0, np.int64)
-            return FusedMapChanges(log.revision, won, removed)
+            return FusedMapChanges(log.revisions.revision, won, removed)
 
     def voted_map(self, only_agent: str = "") -> VoxelBatch:
         """Return the fused map, or its voxels that one agent wins."""
@@ -244,18 +247,19 @@ class FusedMapLayers:
         for key, tile in zip(refined.batch.keys.tolist(), tiles_of(refined.batch.keys).tolist(), strict=True):
             own.setdefault(tile, set()).add(key)
         with self._lock:
-            changed = set(self._change_log.changed_since(revision).tolist())
+            revisions = self._voted_log.revisions
+            changed = set(revisions.changed_since(revision).tolist())
             if self._refined is None:
-                self._refined_log = self._change_log.voxels.copy()
-            self._refined, seen = refined, self._change_log.revision
-            known = {*self._refined_log.tiles.tiles().tolist(), *self._change_log.tiles.tiles().tolist()}
+                self._refined_log = self._voted_log.copy()
+            self._refined, seen = refined, revisions.revision
+            known = {*self._refined_log.tiles().tolist(), *self._voted_log.tiles().tolist()}
         keys, hashes = [np.zeros(0, np.int64)], [np.zeros(0, np.uint64)]
         for tile in sorted(known | own.keys()):
             with self._lock:
-                changed.update(self._change_log.changed_since(seen).tolist())
-                seen = self._change_log.revision
+                changed.update(revisions.changed_since(seen).tolist())
+                seen = revisions.revision
                 self._show_tile(tile, own.get(tile, set()), changed)
-                vote = rank_voxels(self._votes.scores(self._change_log.tiles.keys(tile)))
+                vote = rank_voxels(self._votes.scores(self._voted_log.keys(tile)))
             keys.append(vote.keys)
             hashes.append(_winner_hashes(vote))
         voted = np.concatenate(keys)
@@ -265,7 +269,7 @@ class FusedMapLayers:
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the voxels of the vote that changed or became empty after this revision. Raises RevisionGoneError."""
         with self._lock:
-            return self._change_log.changed_since(revision)
+            return self._voted_log.revisions.changed_since(revision)
 
     def refined_map(self) -> VoxelBatch:
         """Return the refined map; voxels that changed after the refinement started show the newer vote.
@@ -279,34 +283,32 @@ class FusedMapLayers:
     def tiles(self, layer: MapLayer) -> tuple[int, Int64[ndarray, " t"]]:
         """Return the layer's revision and the tiles of its voxels, ascending."""
         with self._lock:
-            return self.revision(layer), self._tiles_of(layer).tiles()
+            return self.revision(layer), self._log_of(layer).tiles()
 
     def tile_revision(self, layer: MapLayer, tile: int) -> int:
         """Return the revision of the last change in a tile."""
         with self._lock:
-            return self._tiles_of(layer).revision(tile)
+            return self._log_of(layer).tile_revision(tile)
 
     def tile(self, layer: MapLayer, tile: int) -> WonVoxels:
         """Return the voxels of a tile as they are now."""
         with self._lock:
-            return self._won_voxels(layer, self._tiles_of(layer).keys(tile))
+            return self._won_voxels(layer, self._log_of(layer).keys(tile))
 
     def _log_of(self, layer: MapLayer) -> VoxelLog:
-        return self._change_log.voxels if layer is MapLayer.VOTE else self._refined_log
+        return self._voted_log if layer is MapLayer.VOTE else self._refined_log
 
     def _read_tiles(self, layer: MapLayer) -> Iterator[WonVoxels]:
         """Yield the tiles of a layer. Messages are served in between, so that later tiles may be newer."""
         yield from (self.tile(layer, tile) for tile in self.tiles(layer)[1].tolist())
-
-    def _tiles_of(self, layer: MapLayer) -> TileIndex:
-        return self._log_of(layer).tiles
 
     def _won_voxels(self, layer: MapLayer, keys: Int64[ndarray, " k"]) -> WonVoxels:
         voted = keys
         parts = []
         refined = self._refined if layer is MapLayer.REFINED else None
         if refined is not None:
-            voted = np.array(self._change_log.changed_after(keys.tolist(), refined.revision), np.int64)
+            changed_at = self._voted_log.revisions.changed_at
+            voted = np.array([key for key in keys.tolist() if changed_at(key) > refined.revision], np.int64)
             parts.append(select_keys(refined.batch, np.setdiff1d(keys, voted)))
         winners = self._change_log.winners(voted.tolist())
         parts += [self._votes.batch(name, np.array(own, np.int64)) for name, own in winners.items()]
@@ -316,30 +318,17 @@ class FusedMapLayers:
         winners = self._change_log.winners(batch.keys.tolist())
         return WonVoxels(batch, winners)
 
-    def _record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
-        vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
-        fused_changes = self._change_log.record(changed_keys, vote)
-        if self._refined is None:
-            return
-        present = set(vote.keys.tolist())
-        changed = [key for key in fused_changes.tolist() if key in present]
-        removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_log.tiles]
-        if changed or removed:
-            self._refined_log.record(changed, removed)
-
     def _restore_refined(self, stored: StoredRefinement, vote: VoteResult) -> Int64[ndarray, " k"]:
         """Show a refinement from before a restart; returns the voxels of the refined layer."""
         changed = stored.changed_voxels(vote)
-        self._refined = RefinedMap(stored.without_removed(vote), self._change_log.revision)
-        self._change_log.mark_changed(changed)
+        self._refined = RefinedMap(stored.without_removed(vote), self._voted_log.revisions.revision)
+        self._voted_log.record(changed.tolist())
         return np.union1d(self._refined.batch.keys, changed)
 
     def _show_tile(self, tile: int, refined: set[int], changed: set[int]) -> None:
         """Record a tile of the refined layer; changed: the voxels that show the vote."""
-        before = set(self._refined_log.tiles.keys(tile).tolist())
-        updated, removed = sorted(refined - changed), sorted(before - refined - changed)
-        if updated or removed:
-            self._refined_log.record(updated, removed)
+        before = set(self._refined_log.keys(tile).tolist())
+        self._refined_log.record(sorted(refined - changed), sorted(before - refined - changed))
 
     def _require_contributor(self, agent_id: str) -> None:
         agents = self._votes.agents()

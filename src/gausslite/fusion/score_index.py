@@ -10,22 +10,20 @@ from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import repeat
 from operator import or_
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray
-from numpy.typing import NDArray
 
 from gausslite.codec.stored import RECORD, to_records
-from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
+from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels, join_elements
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch
-from gausslite.fusion.store_values import AgentTotals, StoredScores, VoxelScoreTable
+from gausslite.fusion.store_values import NO_SCORES, SCORES, AgentTotals, Scores, VoxelScoreTable
 
 _FIRST_CAPACITY = 64
-_DTYPES = (np.int64, np.int64, np.uint64, np.uint32, np.int64)
-_NO_COLUMNS: tuple[NDArray[Any], ...] = tuple(np.zeros(0, dtype) for dtype in _DTYPES)
+_MISSING = np.zeros((), SCORES)
+_MISSING["update_seqs"] = _MISSING["rows"] = -1
 ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[StoredVoxels]]
 """Returns an agent's stored updates of some voxels in parts, each with ascending keys."""
 
@@ -52,45 +50,37 @@ class ScoreIndex:
 
     def digests(self, agent_id: str) -> TileDigests:
         """Return the digests of an agent's rows; empty for an unknown one."""
-        rows = self._rows.get(agent_id)
-        return TileDigests.sum_of(()) if rows is None else TileDigests.of(*rows.sorted_columns(None)[:2])
+        scores = self.sorted_scores(agent_id)
+        return TileDigests.of(scores["keys"], scores["update_seqs"])
 
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
-        """Return the agent's totals on these voxels, in their order; update_seq is -1 where it has none."""
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
+        """Return the agent's totals on these voxels, in their order."""
         rows = self._rows.get(agent_id)
-        if rows is None:
-            return StoredScores.missing(len(keys))
-        return rows.stored(rows.find(keys))
+        return np.full(len(keys), _MISSING) if rows is None else rows.stored(rows.find(keys))
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         wanted = None if keys is None else np.unique(keys)
         holders = -1 if wanted is None else self._holders_of(wanted)
         present = [index for index, agent_id in enumerate(self._agents) if self._bits[agent_id] & holders]
-        parts = [self._rows[self._agents[index]].sorted_columns(wanted) for index in present]
-        return VoxelScoreTable(
-            self._agents,
-            np.repeat(np.array(present, np.int32), [len(part[0]) for part in parts]),
-            np.concatenate([np.zeros(0, np.int64), *(part[0] for part in parts)]),
-            np.concatenate([np.zeros(0, np.int64), *(part[1] for part in parts)]),
-            np.concatenate([np.zeros(0, np.uint64), *(part[2] for part in parts)]),
-            np.concatenate([np.zeros(0, np.uint32), *(part[3] for part in parts)]),
-        )
+        parts = [self._rows[self._agents[index]].sorted_scores(wanted) for index in present]
+        agent_index = np.repeat(np.array(present, np.int32), [len(part) for part in parts])
+        return VoxelScoreTable(self._agents, agent_index, join_elements([NO_SCORES, *parts]))
 
-    def columns(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> tuple[NDArray[Any], ...]:
-        """Return keys, update_seqs, kappa_sums, counts and rows of an agent's voxels (ascending keys), or of all."""
+    def sorted_scores(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> Scores:
+        """Return the agent's totals on those of these voxels (ascending keys) that it has, or on all."""
         rows = self._rows.get(agent_id)
-        return _NO_COLUMNS if rows is None else rows.sorted_columns(keys)
+        return NO_SCORES if rows is None else rows.sorted_scores(keys)
 
-    def put(self, agent_id: str, keys: Int64[ndarray, " k"], scores: StoredScores) -> StoredScores:
-        """Replace the agent's totals on these voxels; returns those from before."""
+    def put(self, agent_id: str, scores: Scores) -> Scores:
+        """Replace the agent's totals on the voxels of the scores; returns those from before."""
         if agent_id not in self._rows:
             self._rows[agent_id] = _AgentRows()
             self._agents = tuple(sorted(self._rows))
             used = reduce(or_, self._bits.values(), 0)
             self._bits[agent_id] = ~used & (used + 1)
         bit = self._bits[agent_id]
-        new_keys, before = self._rows[agent_id].put(keys, scores)
+        new_keys, before = self._rows[agent_id].put(scores)
         for key in new_keys:
             self._holders[key] = self._holders.get(key, 0) | bit
         return before
@@ -102,7 +92,7 @@ class ScoreIndex:
             return np.zeros(0, np.int64)
         self._agents = tuple(sorted(self._rows))
         bit = self._bits.pop(agent_id)
-        keys = rows.sorted_columns(None)[0]
+        keys = rows.sorted_scores(None)["keys"].copy()
         for key in keys.tolist():
             left = self._holders[key] & ~bit
             if left:
@@ -123,13 +113,13 @@ def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadVoxels) -> B
     """
     keys, table = update.voxels.keys, update.voxels.voxels
     stored = index.stored(update.agent_id, keys)
-    newer: Bool[ndarray, " v"] = stored.update_seqs < update.update_seq
-    same_seq = stored.update_seqs == update.update_seq
+    newer: Bool[ndarray, " v"] = stored["update_seqs"] < update.update_seq
+    same_seq = stored["update_seqs"] == update.update_seq
     if same_seq.any():
         sums, counts = table["kappa_sums"], table["counts"]
-        same_sum = stored.kappa_sums == sums
-        newer |= same_seq & ((sums > stored.kappa_sums) | (same_sum & (counts > stored.counts)))
-        equal = np.flatnonzero(same_seq & same_sum & (counts == stored.counts) & (counts > 0))
+        same_sum = stored["kappa_sums"] == sums
+        newer |= same_seq & ((sums > stored["kappa_sums"]) | (same_sum & (counts > stored["counts"])))
+        equal = np.flatnonzero(same_seq & same_sum & (counts == stored["counts"]) & (counts > 0))
         for part in read(update.agent_id, keys[equal]) if len(equal) else ():
             places = np.searchsorted(keys, part.keys)
             newer[places] = _are_larger(update.voxels.take(places), part)
@@ -153,41 +143,36 @@ def voxel_records(batch: VoxelBatch) -> list[bytes]:
 
 
 class _AgentRows:
-    """Columns of one agent's totals, in the order of arrival, and the row of each voxel."""
+    """One agent's totals, in the order of arrival, and the row of each voxel among them."""
 
     def __init__(self) -> None:
         self.totals = AgentTotals()
         self._row_of: dict[int, int] = {}
-        self._columns: tuple[NDArray[Any], ...] = tuple(np.zeros(_FIRST_CAPACITY, dtype) for dtype in _DTYPES)
+        self._scores: Scores = np.zeros(_FIRST_CAPACITY, SCORES)
 
     def find(self, keys: Int64[ndarray, " k"]) -> Int64[ndarray, " k"]:
         """Return the row of each voxel, -1 where there is none."""
         return np.fromiter(map(self._row_of.get, keys.tolist(), repeat(-1)), np.int64, len(keys))
 
-    def stored(self, rows: Int64[ndarray, " k"]) -> StoredScores:
+    def stored(self, rows: Int64[ndarray, " k"]) -> Scores:
         """Return the totals in these rows."""
-        _, update_seqs, kappa_sums, counts, numbers = self._columns
-        is_stored = rows >= 0
-        if is_stored.all():
-            return StoredScores(update_seqs[rows], kappa_sums[rows], counts[rows], numbers[rows])
-        return StoredScores(
-            np.where(is_stored, update_seqs[rows], -1),
-            np.where(is_stored, kappa_sums[rows], np.uint64(0)),
-            np.where(is_stored, counts[rows], np.uint32(0)),
-            np.where(is_stored, numbers[rows], -1),
-        )
+        # `take` copies elements as they are, an index copies them field by field
+        found = self._scores.take(rows)
+        found[rows < 0] = _MISSING
+        return found
 
-    def sorted_columns(self, wanted: Int64[ndarray, " k"] | None) -> tuple[NDArray[Any], ...]:
-        """Return keys, update_seqs, kappa_sums, counts and rows of the wanted voxels (ascending keys), or of all."""
+    def sorted_scores(self, wanted: Int64[ndarray, " k"] | None) -> Scores:
+        """Return the totals of the wanted voxels (ascending keys), or of all."""
         if wanted is None:
-            rows = np.argsort(self._columns[0][: len(self._row_of)])
+            rows = np.argsort(self._scores["keys"][: len(self._row_of)])
         else:
             rows = self.find(wanted)
             rows = rows[rows >= 0]
-        return tuple(column[rows] for column in self._columns)
+        return self._scores.take(rows)
 
-    def put(self, keys: Int64[ndarray, " k"], scores: StoredScores) -> tuple[list[int], StoredScores]:
-        """Replace the totals of these voxels; returns the keys that had none, and the totals from before."""
+    def put(self, scores: Scores) -> tuple[list[int], Scores]:
+        """Replace the totals of the voxels of the scores; returns the keys that had none, and those from before."""
+        keys = scores["keys"]
         rows = self.find(keys)
         before = self.stored(rows)
         is_new = rows < 0
@@ -196,14 +181,12 @@ class _AgentRows:
         rows[is_new] = np.arange(used, used + len(new_keys))
         self._reserve(used + len(new_keys))
         self._row_of.update(zip(new_keys, range(used, used + len(new_keys)), strict=True))
-        values = keys, scores.update_seqs, scores.kappa_sums, scores.counts, scores.rows
-        for column, value in zip(self._columns, values, strict=True):
-            column[rows] = value
+        self._scores[rows] = scores
         self.totals = self.totals.replace_part(before, scores)
         return new_keys, before
 
     def _reserve(self, size: int) -> None:
-        capacity = len(self._columns[0])
+        capacity = len(self._scores)
         if size > capacity:
             extra = max(size, 2 * capacity) - capacity
-            self._columns = tuple(np.concatenate([c, np.zeros(extra, c.dtype)]) for c in self._columns)
+            self._scores = np.concatenate([self._scores, np.zeros(extra, SCORES)])

@@ -28,8 +28,8 @@ from gausslite.fusion.store_values import (
     AgentTotals,
     MissionConfig,
     PutOutcome,
+    Scores,
     SessionRecord,
-    StoredScores,
     VoxelScoreTable,
     require_storable,
 )
@@ -114,7 +114,12 @@ class FusionStore(ABC):
         with self._index_lock:
             return self._log.index.digests(agent_id)
 
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+    def keys(self, agent_id: str) -> Int64[ndarray, " v"]:
+        """Return the keys of an agent's updates (with tombstones), ascending."""
+        with self._index_lock:
+            return np.ascontiguousarray(self._log.index.sorted_scores(agent_id)["keys"])
+
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels, in their order."""
         with self._index_lock:
             return self._log.index.stored(agent_id, keys)

@@ -21,11 +21,11 @@ from jaxtyping import Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels, join_elements
+from gausslite.codec.stored_voxels import VOXELS, StoredSubset, StoredVoxels, join_elements
 from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of, tiles_of
 from gausslite.fusion.score_index import ScoreIndex, newer_voxels
-from gausslite.fusion.store_values import PutOutcome, StoredScores
+from gausslite.fusion.store_values import SCORES, PutOutcome, Scores
 
 UpdateRow = tuple[int, str, int, bytes]
 """number, agent_id, checksum, voxels."""
@@ -68,7 +68,7 @@ class LogChange:
     rows: list[UpdateRow] = field(default_factory=list)
     added: list[tuple[_TileName, int, int]] = field(default_factory=list)
     emptied: list[tuple[_TileName, list[int]]] = field(default_factory=list)
-    puts: list[tuple[str, Int64[ndarray, " _"], StoredScores]] = field(default_factory=list)
+    puts: list[tuple[str, Scores]] = field(default_factory=list)
     outcomes: list[PutOutcome] = field(default_factory=list)
 
 
@@ -98,7 +98,7 @@ class UpdateLog:
             order = np.lexsort((numbers, table["update_seqs"], table["keys"]))
             keys = table["keys"][order]
             latest = order[np.append(keys[1:] != keys[:-1], True)[: len(keys)]]
-            self._put(agent_id, *_scores(table[latest], numbers[latest]))
+            self._put(agent_id, _scores(table[latest], numbers[latest]))
 
     def plan(self, updates: Sequence[StoredSubset], read: ReadRows) -> LogChange:
         """Return how to store messages of different agents, each completely. Raises StorageError."""
@@ -114,7 +114,7 @@ class UpdateLog:
                 table = join_elements([voxels.voxels for _, voxels in written])
                 numbers = np.array([number for number, _ in written], np.int64)
                 rows = np.repeat(numbers, [len(voxels) for _, voxels in written])
-                change.puts.append((update.agent_id, *_scores(table, rows)))
+                change.puts.append((update.agent_id, _scores(table, rows)))
         return change
 
     def apply(self, change: LogChange) -> None:
@@ -126,8 +126,8 @@ class UpdateLog:
             self._outdated += numbers
         for name, number, size in change.added:
             self._add_row(name, number, size)
-        for agent_id, keys, scores in change.puts:
-            self._put(agent_id, keys, scores)
+        for agent_id, scores in change.puts:
+            self._put(agent_id, scores)
 
     def rows_of(self, agent_id: str) -> list[int]:
         """Return the numbers of all rows of an agent, and of those that the next transaction deletes."""
@@ -142,8 +142,8 @@ class UpdateLog:
 
     def places(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> Places:
         """Return where the agent's updates of these voxels, or all, are."""
-        columns = self.index.columns(agent_id, None if keys is None else np.unique(keys))
-        return columns[0], columns[4]
+        scores = self.index.sorted_scores(agent_id, None if keys is None else np.unique(keys))
+        return np.ascontiguousarray(scores["keys"]), np.ascontiguousarray(scores["rows"])
 
     def _stored(self, agent_id: str, keys: Int64[ndarray, " k"], read: ReadRows) -> list[StoredVoxels]:
         keys, rows = self.places(agent_id, keys)
@@ -159,7 +159,7 @@ class UpdateLog:
         if own is not None and own.is_outdated:
             for number, data in read(sorted(own.sizes)).items():
                 voxels = StoredVoxels.from_row(data)
-                is_used = self.index.stored(agent_id, voxels.keys).rows == number
+                is_used = self.index.stored(agent_id, voxels.keys)["rows"] == number
                 is_used &= ~np.isin(voxels.keys, part.keys)
                 if is_used.any():
                     parts.setdefault(voxels.size_m, []).append(voxels.take(np.flatnonzero(is_used)))
@@ -176,11 +176,12 @@ class UpdateLog:
     def _add_row(self, name: _TileName, number: int, size: int) -> None:
         self._tiles.setdefault(name, _Tile()).sizes[number] = size
 
-    def _put(self, agent_id: str, keys: Int64[ndarray, " k"], scores: StoredScores) -> None:
+    def _put(self, agent_id: str, scores: Scores) -> None:
         """Replace the totals of these voxels in the index, and the sizes in use in their tiles."""
-        before = self.index.put(agent_id, keys, scores)
-        sizes = (scores.counts + float(_VOXEL_UNITS)) - np.where(before.rows >= 0, before.counts + _VOXEL_UNITS, 0)
-        tiles, places = np.unique(tiles_of(keys), return_inverse=True)
+        before = self.index.put(agent_id, scores)
+        was_used = np.where(before["rows"] >= 0, before["counts"] + _VOXEL_UNITS, 0)
+        sizes = (scores["counts"] + float(_VOXEL_UNITS)) - was_used
+        tiles, places = np.unique(tiles_of(scores["keys"]), return_inverse=True)
         for tile, size in zip(tiles.tolist(), np.bincount(places, sizes, len(tiles)).tolist(), strict=True):
             self._tiles[agent_id, tile].used += int(size)
 
@@ -257,7 +258,10 @@ def _size(voxels: StoredVoxels) -> int:
     return len(voxels.gaussians) + _VOXEL_UNITS * len(voxels)
 
 
-def _scores(table: NDArray[Any], rows: Int64[ndarray, " k"]) -> tuple[Int64[ndarray, " k"], StoredScores]:
-    """Return the keys of voxels and their totals, of elements of VOXELS."""
-    keys, sums, counts = (np.ascontiguousarray(table[name]) for name in ("keys", "kappa_sums", "counts"))
-    return keys, StoredScores(table["update_seqs"].astype(np.int64), sums, counts, rows)
+def _scores(table: NDArray[Any], rows: Int64[ndarray, " k"]) -> Scores:
+    """Return the totals of the voxels of elements of VOXELS, which are in these rows."""
+    scores = np.empty(len(table), SCORES)
+    for name in VOXELS.names or ():
+        scores[name] = table[name]
+    scores["rows"] = rows
+    return scores

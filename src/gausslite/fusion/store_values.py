@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Int32, Int64, UInt32, UInt64
+from jaxtyping import Int32, Int64, UInt64
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.checks import quote_name, require_identifier, require_name
@@ -73,35 +75,40 @@ class PutOutcome:
     stale: Int64[ndarray, " s"]
 
 
+SCORES = np.dtype(
+    [
+        ("keys", np.int64),
+        ("update_seqs", np.int64),
+        ("kappa_sums", np.uint64),
+        ("counts", np.uint32),
+        ("rows", np.int64),
+    ]
+)
+Scores = NDArray[Any]
+"""An element of SCORES for each of an agent's updates: its totals, and the store's row that has its Gaussians.
+
+update_seq and row are -1 where the agent has no update of a voxel.
+"""
+NO_SCORES: Scores = np.zeros(0, SCORES)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelScoreTable:
     """The totals of every update (tombstones included) without the Gaussians: the input of the vote.
 
-    agent_index holds indices into `agents`, which is sorted; rows are sorted by (agent, key).
+    agent_index holds indices into `agents`, which is sorted; the scores are sorted by (agent, key).
     """
 
     agents: tuple[str, ...]
     agent_index: Int32[ndarray, " w"]
-    keys: Int64[ndarray, " w"]
-    update_seqs: Int64[ndarray, " w"]
-    kappa_sums: UInt64[ndarray, " w"]
-    counts: UInt32[ndarray, " w"]
+    scores: Scores
 
+    def __len__(self) -> int:
+        return len(self.scores)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredScores:
-    """The totals of an agent's updates of some voxels, and the store's row of each; -1 where it has no update."""
-
-    update_seqs: Int64[ndarray, " k"]
-    kappa_sums: UInt64[ndarray, " k"]
-    counts: UInt32[ndarray, " k"]
-    rows: Int64[ndarray, " k"]
-
-    @classmethod
-    def missing(cls, voxels: int) -> StoredScores:
-        """Return the totals of an agent without updates."""
-        none = np.full(voxels, -1, np.int64)
-        return cls(none, np.zeros(voxels, np.uint64), np.zeros(voxels, np.uint32), none)
+    def take(self, places: Int64[ndarray, " s"]) -> VoxelScoreTable:
+        """Return the scores at these places."""
+        return VoxelScoreTable(self.agents, self.agent_index[places], self.scores.take(places))
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,14 +121,15 @@ class AgentTotals:
     kappa_sum: int = 0
     highest_update_seq: int = 0
 
-    def replace_part(self, removed: StoredScores, added: StoredScores) -> AgentTotals:
+    def replace_part(self, removed: Scores, added: Scores) -> AgentTotals:
         """Return the totals after `added` replaced `removed`."""
+        counts, counts_before = added["counts"], removed["counts"]
         return AgentTotals(
-            self.voxels + len(added.counts) - int(np.count_nonzero(removed.update_seqs >= 0)),
-            self.occupied_voxels + int(np.count_nonzero(added.counts)) - int(np.count_nonzero(removed.counts)),
-            self.gaussians + int(added.counts.sum(dtype=np.int64)) - int(removed.counts.sum(dtype=np.int64)),
-            self.kappa_sum + _exact_sum(added.kappa_sums) - _exact_sum(removed.kappa_sums),
-            max(self.highest_update_seq, int(added.update_seqs.max(initial=0))),
+            self.voxels + len(added) - int(np.count_nonzero(removed["update_seqs"] >= 0)),
+            self.occupied_voxels + int(np.count_nonzero(counts)) - int(np.count_nonzero(counts_before)),
+            self.gaussians + int(counts.sum(dtype=np.int64)) - int(counts_before.sum(dtype=np.int64)),
+            self.kappa_sum + _exact_sum(added["kappa_sums"]) - _exact_sum(removed["kappa_sums"]),
+            max(self.highest_update_seq, int(added["update_seqs"].max(initial=0))),
         )
 
 

@@ -378,10 +378,10 @@ def require_within_quotas(subset: StoredSubset, store: FusionStore, quotas: Quot
     """Raise QuotaError if the agent would have too many voxels (with tombstones) or Gaussians."""
     stored, totals = store.stored(subset.agent_id, subset.voxels.keys), store.totals(subset.agent_id)
     # equal numbers count as newer: a larger content replaces the stored one, and a duplicate adds nothing
-    newer = stored.update_seqs <= subset.update_seq
-    added = subset.voxels.counts[newer].sum(dtype=np.int64) - stored.counts[newer].sum(dtype=np.int64)
+    newer = stored["update_seqs"] <= subset.update_seq
+    added = subset.voxels.counts[newer].sum(dtype=np.int64) - stored["counts"][newer].sum(dtype=np.int64)
     for name, value, limit in (
-        ("voxels", totals.voxels + int(np.count_nonzero(stored.update_seqs < 0)), quotas.voxels_per_agent),
+        ("voxels", totals.voxels + int(np.count_nonzero(stored["update_seqs"] < 0)), quotas.voxels_per_agent),
         ("Gaussians", totals.gaussians + int(added), quotas.gaussians_per_agent),
     ):
         if value > limit:

@@ -6,54 +6,52 @@ and voxels can be fused in shards whose union is the whole map.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int32, Int64, UInt32, UInt64
+from jaxtyping import Bool, Int32, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelScore, VoxelVotes, gather_rows, group_by_voxel
-from gausslite.fusion.store_values import VoxelScoreTable
+from gausslite.fusion.store_values import SCORES, VoxelScoreTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoteResult:
     """The agents' scores on every voxel that holds Gaussians, best first within a voxel; tombstones have no score.
 
-    Voxel i has the key keys[i] (ascending) and the scores offsets[i] : offsets[i + 1]; the first one wins.
-    agent_index holds indices into `agents`.
+    Voxel i has the key keys[i] (ascending) and the scores offsets[i] : offsets[i + 1] of `ranked`; the first one wins.
     """
 
-    agents: tuple[str, ...]
-    keys: Int64[ndarray, " v"]
+    ranked: VoxelScoreTable
     offsets: Int64[ndarray, " v1"]
-    agent_index: Int32[ndarray, " s"]
-    update_seqs: Int64[ndarray, " s"]
-    kappa_sums: UInt64[ndarray, " s"]
-    counts: UInt32[ndarray, " s"]
 
     def __len__(self) -> int:
-        return len(self.keys)
+        return len(self.offsets) - 1
 
     @property
-    def winner_index(self) -> Int32[ndarray, " v"]:
-        """For each voxel the index into `agents` of the winner."""
-        first: Int32[ndarray, " v"] = self.agent_index[self.offsets[:-1]]
-        return first
+    def winners(self) -> VoxelScoreTable:
+        """The winner's score on each voxel."""
+        return self.ranked.take(self.offsets[:-1])
+
+    @property
+    def keys(self) -> Int64[ndarray, " v"]:
+        """The voxels, ascending."""
+        return np.ascontiguousarray(self.winners.scores["keys"])
 
     def votes(self) -> Iterator[VoxelVotes]:
         """Yield the result on each voxel as an object, in key order."""
-        for i, key in enumerate(self.keys.tolist()):
-            rows = range(int(self.offsets[i]), int(self.offsets[i + 1]))
-            yield VoxelVotes(
-                key,
-                tuple(
-                    VoxelScore(self.agents[self.agent_index[row]], int(self.kappa_sums[row]), int(self.counts[row]))
-                    for row in rows
-                ),
-            )
+        table = self.ranked
+        columns = table.agent_index, table.scores["kappa_sums"], table.scores["counts"]
+        scores = [
+            VoxelScore(table.agents[agent], kappa_sum, count)
+            for agent, kappa_sum, count in zip(*(column.tolist() for column in columns), strict=True)
+        ]
+        for key, (start, end) in zip(self.keys.tolist(), itertools.pairwise(self.offsets.tolist()), strict=True):
+            yield VoxelVotes(key, tuple(scores[start:end]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,87 +68,68 @@ class FusedMap:
 
     @property
     def provenance(self) -> Int32[ndarray, " n"]:
-        """For each Gaussian the index into vote.agents of its agent."""
-        return np.repeat(self.vote.winner_index, self.batch.counts)
+        """For each Gaussian the index into vote.ranked.agents of its agent."""
+        return np.repeat(self.vote.winners.agent_index, self.batch.counts)
 
     def won_by(self, agent_id: str) -> Bool[ndarray, " v"]:
         """True for the voxels this agent wins."""
-        is_agent = np.array([name == agent_id for name in self.vote.agents], np.bool_)
-        won: Bool[ndarray, " v"] = is_agent[self.vote.winner_index]
+        winners = self.vote.winners
+        is_agent = np.array([name == agent_id for name in winners.agents], np.bool_)
+        won: Bool[ndarray, " v"] = is_agent[winners.agent_index]
         return won
 
 
-def rank_voxels(scores: VoxelScoreTable) -> VoteResult:
+def rank_voxels(table: VoxelScoreTable) -> VoteResult:
     """Rank the agents on each voxel by (higher Σkappa, more Gaussians, lower agent id)."""
-    order, is_first = _ranking(scores)
-    keys = scores.keys[order]
-    return VoteResult(
-        agents=scores.agents,
-        keys=keys[is_first],
-        offsets=np.append(np.flatnonzero(is_first), len(order)).astype(np.int64),
-        agent_index=scores.agent_index[order],
-        update_seqs=scores.update_seqs[order],
-        kappa_sums=scores.kappa_sums[order],
-        counts=scores.counts[order],
-    )
+    keys, kappa_sums, counts = (table.scores[name] for name in ("keys", "kappa_sums", "counts"))
+    # the bitwise complement of an unsigned number sorts it in descending order
+    order = np.lexsort((table.agent_index, ~counts, ~kappa_sums, keys))
+    ranked = table.take(order[counts[order] > 0])
+    starts = np.unique(ranked.scores["keys"], return_index=True)[1]
+    return VoteResult(ranked, np.append(starts, len(ranked)).astype(np.int64))
 
 
 def fuse(batch_by_agent: Mapping[str, VoxelBatch]) -> FusedMap:
     """Return the fused map of these agents' latest updates; the order of the mapping has no influence."""
-    scores, gaussians, starts = _stack(batch_by_agent)
-    order, is_first = _ranking(scores)
-    winners = order[is_first]
-    counts = scores.counts[winners]
-    batch = VoxelBatch(
-        scores.keys[winners],
-        scores.kappa_sums[winners],
-        counts,
-        gaussians.take(gather_rows(starts[winners], counts)),
-    )
-    return FusedMap(batch, rank_voxels(scores))
+    table, gaussians, starts = _stack(batch_by_agent)
+    vote = rank_voxels(table)
+    winners = vote.winners.scores
+    keys, sums, counts = (np.ascontiguousarray(winners[name]) for name in ("keys", "kappa_sums", "counts"))
+    won = gaussians.take(gather_rows(starts[winners["rows"]], counts))
+    return FusedMap(VoxelBatch(keys, sums, counts, won), vote)
 
 
 def union_maps(batch_by_agent: Mapping[str, VoxelBatch]) -> VoxelBatch:
     """Return all agents' Gaussians, sorted by voxel and then by agent id, with the sums of the agents' totals."""
-    scores, gaussians, starts = _stack(batch_by_agent)
-    order = np.lexsort((scores.agent_index, scores.keys))
-    order = order[scores.counts[order] > 0]
-    keys, first = np.unique(scores.keys[order], return_index=True)
-    counts = scores.counts[order]
+    table, gaussians, starts = _stack(batch_by_agent)
+    scores = table.scores.take(np.lexsort((table.agent_index, table.scores["keys"])))
+    scores = scores[scores["counts"] > 0]
+    keys, first = np.unique(scores["keys"], return_index=True)
+    counts = scores["counts"]
     return VoxelBatch(
         keys,
-        np.add.reduceat(scores.kappa_sums[order], first) if len(first) else np.zeros(0, np.uint64),
+        np.add.reduceat(scores["kappa_sums"], first) if len(first) else np.zeros(0, np.uint64),
         np.add.reduceat(counts, first).astype(np.uint32) if len(first) else np.zeros(0, np.uint32),
-        gaussians.take(gather_rows(starts[order], counts)),
+        gaussians.take(gather_rows(starts[scores["rows"]], counts)),
     )
-
-
-def _ranking(scores: VoxelScoreTable) -> tuple[Int64[ndarray, " s"], Bool[ndarray, " s"]]:
-    """Return the rows with Gaussians, sorted by voxel and then best first, and a mask of each voxel's first row."""
-    # the bitwise complement of an unsigned number sorts it in descending order
-    order = np.lexsort((scores.agent_index, ~scores.counts, ~scores.kappa_sums, scores.keys))
-    order = order[scores.counts[order] > 0]
-    keys = scores.keys[order]
-    is_first = np.ones(len(order), np.bool_)
-    is_first[1:] = keys[1:] != keys[:-1]
-    return order, is_first
 
 
 def _stack(batch_by_agent: Mapping[str, VoxelBatch]) -> tuple[VoxelScoreTable, Gaussians, Int64[ndarray, " w"]]:
-    """Return all updates as one table, all Gaussians as one array, and the first Gaussian's row for each update."""
+    """Return all updates as one table, all Gaussians as one array, and the first Gaussian's place for each update.
+
+    An update's row in the table is its number, from 0.
+    """
     agents = tuple(sorted(batch_by_agent))
     batches = [batch_by_agent[agent_id] for agent_id in agents]
-    counts = np.concatenate([np.zeros(0, np.uint32), *(batch.counts for batch in batches)])
-    scores = VoxelScoreTable(
-        agents,
-        np.repeat(np.arange(len(agents), dtype=np.int32), [len(batch) for batch in batches]),
-        np.concatenate([np.zeros(0, np.int64), *(batch.keys for batch in batches)]),
-        np.zeros(len(counts), np.int64),  # the vote does not use sequence numbers
-        np.concatenate([np.zeros(0, np.uint64), *(batch.kappa_sums for batch in batches)]),
-        counts,
-    )
-    starts = np.cumsum(counts, dtype=np.int64) - counts
-    return scores, Gaussians.concatenate([batch.gaussians for batch in batches]), starts
+    agent_index = np.repeat(np.arange(len(agents), dtype=np.int32), [len(batch) for batch in batches])
+    # the vote does not use sequence numbers
+    scores = np.zeros(len(agent_index), SCORES)
+    for name in ("keys", "kappa_sums", "counts") if batches else ():
+        scores[name] = np.concatenate([getattr(batch, name) for batch in batches])
+    scores["rows"] = np.arange(len(scores))
+    starts = np.cumsum(scores["counts"], dtype=np.int64) - scores["counts"]
+    gaussians = Gaussians.concatenate([batch.gaussians for batch in batches])
+    return VoxelScoreTable(agents, agent_index, scores), gaussians, starts
 
 
 def fuse_maps(maps: Mapping[str, Gaussians], grid: VoxelGrid) -> FusedMap:

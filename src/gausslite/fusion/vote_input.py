@@ -20,7 +20,7 @@ from gausslite.domain.voxels import (
 )
 from gausslite.fusion.frames import FrameAlignments
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import VoxelScoreTable
+from gausslite.fusion.store_values import SCORES, VoxelScoreTable
 
 SLICE_VOXELS = 128
 _Cells = dict[int, tuple[int, int]]
@@ -81,9 +81,7 @@ class VoteInput:
 
     def slices(self, agent_id: str) -> Iterator[Int64[ndarray, " k"]]:
         """Yield the agent's voxels in slices, as they are now."""
-        table = self._store.scores()
-        index = {name: i for i, name in enumerate(table.agents)}.get(agent_id, -1)
-        keys = table.keys[table.agent_index == index]
+        keys = self._store.keys(agent_id)
         yield from (keys[start : start + SLICE_VOXELS] for start in range(0, len(keys), SLICE_VOXELS))
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
@@ -160,7 +158,7 @@ class VoteInput:
     def _gaussians_in_frame(self, agent_id: str, batch: VoxelBatch) -> Gaussians:
         """Return the Gaussians in the fused frame, in their order."""
         alignment = self._alignments.get(agent_id)
-        segments = alignment.segment_of(self._store.stored(agent_id, batch.keys).update_seqs)
+        segments = alignment.segment_of(self._store.stored(agent_id, batch.keys)["update_seqs"])
         used = np.unique(segments)
         if len(used) == 1:
             return move_gaussians(batch.gaussians, alignment.transform(int(used[0])))
@@ -186,32 +184,24 @@ class VoteInput:
         self, table: VoxelScoreTable, index: int, moved: _MovedVoxels, keys: Int64[ndarray, " k"] | None
     ) -> VoxelScoreTable:
         """Return the table with the agent's moved voxels in place of those of the index."""
-        own = np.flatnonzero(table.agent_index == index)
-        sources = np.fromiter((key in moved.cells_of for key in table.keys[own].tolist()), np.bool_, len(own))
-        replaced = own[sources]
         wanted = moved.sources_of if keys is None else [key for key in keys.tolist() if key in moved.sources_of]
         totals = {key: moved.totals(key) for key in wanted}
-        for row in own[~sources].tolist():
-            key = int(table.keys[row])
-            if key in totals and table.counts[row]:
-                kappa, count = totals[key]
-                totals[key] = kappa + int(table.kappa_sums[row]), count + int(table.counts[row])
-        also = own[~sources][np.isin(table.keys[own[~sources]], _array(totals))]
-        kept = np.ones(len(table.keys), np.bool_)
-        kept[replaced] = kept[also] = False
-        sums = np.array([kappa for kappa, _ in totals.values()], np.uint64)
-        counts = np.array([count for _, count in totals.values()], np.uint32)
-        indices = np.concatenate([table.agent_index[kept], np.full(len(totals), index, np.int32)])
-        all_keys = np.concatenate([table.keys[kept], np.array(list(totals), np.int64)])
-        order = np.lexsort((all_keys, indices))
-        return VoxelScoreTable(
+        kept = np.ones(len(table), np.bool_)
+        own = np.flatnonzero(table.agent_index == index)
+        for place, (key, _, kappa, count, _) in zip(own.tolist(), table.scores[own].tolist(), strict=True):
+            kept[place] = key not in moved.cells_of and key not in totals
+            if key in totals and key not in moved.cells_of and count:
+                # as sent, beside what other voxels have there
+                totals[key] = totals[key][0] + kappa, totals[key][1] + count
+        scores = np.zeros(len(totals), SCORES)
+        scores["keys"] = list(totals)
+        scores["kappa_sums"], scores["counts"] = np.array(list(totals.values()), np.uint64).reshape(-1, 2).T
+        changed = VoxelScoreTable(
             table.agents,
-            indices[order],
-            all_keys[order],
-            np.concatenate([table.update_seqs[kept], np.zeros(len(totals), np.int64)])[order],
-            np.concatenate([table.kappa_sums[kept], sums])[order],
-            np.concatenate([table.counts[kept], counts])[order],
+            np.append(table.agent_index[kept], np.full(len(totals), index, np.int32)),
+            np.concatenate([table.scores[kept], scores]),
         )
+        return changed.take(np.lexsort((changed.scores["keys"], changed.agent_index)))
 
 
 def _totals_by_cell(

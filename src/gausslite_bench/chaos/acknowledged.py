@@ -20,7 +20,7 @@ from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import StoredScores
+from gausslite.fusion.store_values import Scores
 from gausslite.fusion.vote import FusedMap, fuse
 from gausslite_bench.chaos.journal import JournalReader, RecordKind
 
@@ -130,7 +130,7 @@ class StoredUpdates(Protocol):
         """Return an agent's updates."""
         ...
 
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels."""
         ...
 
@@ -148,7 +148,7 @@ def compare_opened(agents: Mapping[str, AgentAcknowledgements], store: StoredUpd
 
 def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: StoredUpdates) -> StoreComparison:
     batch = store.batch(agent_id)
-    seqs = store.stored(agent_id, batch.keys).update_seqs.tolist()
+    seqs = store.stored(agent_id, batch.keys)["update_seqs"].tolist()
     held = {
         key: StoredVoxel(seq, kappa_sum, records)
         for key, seq, kappa_sum, records in zip(

@@ -22,7 +22,7 @@ from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.regions import slots_of
 from gausslite.fusion.store_rows import UpdateLog, read_batches, require_intact
-from gausslite.fusion.store_values import StoredScores
+from gausslite.fusion.store_values import Scores
 from gausslite.wire.clients import Export, FusionClient
 from gausslite_bench.chaos.acknowledged import (
     AgentAcknowledgements,
@@ -244,7 +244,7 @@ class _Snapshot:
         """Return an agent's updates."""
         return read_batches(self._log, self._lock, self._read, None, (agent_id,))[agent_id]
 
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> StoredScores:
+    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels."""
         return self._log.index.stored(agent_id, keys)
 

@@ -182,7 +182,7 @@ def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> N
     votes = list(fused.vote.votes())
     assert len(fused.provenance) == len(fused.gaussians) == int(fused.batch.counts.sum())
     owners = [vote.winner for vote, count in zip(votes, fused.batch.counts.tolist(), strict=True) for _ in range(count)]
-    assert [fused.vote.agents[index] for index in fused.provenance] == owners
+    assert [fused.vote.ranked.agents[index] for index in fused.provenance] == owners
     assert all(vote.margin >= 0 and vote.scores[0].count > 0 for vote in votes)
     assert sum(int(fused.won_by(agent_id).sum()) for agent_id in table) == len(votes)
 

@@ -135,10 +135,10 @@ def test_messages_of_several_agents_are_stored_together(store: FusionStore) -> N
     messages = [make_subset(name, 1, {11: 2, 22: index}) for index, name in enumerate(("ant", "bee"))]
     assert [each.accepted.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
     assert [each.stale.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
-    assert store.scores().counts.tolist() == [2, 0, 2, 1]
+    assert store.scores().scores["counts"].tolist() == [2, 0, 2, 1]
     with pytest.raises(InvalidInputError):
         store.put_all([StoredSubset.exact(make_subset(*own, {33: 1})) for own in (("ant", 2), ("bee", 2**63))])
-    assert 33 not in store.scores().keys
+    assert 33 not in store.scores().scores["keys"]
 
 
 def test_a_tombstone_is_kept_and_makes_older_updates_stale(store: FusionStore) -> None:
@@ -153,9 +153,9 @@ def test_agents_do_not_change_each_others_data(store: FusionStore) -> None:
     scores = store.scores()
     assert scores.agents == ("ant", "bee")
     assert scores.agent_index.tolist() == [0, 1, 1]
-    assert scores.keys.tolist() == [11, 11, 22]
-    assert scores.update_seqs.tolist() == [9, 1, 1]
-    assert scores.counts.tolist() == [2, 1, 1]
+    assert scores.scores["keys"].tolist() == [11, 11, 22]
+    assert scores.scores["update_seqs"].tolist() == [9, 1, 1]
+    assert scores.scores["counts"].tolist() == [2, 1, 1]
     assert store.remove_agent("ant").tolist() == [11]
     assert store.agents() == ("bee",)
     assert len(store.batch("ant")) == 0
@@ -170,8 +170,8 @@ def test_reading_some_voxels_equals_selecting_from_all(store: FusionStore) -> No
         expected = select_keys(store.batch(agent_id), keys)
         assert batch.keys.tolist() == expected.keys.tolist()
         assert batch.gaussians.means_m.tobytes() == expected.gaussians.means_m.tobytes()
-    assert store.scores(keys).keys.tolist() == [22, 33, 22]
-    assert len(store.scores(np.zeros(0, np.int64)).keys) == 0
+    assert store.scores(keys).scores["keys"].tolist() == [22, 33, 22]
+    assert len(store.scores(np.zeros(0, np.int64))) == 0
 
 
 def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
@@ -209,7 +209,7 @@ def test_threads_can_put_concurrently(store: FusionStore) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert store.scores().update_seqs.tolist() == [19] * 6
+    assert store.scores().scores["update_seqs"].tolist() == [19] * 6
 
 
 def test_keyframes_and_records_are_stored_and_leave_with_their_agent(store: FusionStore) -> None:

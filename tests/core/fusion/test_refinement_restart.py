@@ -113,7 +113,7 @@ class WatchedStore(SqliteStore):
         if during is not None:
             during()
         table = super().scores(keys)
-        self.largest_read = max(self.largest_read, len(table.keys))
+        self.largest_read = max(self.largest_read, len(table))
         return table
 
 

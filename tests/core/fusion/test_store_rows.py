@@ -61,11 +61,11 @@ def require_latest(store: FusionStore, latest: Latest) -> None:
     assert set(batches) == {agent_id for agent_id, own in latest.items() if own}
     for agent_id, batch in batches.items():
         own = latest[agent_id]
-        seqs = store.stored(agent_id, batch.keys).update_seqs.tolist()
+        seqs = store.stored(agent_id, batch.keys)["update_seqs"].tolist()
         assert dict(zip(batch.keys.tolist(), rows_of(batch, seqs), strict=True)) == own
         some = np.array(sorted(own)[::2], np.int64)
         part = store.batch(agent_id, some)
-        assert rows_of(part, store.stored(agent_id, part.keys).update_seqs.tolist()) == [own[key] for key in some]
+        assert rows_of(part, store.stored(agent_id, part.keys)["update_seqs"].tolist()) == [own[key] for key in some]
 
 
 def rows_of(batch: VoxelBatch, seqs: list[int]) -> list[tuple[int, int, int, bytes]]:
