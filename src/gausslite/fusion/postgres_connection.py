@@ -72,10 +72,7 @@ class PostgresConnection:
                 return self._run(work)
             except _LostConnectionError:
                 # at once, because the database may only have been restarted
-                try:
-                    return self._run(work)
-                except _LostConnectionError as error:
-                    raise StorageError(str(error)) from error
+                return self._run(work)
 
     def close(self) -> None:
         """Close the connection; its lock ends."""
@@ -129,5 +126,5 @@ class PostgresConnection:
         return f"store {self._name}: {what} ({' '.join(str(error).split())})"
 
 
-class _LostConnectionError(Exception):
+class _LostConnectionError(StorageError):
     """The connection ended during a call; whether a transaction was committed is unknown."""

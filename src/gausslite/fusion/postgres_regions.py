@@ -6,6 +6,7 @@ that holds the slot's lock, so a server that has lost its connection cannot writ
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection
 
 import psycopg
@@ -84,7 +85,7 @@ class SharedSlots:
 
     def open_store(self) -> PostgresStore:
         """Return the store of the slots that are held now. Raises StorageError."""
-        return PostgresStore(self._url, OwnedSlots(self._held), _Writer(self._locks, self._holder))
+        return PostgresStore(self._url, OwnedSlots(self._held), functools.partial(self._write, self._holder))
 
     def close(self) -> None:
         """Close the connection; the locks end."""
@@ -111,18 +112,11 @@ class SharedSlots:
         self._holder = db
         self._connections += 1
 
-
-class _Writer:
-    """Writes by the connection that holds the locks, as long as it is the same one."""
-
-    def __init__(self, locks: PostgresConnection, holder: Database | None) -> None:
-        self._locks, self._holder = locks, holder
-
-    def write(self, work: Callable[[Database], object]) -> None:
-        """Do the work in one transaction. Raises StorageError, UnavailableError if the locks have been lost."""
+    def _write(self, holder: Database | None, work: Callable[[Database], object]) -> None:
+        """Do the work in one transaction of the holder. Raises StorageError, UnavailableError if it was replaced."""
 
         def commit(db: Database) -> None:
-            if db is not self._holder:
+            if db is not holder:
                 raise UnavailableError("store: the connection with the locks of this server's regions was lost")
             with db.pipeline(), db.transaction():
                 work(db)

@@ -10,7 +10,7 @@ import itertools
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import psycopg
 
@@ -57,13 +57,11 @@ INSERT INTO gausslite.properties VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SE
 _SELECT_TIMELINE = "SELECT substr(pg_walfile_name(pg_current_wal_lsn()), 1, 8)"
 
 
-@runtime_checkable
-class SlotHolder(Protocol):
-    """Holds the locks of the slots that this server owns, by a connection that also writes their rows."""
+Write = Callable[[Callable[[Database], object]], None]
+"""Does work in one transaction, by the connection that holds the locks of this server's slots.
 
-    def write(self, work: Callable[[Database], object]) -> None:
-        """Do the work in one transaction. Raises StorageError, UnavailableError if the locks have been lost."""
-        ...
+Raises StorageError, UnavailableError if the locks have been lost.
+"""
 
 
 class PostgresStore(FusionStore):
@@ -82,15 +80,15 @@ class PostgresStore(FusionStore):
 
     _config_key = "number"
 
-    def __init__(self, url: str, owned: OwnedSlots | None = None, holder: SlotHolder | None = None) -> None:
-        """holder: of the locks of the `owned` slots."""
+    def __init__(self, url: str, owned: OwnedSlots | None = None, write_owned: Write | None = None) -> None:
+        """write_owned: for a store of `owned` slots."""
         super().__init__(slots_of)
         self._name = database_name(url)
-        self._owned, self._holder, self.is_shared = owned, holder, owned is not None
+        self._owned, self._write_owned, self.is_shared = owned, write_owned, owned is not None
         # identify the content of the database: this opening, and the number of transactions since
         self._opening, self._commits = "", 0
         with ExitStack() as opened:
-            if holder is None:
+            if write_owned is None:
                 self._writer = PostgresConnection(url, self._take_over)
                 opened.callback(self._writer.close)
             self._reader = PostgresConnection(url, lambda _: None)
@@ -173,8 +171,8 @@ class PostgresStore(FusionStore):
 
     def _commit(self, work: Callable[[Database], object]) -> None:
         """Do the work in one transaction, without waiting for the answer to each statement. Raises StorageError."""
-        if self._holder is not None:
-            self._holder.write(work)
+        if self._write_owned is not None:
+            self._write_owned(work)
             return
 
         def commit(db: Database) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
-import os
 import secrets
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -46,34 +45,30 @@ CREATE TABLE mission_config (
 """
 
 
-class StoreLock:
-    """Held by the one process that may write a store; readers such as a backup need none. Ends with the process.
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock of the one process that may write a store; readers such as a backup need none.
 
-    It belongs to the file: symbolic links are followed, and a file with several names is refused.
+    It belongs to the file: symbolic links are followed, and a file with several names is refused. It ends with the
+    process. Raises StorageError if another process holds it, or the folder is not writable.
     """
-
-    def __init__(self, path: Path) -> None:
-        """Raises StorageError if another process holds the lock, or the folder is not writable."""
-        if path.is_file() and path.stat().st_nlink > 1:
-            raise StorageError(
-                f"store {path}: expected a file with one name, got {path.stat().st_nlink} (hard links); another server "
-                "could write it under another name: delete the others, or copy the file"
-            )
+    if path.is_file() and path.stat().st_nlink > 1:
+        raise StorageError(
+            f"store {path}: expected a file with one name, got {path.stat().st_nlink} (hard links); another server "
+            "could write it under another name: delete the others, or copy the file"
+        )
+    try:
+        file = Path(f"{path.resolve()}-lock").open("ab")  # noqa: SIM115 - closed below
+    except OSError as error:
+        raise StorageError(
+            f"store {path}: cannot be opened ({error.strerror}); expected a file in a writable folder"
+        ) from error
+    with file:
         try:
-            self._file = os.open(f"{path.resolve()}-lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise StorageError(
-                f"store {path}: cannot be opened ({error.strerror}); expected a file in a writable folder"
-            ) from error
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(self._file)
             raise StorageError(f"store {path}: in use by another server; give each its own file") from error
-
-    def release(self) -> None:
-        """Let another process open the store."""
-        os.close(self._file)
+        yield
 
 
 def open_existing(path: Path) -> sqlite3.Connection:
@@ -102,30 +97,22 @@ def open_existing(path: Path) -> sqlite3.Connection:
     return db
 
 
-def open_or_create(path: Path) -> sqlite3.Connection:
-    """Connect to a store for writing; a missing file is created. Raises StorageError."""
+def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
+    """Lock a store and connect to it for writing; a missing file is created. Raises StorageError."""
+    if path == _IN_MEMORY:
+        db = opened.enter_context(contextlib.closing(connect(path)))
+        _create_tables(db)
+        return db
+    opened.enter_context(locked(path))
     if not path.exists():
         _create(path)
-    db = open_existing(path)
-    try:
-        with storage_errors(path):
-            db.execute("PRAGMA journal_mode = WAL")
-            db.execute("PRAGMA synchronous = FULL")
-            # freed pages are overwritten only where that costs no additional write
-            db.execute("PRAGMA secure_delete = FAST")
-            db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
-    except BaseException:
-        db.close()
-        raise
-    return db
-
-
-def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
-    if path != _IN_MEMORY:
-        opened.callback(StoreLock(path).release)
-        return open_or_create(path)
-    db = connect(path)
-    _create_tables(db)
+    db = opened.enter_context(contextlib.closing(open_existing(path)))
+    with storage_errors(path):
+        db.execute("PRAGMA journal_mode = WAL")
+        db.execute("PRAGMA synchronous = FULL")
+        # freed pages are overwritten only where that costs no additional write
+        db.execute("PRAGMA secure_delete = FAST")
+        db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
     return db
 
 
@@ -242,7 +229,7 @@ class SqliteStore(FusionStore):
         super().__init__()
         self._path, self._read_lock = path, RLock()
         with ExitStack() as opened:
-            self._writer = self._reader = opened.enter_context(contextlib.closing(_open(path, opened)))
+            self._writer = self._reader = _open(path, opened)
             if path == _IN_MEMORY:
                 # both use one connection
                 self._read_lock = self._write_lock

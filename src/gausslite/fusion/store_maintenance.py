@@ -13,7 +13,7 @@ from gausslite.domain.errors import StorageError
 from gausslite.fusion.sqlite_store import (
     RESTORE_ADVICE,
     SELECT_UPDATES,
-    StoreLock,
+    locked,
     open_existing,
     renew_incarnation,
     storage_errors,
@@ -39,7 +39,7 @@ def verify(path: Path, repair: bool = False) -> StoreReport:
     """
     with contextlib.ExitStack() as held:
         if repair:
-            held.enter_context(_locked(path))
+            held.enter_context(locked(path))
         db = held.enter_context(contextlib.closing(open_existing(path)))
         with storage_errors(path):
             report, damaged = _check(db, path)
@@ -66,7 +66,7 @@ def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
 
     Returns the report and the new name of the file that was there before. Raises StorageError.
     """
-    with _locked(store):
+    with locked(store):
         report = _require_intact(backup)
         copy = store.with_name(store.name + ".restoring")
         copy.unlink(missing_ok=True)
@@ -78,15 +78,6 @@ def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
         copy.replace(store)
         _synchronise_folder(store.parent)
     return report, replaced
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    lock = StoreLock(path)
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _check(db: sqlite3.Connection, path: Path) -> tuple[StoreReport, list[tuple[str, int]]]:
