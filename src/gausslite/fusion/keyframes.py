@@ -9,7 +9,7 @@ from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError
@@ -29,11 +29,10 @@ def no_decoder(data: bytes) -> Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentKeyframe:
-    """A keyframe of one agent. pixel_weights: the weight of each pixel in the loss, 0 to 1; None means 1 everywhere."""
+    """A keyframe of one agent."""
 
     agent_id: str
     frame: Frame
-    pixel_weights: Float32[ndarray, "h w"] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ inside the footprint of the fused map, and not where the measured surface occlud
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy import ndarray
 from gausslite.config.option import option
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, QuotaError
-from gausslite.domain.frame import without_depth_edges
+from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import NO_TARGET
@@ -33,7 +33,6 @@ from gausslite.render.rasterizer import (
     AdamSettings,
     LossWeights,
     Rasterizer,
-    StepReport,
     TrainingView,
     UpdateCounter,
     gaussians_to_rows,
@@ -42,6 +41,9 @@ from gausslite.render.rasterizer import (
 _FOOTPRINT_ALPHA = 0.5
 _OCCLUSION_M, _OCCLUSION_SHARE = 0.05, 0.05
 """A measured surface occludes the map's if it is closer by this distance plus this share of the depth."""
+_Rows = Float32[ndarray, "n 16"]
+_View = tuple[Frame, Float32[ndarray, "h w"]]
+"""A keyframe, and the weight of each pixel in the loss: 1 in the footprint of the map, otherwise 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +110,26 @@ def refine(
     Raises InvalidInputError if no keyframe shows the map, QuotaError if the map exceeds max_gaussians.
     """
     table = _fill_table(gaussians, settings)
-    views = _ViewPool(_refinement_views(table, keyframes, rasterizer), rasterizer, settings)
+    views = _ViewPool(_footprints(table, keyframes, rasterizer), rasterizer, settings)
     extent_m = _extent_m(gaussians)
     rng = np.random.default_rng(settings.seed)
     with ExitStack() as binding:
-        binding.enter_context(_bind_tables(table, rasterizer))
+        binding.enter_context(rasterizer.bind_tables(*_tables(table)))
         for iteration in range(1, settings.iterations + 1):
             view, T_camera_world = views.draw(rng)
-            report = _train(table, view, T_camera_world, rasterizer, settings)
+            report = rasterizer.step(
+                *_tables(table),
+                view=view,
+                T_camera_world=T_camera_world,
+                loss=settings.loss,
+                adam=settings.adam,
+                masked=True,
+                update_counter=UpdateCounter(table.kappa),
+            )
             if _density_control_is_due(iteration, settings.density):
                 binding.close()
                 _control_density(table, iteration, settings, extent_m)
-                binding.enter_context(_bind_tables(table, rasterizer))
+                binding.enter_context(rasterizer.bind_tables(*_tables(table)))
             due = iteration % settings.report_every == 0 or iteration == settings.iterations
             if due and not report_progress(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
                 break
@@ -127,8 +137,8 @@ def refine(
     return replace(refined, active=refined.target != NO_TARGET)
 
 
-def _bind_tables(table: SplatTable, rasterizer: Rasterizer) -> AbstractContextManager[None]:
-    return rasterizer.bind_tables(table.rows, table.first_moment, table.second_moment)
+def _tables(table: SplatTable) -> tuple[_Rows, _Rows, _Rows]:
+    return table.rows, table.first_moment, table.second_moment
 
 
 def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
@@ -142,31 +152,16 @@ def _fill_table(gaussians: Gaussians, settings: RefineSettings) -> SplatTable:
     return table
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _RefinementView:
-    """A keyframe with its pixel weights and camera pose."""
-
-    keyframe: AgentKeyframe
-    pixel_weights: Float32[ndarray, "h w"]
-    T_camera_world: Float64[ndarray, "4 4"]
-
-
-def _refinement_views(
-    table: SplatTable, keyframes: Sequence[AgentKeyframe], rasterizer: Rasterizer
-) -> list[_RefinementView]:
+def _footprints(table: SplatTable, keyframes: Sequence[AgentKeyframe], rasterizer: Rasterizer) -> list[_View]:
     """Return the keyframes that show some of the map, with the weights of their pixels."""
     views = []
-    for keyframe in keyframes:
-        frame = keyframe.frame
-        T_camera_world = inverse(frame.T_world_camera)
-        rendering = rasterizer.forward(table.rows, frame.camera, T_camera_world, motion=frame.motion)
+    for frame in (keyframe.frame for keyframe in keyframes):
+        rendering = rasterizer.forward(table.rows, frame.camera, inverse(frame.T_world_camera), motion=frame.motion)
         surface_m = rendering.expected_depth_m(_FOOTPRINT_ALPHA)
         occluded = (frame.depth_m > 0) & (frame.depth_m < surface_m * (1 - _OCCLUSION_SHARE) - _OCCLUSION_M)
         pixel_weights = ((rendering.alpha > _FOOTPRINT_ALPHA) & ~occluded).astype(np.float32)
-        if keyframe.pixel_weights is not None:
-            pixel_weights *= keyframe.pixel_weights
         if pixel_weights.any():
-            views.append(_RefinementView(keyframe, pixel_weights, T_camera_world))
+            views.append((frame, pixel_weights))
     if not views:
         raise InvalidInputError(
             f"refine: expected keyframes that show the fused map, got {len(keyframes)} but none does"
@@ -177,7 +172,7 @@ def _refinement_views(
 class _ViewPool:
     """The views to draw from. Up to max_prepared_views stay prepared; the others are prepared at each use."""
 
-    def __init__(self, views: list[_RefinementView], rasterizer: Rasterizer, settings: RefineSettings) -> None:
+    def __init__(self, views: list[_View], rasterizer: Rasterizer, settings: RefineSettings) -> None:
         self._views = views
         self._rasterizer = rasterizer
         self._max_prepared, self._depth_edge_px = settings.max_prepared_views, settings.depth_edge_px
@@ -186,35 +181,14 @@ class _ViewPool:
     def draw(self, rng: np.random.Generator) -> tuple[TrainingView, Float64[ndarray, "4 4"]]:
         """Draw a view uniformly from all agents' keyframes; returns it with its T_camera_world."""
         index = int(rng.integers(len(self._views)))
-        chosen = self._views[index]
+        frame, pixel_weights = self._views[index]
         view = self._prepared.get(index)
         if view is None:
-            frame = chosen.keyframe.frame
             depth_m = without_depth_edges(frame.depth_m, self._depth_edge_px)
-            view = self._rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, chosen.pixel_weights, frame.motion)
+            view = self._rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, pixel_weights, frame.motion)
             if len(self._prepared) < self._max_prepared:
                 self._prepared[index] = view
-        return view, chosen.T_camera_world
-
-
-def _train(
-    table: SplatTable,
-    view: TrainingView,
-    T_camera_world: Float64[ndarray, "4 4"],
-    rasterizer: Rasterizer,
-    settings: RefineSettings,
-) -> StepReport:
-    return rasterizer.step(
-        table.rows,
-        table.first_moment,
-        table.second_moment,
-        view=view,
-        T_camera_world=T_camera_world,
-        loss=settings.loss,
-        adam=settings.adam,
-        masked=True,
-        update_counter=UpdateCounter(table.kappa),
-    )
+        return view, inverse(frame.T_world_camera)
 
 
 def _density_control_is_due(iteration: int, density: DensitySettings) -> bool:

@@ -104,12 +104,6 @@ def test_pixels_that_occlude_the_map_are_not_trained() -> None:
         refine(patch(0.2), [view(1, 250, depth_m=0.5)], ReferenceRasterizer(), QUICK, always)
 
 
-def test_pixels_with_weight_zero_are_not_trained() -> None:
-    weightless = AgentKeyframe("ant", view(1, 200).frame, np.zeros((18, 24), np.float32))
-    with pytest.raises(InvalidInputError, match="none does"):
-        refine(patch(0.2), [weightless], ReferenceRasterizer(), QUICK, always)
-
-
 def test_refinement_stops_when_the_callback_returns_false() -> None:
     reports = []
 
