@@ -188,9 +188,8 @@ def _trials(
     """Yield the motions that registrations with different first reaches find."""
     surface = Surface(source.points_m)
     for first_m in _REACH_M:
-        T = np.eye(4)
-        for reach_m in (first_m, *(reach_m for reach_m in _REFINE_M if reach_m < first_m)):
-            T = target.surface.refined(surface, T, reach_m)
+        shorter_m = (reach_m for reach_m in _REFINE_M if reach_m < first_m)
+        T = target.surface.refined(surface, np.eye(4), first_m, *shorter_m)
         if _shift_m(T, centre_m) <= _MAX_SHIFT_M and rotation_angle_deg(T, np.eye(4)) <= _MAX_ROTATION_DEG:
             yield T
 

@@ -57,15 +57,13 @@ class FitProcess:
 
         A process that is killed, for example because memory ran out, is started again for the second attempt.
         """
-        fit = self._ask(_FIT, source, target)["fit"]
-        return None if fit is None else FrameFit.from_json(fit)
+        return self._ask(_FIT, source, target).fit
 
     def find(self, source: SurfaceSamples, target: SurfaceSamples) -> FrameSearch:
         """Return `find_frame` of the samples. Raises UnavailableError as a call does."""
-        answer = self._ask(_FIND, source, target)
-        return FrameSearch(None if answer["fit"] is None else FrameFit.from_json(answer["fit"]), answer["reason"])
+        return self._ask(_FIND, source, target)
 
-    def _ask(self, question: bytes, source: SurfaceSamples, target: SurfaceSamples) -> dict[str, Any]:
+    def _ask(self, question: bytes, source: SurfaceSamples, target: SurfaceSamples) -> FrameSearch:
         for _ in range(_ATTEMPTS):
             process, connection = self._running()
             timer = Timer(self._longest_s, process.kill)
@@ -85,7 +83,7 @@ class FitProcess:
             raise UnavailableError(f"the process of the comparisons ended {_ATTEMPTS} times, with code {code}")
         if "error" in answer:
             raise UnavailableError(answer["error"])
-        return answer
+        return FrameSearch(answer["fit"] and FrameFit.from_json(answer["fit"]), answer["reason"])
 
     def close(self) -> None:
         """End the process; a call that runs raises UnavailableError, and so do later ones."""

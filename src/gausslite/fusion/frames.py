@@ -184,13 +184,11 @@ def find_quarantined(
     Agents that fit most others are accepted first, then those that contributed first. An agent that contradicts two
     accepted ones is quarantined. So is one that contradicts a single one, fits none, and repeats it with newer data.
     """
-    others = {name: orders.keys() - {name} for name in orders}
     fits: dict[str, set[str]] = {name: set() for name in orders}
-    for name, candidates in others.items():
-        for other in candidates:
-            comparison = comparisons.get(frozenset((name, other)))
-            if comparison is not None and not comparison.contradicting:
-                fits[name].add(other)
+    for pair, comparison in comparisons.items():
+        if pair <= orders.keys() and not comparison.contradicting:
+            for name in pair:
+                fits[name] |= pair - {name}
     accepted: list[str] = []
     quarantined: dict[str, tuple[str, ...]] = {}
     for name in sorted(orders, key=lambda name: (-len(fits[name]), orders[name])):

@@ -214,10 +214,7 @@ class _Search:
     def _registered(
         self, surface: Surface, T: Float64[ndarray, "4 4"], reaches_m: Sequence[float] = _REACH_M
     ) -> Float64[ndarray, "4 4"]:
-        for reach_m in reaches_m:
-            T = self._places.surface.refined(surface, T, reach_m)
-        registered: Float64[ndarray, "4 4"] = orthonormal(T)
-        return registered
+        return orthonormal(self._places.surface.refined(surface, T, *reaches_m))
 
 
 def _block_correlation(

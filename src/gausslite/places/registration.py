@@ -71,12 +71,14 @@ class Surface:
         found, squares = self._tree.batch_nearest_neighbor_search(points_m)
         return np.asarray(found, np.int64), np.sqrt(np.asarray(squares, np.float64))
 
-    def refined(self, source: Surface, T: Float64[ndarray, "4 4"], reach_m: float) -> Float64[ndarray, "4 4"]:
-        """Return T_target_source after a GICP registration with matches up to this distance; this is the target."""
-        result = small_gicp.align(
-            self._cloud, source._cloud, self._tree, T, "GICP", reach_m, max_iterations=_GICP_ITERATIONS
-        )
-        return np.asarray(result.T_target_source, np.float64)
+    def refined(self, source: Surface, T: Float64[ndarray, "4 4"], *reaches_m: float) -> Float64[ndarray, "4 4"]:
+        """Return T_target_source after GICP registrations with matches up to these distances; this is the target."""
+        for reach_m in reaches_m:
+            result = small_gicp.align(
+                self._cloud, source._cloud, self._tree, T, "GICP", reach_m, max_iterations=_GICP_ITERATIONS
+            )
+            T = np.asarray(result.T_target_source, np.float64)
+        return T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,9 +121,8 @@ def register(source: Surface, target: Surface, guess: Float64[ndarray, "4 4"] | 
     T = matched_motion(source, target) if guess is None else guess
     if T is None:
         return None
-    for reach_m in _REACH_M if guess is None else (_GUESS_REACH_M, *_REACH_M):
-        T = target.refined(source, T, reach_m)
-    return evaluate(source, target, orthonormal(T))
+    reaches_m = _REACH_M if guess is None else (_GUESS_REACH_M, *_REACH_M)
+    return evaluate(source, target, orthonormal(target.refined(source, T, *reaches_m)))
 
 
 def matched_motion(
