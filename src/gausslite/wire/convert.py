@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.frame import Frame, has_whole_chunks, image_size
 from gausslite.domain.pose import Twist, require_rigid
+from gausslite.domain.relevance import PointM
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, VoxelGrid, empty_batch, replace_voxels, select_voxels
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -28,14 +29,26 @@ _LENS_MODELS = {
     geometry_pb2.LENS_MODEL_FISHEYE: LensModel.FISHEYE,
 }
 _LENS_NUMBERS = {model: number for number, model in _LENS_MODELS.items()}
+_CAMERA = tuple(field.name for field in fields(Camera))
 
 
-def lens_to_message(lens: Lens) -> geometry_pb2.Lens:
-    """Encode a lens."""
-    return geometry_pb2.Lens(model=_LENS_NUMBERS[lens.model], coefficients=lens.coefficients)
+def values_of(source: object, names: Iterable[str]) -> dict[str, Any]:
+    """Return these fields of a message or of its dataclass, for the other one, which has them by the same names."""
+    return {name: getattr(source, name) for name in names}
 
 
-def lens_from_message(message: geometry_pb2.EncodedFrame) -> Lens | None:
+def point_to_message(xyz: Iterable[float]) -> geometry_pb2.Point:
+    """Encode three numbers."""
+    x, y, z = map(float, xyz)
+    return geometry_pb2.Point(x=x, y=y, z=z)
+
+
+def point_from_message(message: geometry_pb2.Point) -> PointM:
+    """Decode three numbers."""
+    return message.x, message.y, message.z
+
+
+def _lens_from_message(message: geometry_pb2.EncodedFrame) -> Lens | None:
     """Return the lens of a frame, None for a pinhole. Raises InvalidInputError."""
     if not message.HasField("lens"):
         return None
@@ -44,15 +57,13 @@ def lens_from_message(message: geometry_pb2.EncodedFrame) -> Lens | None:
     return Lens(_LENS_MODELS[message.lens.model], tuple(message.lens.coefficients))
 
 
-def twist_to_message(twist: Twist) -> geometry_pb2.Twist:
-    """Encode a velocity."""
-    linear, angular = (
-        geometry_pb2.Point(x=float(v[0]), y=float(v[1]), z=float(v[2])) for v in (twist.linear_m_s, twist.angular_rad_s)
+def _twist_to_message(twist: Twist) -> geometry_pb2.Twist:
+    return geometry_pb2.Twist(
+        linear_m_s=point_to_message(twist.linear_m_s), angular_rad_s=point_to_message(twist.angular_rad_s)
     )
-    return geometry_pb2.Twist(linear_m_s=linear, angular_rad_s=angular)
 
 
-def motion_from_message(message: geometry_pb2.EncodedFrame) -> CameraMotion | None:
+def _motion_from_message(message: geometry_pb2.EncodedFrame) -> CameraMotion | None:
     """Return the motion of a frame, None if it states no twist. Raises InvalidInputError."""
     if not message.HasField("twist"):
         if message.readout_seconds != 0.0 or message.exposure_seconds != 0.0:
@@ -65,7 +76,7 @@ def motion_from_message(message: geometry_pb2.EncodedFrame) -> CameraMotion | No
 
 
 def _velocity(name: str, point: geometry_pb2.Point) -> Float64[ndarray, "3"]:
-    velocity = np.array([point.x, point.y, point.z])
+    velocity = np.array(point_from_message(point))
     if not (np.abs(velocity) <= _MAX_VELOCITY).all():
         raise InvalidInputError(
             f"frame twist {name}: expected finite values up to {_MAX_VELOCITY:g}, got {velocity.tolist()}"
@@ -206,14 +217,7 @@ class MapUpdate:
 
 def camera_to_message(camera: Camera) -> geometry_pb2.Camera:
     """Encode a camera."""
-    return geometry_pb2.Camera(
-        fx_px=camera.fx_px,
-        fy_px=camera.fy_px,
-        cx_px=camera.cx_px,
-        cy_px=camera.cy_px,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-    )
+    return geometry_pb2.Camera(**values_of(camera, _CAMERA))
 
 
 def camera_from_message(message: geometry_pb2.Camera) -> Camera:
@@ -222,7 +226,7 @@ def camera_from_message(message: geometry_pb2.Camera) -> Camera:
         raise InvalidInputError(
             f"camera: expected at most {MAX_IMAGE_PX} pixels, got {message.width_px}x{message.height_px}"
         )
-    return Camera(message.fx_px, message.fy_px, message.cx_px, message.cy_px, message.width_px, message.height_px)
+    return Camera(**values_of(message, _CAMERA))
 
 
 def transform_to_message(T: Float64[ndarray, "4 4"]) -> geometry_pb2.RigidTransform:
@@ -254,7 +258,7 @@ def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False
         t_world_camera=transform_to_message(frame.T_world_camera),
         readout_seconds=0.0 if motion is None else motion.readout_s,
         exposure_seconds=0.0 if motion is None else motion.exposure_s,
-        twist=None if motion is None else twist_to_message(motion.twist),
+        twist=None if motion is None else _twist_to_message(motion.twist),
     )
 
 
@@ -272,19 +276,19 @@ def live_frame_to_message(frame: Frame, lens: Lens | None, lossless: bool = Fals
     """Encode a frame of a live camera with its lens; None for a pinhole."""
     message = frame_to_message(frame, lossless)
     if lens is not None:
-        message.lens.CopyFrom(lens_to_message(lens))
+        message.lens.CopyFrom(geometry_pb2.Lens(model=_LENS_NUMBERS[lens.model], coefficients=lens.coefficients))
     return message
 
 
 def live_frame_from_message(message: geometry_pb2.EncodedFrame) -> tuple[Frame, Lens | None]:
     """Decode a frame of a live camera as recorded, and its lens. Raises InvalidInputError and subclasses."""
-    lens = lens_from_message(message)
+    lens = _lens_from_message(message)
     return _decode_images(message), lens
 
 
 def _decode_images(message: geometry_pb2.EncodedFrame) -> Frame:
     camera = camera_from_message(message.camera)
-    motion = motion_from_message(message)
+    motion = _motion_from_message(message)
     return Frame(
         index=message.index,
         capture_time_ns=message.capture_time_ns,
@@ -317,14 +321,12 @@ def grid_from_message(message: geometry_pb2.VoxelGrid) -> VoxelGrid:
 
 def box_to_message(box: AxisAlignedBox) -> geometry_pb2.Box:
     """Encode a box."""
-    low, high = (geometry_pb2.Point(x=p[0], y=p[1], z=p[2]) for p in (box.min_m, box.max_m))
-    return geometry_pb2.Box(min_m=low, max_m=high)
+    return geometry_pb2.Box(min_m=point_to_message(box.min_m), max_m=point_to_message(box.max_m))
 
 
 def box_from_message(message: geometry_pb2.Box) -> AxisAlignedBox:
     """Decode a box. Raises InvalidInputError."""
-    low, high = message.min_m, message.max_m
-    return AxisAlignedBox((low.x, low.y, low.z), (high.x, high.y, high.z))
+    return AxisAlignedBox(point_from_message(message.min_m), point_from_message(message.max_m))
 
 
 def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits, first: bool) -> MapUpdate:

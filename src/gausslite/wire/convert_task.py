@@ -31,7 +31,13 @@ from gausslite.domain.task import (
     require_graph,
 )
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2, geometry_pb2, objects_pb2, task_pb2
-from gausslite.wire.convert import box_from_message, box_to_message
+from gausslite.wire.convert import (
+    box_from_message,
+    box_to_message,
+    point_from_message,
+    point_to_message,
+    values_of,
+)
 
 _Named = TypeVar("_Named", bound=StrEnum)
 _MAX_POINTED: Final = 64
@@ -50,58 +56,46 @@ _SUPERLATIVE_NUMBERS: dict[Any, Any] = {None: 0, **_numbers(task_pb2.Superlative
 _PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
 _ROLE_BY_NUMBER = {0: TargetRole.OBJECT, **{number: role for role, number in _ROLE_NUMBERS.items()}}
 _SUPERLATIVE_BY_NUMBER = {number: superlative for superlative, number in _SUPERLATIVE_NUMBERS.items()}
+_NAMES = ("targets", "anchors", "warnings", "excluded", "context")
+_RELATION = ("target", "anchor", "negated", "min_m", "max_m")
 
 
 def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
     """Encode a task graph."""
+    relations = [
+        task_pb2.Relation(**values_of(relation, _RELATION), predicate=_PREDICATE_NUMBERS[relation.predicate])
+        for relation in graph.relations
+    ]
+    attributes = [
+        task_pb2.ObjectAttributes(
+            name=attribute.name,
+            colour=attribute.colour or "",
+            superlative=_SUPERLATIVE_NUMBERS[attribute.superlative],
+        )
+        for attribute in graph.attributes
+    ]
     return task_pb2.TaskGraph(
-        task_id=graph.task_id,
-        text=graph.text,
-        targets=graph.targets,
-        anchors=graph.anchors,
-        relations=[
-            task_pb2.Relation(
-                predicate=_PREDICATE_NUMBERS[relation.predicate],
-                target=relation.target,
-                anchor=relation.anchor,
-                negated=relation.negated,
-                min_m=relation.min_m,
-                max_m=relation.max_m,
-            )
-            for relation in graph.relations
-        ],
-        warnings=graph.warnings,
+        **values_of(graph, ("task_id", "text", *_NAMES)),
+        relations=relations,
         roles=[_ROLE_NUMBERS[role] for role in graph.roles],
-        attributes=[
-            task_pb2.ObjectAttributes(
-                name=attribute.name,
-                colour=attribute.colour or "",
-                superlative=_SUPERLATIVE_NUMBERS[attribute.superlative],
-            )
-            for attribute in graph.attributes
-        ],
-        excluded=graph.excluded,
-        context=graph.context,
+        attributes=attributes,
     )
 
 
 def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
     """Decode a task graph and check it with `domain.task_limits`. Raises TaskError."""
     _require_known_numbers(message)
+    names = {name: tuple(values) for name, values in values_of(message, _NAMES).items()}
     graph = TaskGraph(
         task_id=message.task_id,
         text=message.text,
-        targets=tuple(message.targets),
-        anchors=tuple(message.anchors),
         relations=tuple(_relation_from_message(relation) for relation in message.relations),
-        warnings=tuple(message.warnings),
         roles=tuple(_ROLE_BY_NUMBER[role] for role in message.roles),
         attributes=tuple(
             ObjectAttributes(attribute.name, attribute.colour or None, _SUPERLATIVE_BY_NUMBER[attribute.superlative])
             for attribute in message.attributes
         ),
-        excluded=tuple(message.excluded),
-        context=tuple(message.context),
+        **names,
     )
     require_graph(graph)
     return graph
@@ -135,7 +129,7 @@ def assigned_to_message(
 ) -> agent_service_pb2.AssignTaskRequest:
     """Encode the request of an AssignTask call."""
     request = agent_service_pb2.AssignTaskRequest(
-        pointed=map(_pointed_to_message, pointed), excluded=map(_point_to_message, excluded_m)
+        pointed=map(_pointed_to_message, pointed), excluded=map(point_to_message, excluded_m)
     )
     if isinstance(task, str):
         request.text = task
@@ -149,7 +143,7 @@ def assigned_from_message(
 ) -> AssignedTask:
     """Decode the request of an AssignTask call; a text is parsed. Raises TaskError, InvalidInputError."""
     pointed = tuple(map(_pointed_from_message, message.pointed))
-    excluded_m = tuple(_point_from_message("excluded", point) for point in message.excluded)
+    excluded_m = tuple(_surface_point_from_message("excluded", point) for point in message.excluded)
     match message.WhichOneof("task"):
         case "text":
             return AssignedTask(parse(message.text), pointed, excluded_m)
@@ -164,7 +158,7 @@ def _pointed_to_message(pointed: PointedObject) -> agent_service_pb2.PointedObje
         frame_index=pointed.frame_index,
         points_px=[value for point in pointed.points_px for value in point],
         boxes_px=[value for box in pointed.boxes_px for value in box],
-        point_m=None if pointed.point_m is None else _point_to_message(pointed.point_m),
+        point_m=None if pointed.point_m is None else point_to_message(pointed.point_m),
         noun=pointed.noun,
     )
 
@@ -176,19 +170,15 @@ def _pointed_from_message(message: agent_service_pb2.PointedObject) -> PointedOb
     return PointedObject(
         tuple((x, y) for x, y in points.reshape(-1, 2).tolist()),
         tuple((left, top, right, bottom) for left, top, right, bottom in boxes.reshape(-1, 4).tolist()),
-        _point_from_message("point_m", message.point_m) if message.HasField("point_m") else None,
+        _surface_point_from_message("point_m", message.point_m) if message.HasField("point_m") else None,
         message.frame_index if message.HasField("frame_index") else None,
         noun_of(message.noun) or UNNAMED,
     )
 
 
-def _point_to_message(point_m: PointM) -> geometry_pb2.Point:
-    return geometry_pb2.Point(x=point_m[0], y=point_m[1], z=point_m[2])
-
-
-def _point_from_message(name: str, message: geometry_pb2.Point) -> PointM:
+def _surface_point_from_message(name: str, message: geometry_pb2.Point) -> PointM:
     """Decode a point on a surface. Raises InvalidInputError."""
-    point_m = message.x, message.y, message.z
+    point_m = point_from_message(message)
     if not all(abs(value) <= MAX_OBJECT_COORDINATE_M for value in point_m):
         raise InvalidInputError(f"{name}: expected coordinates within ±{MAX_OBJECT_COORDINATE_M:g} m, got {point_m}")
     return point_m
@@ -223,20 +213,16 @@ _OBSERVER = tuple(field.name for field in fields(ObjectObserver))
 
 def object_to_message(landmark: ObjectLandmark, observers: Sequence[ObjectObserver] = ()) -> objects_pb2.ObjectLandmark:
     """Encode an object; without observers, as one agent reports it."""
-    x, y, z = landmark.centroid_m
     return objects_pb2.ObjectLandmark(
         id=landmark.object_id,
         noun=landmark.noun,
         role=_ROLES[landmark.role],
-        centroid_m=geometry_pb2.Point(x=x, y=y, z=z),
+        centroid_m=point_to_message(landmark.centroid_m),
         extent_m=box_to_message(landmark.extent_m),
         confidence=landmark.confidence,
         first_seen_ns=landmark.first_seen_ns,
         last_seen_ns=landmark.last_seen_ns,
-        observers=[
-            objects_pb2.ObjectObserver(**{name: getattr(observer, name) for name in _OBSERVER})
-            for observer in observers
-        ],
+        observers=[objects_pb2.ObjectObserver(**values_of(observer, _OBSERVER)) for observer in observers],
     )
 
 
@@ -245,12 +231,11 @@ def object_from_message(message: objects_pb2.ObjectLandmark) -> ObjectLandmark:
     role = _OBJECT_ROLE_BY_NUMBER.get(message.role)
     if role is None:
         raise InvalidInputError(f"object role: expected TARGET or ANCHOR, got {message.role}")
-    centroid = message.centroid_m
     return ObjectLandmark(
         object_id=message.id,
         noun=message.noun,
         role=role,
-        centroid_m=(centroid.x, centroid.y, centroid.z),
+        centroid_m=point_from_message(message.centroid_m),
         extent_m=box_from_message(message.extent_m),
         confidence=message.confidence,
         first_seen_ns=message.first_seen_ns,
@@ -260,7 +245,7 @@ def object_from_message(message: objects_pb2.ObjectLandmark) -> ObjectLandmark:
 
 def team_object_from_message(message: objects_pb2.ObjectLandmark) -> TeamObject:
     """Decode an object of the team. Raises InvalidInputError."""
-    observers = tuple(ObjectObserver(*(getattr(own, name) for name in _OBSERVER)) for own in message.observers)
+    observers = tuple(ObjectObserver(**values_of(own, _OBSERVER)) for own in message.observers)
     return TeamObject(object_from_message(message), observers)
 
 

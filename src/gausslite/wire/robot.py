@@ -20,11 +20,13 @@ from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import AgentClient
-from gausslite.wire.convert import transform_from_message
+from gausslite.wire.convert import transform_from_message, values_of
 from gausslite.wire.convert_task import object_from_message
 from gausslite.wire.map_follower import FollowedMap, MapFollower
 
 _STATES = {number: name.removeprefix("AGENT_STATE_").lower() for name, number in pb.AgentState.items()}
+_FRAMES = tuple(f"frames_{outcome}" for outcome in ("mapped", "skipped", "dropped", "rejected"))
+_FIGURES = ("agent_id", "gaussians", *_FRAMES, "hz", "roi_share")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,16 +61,9 @@ class AgentSnapshot:
         if message.HasField("map_to_odom"):
             T_map_odometry = transform_from_message("t_map_odometry", message.map_to_odom.t_map_odometry)
         return cls(
-            agent_id=message.agent_id,
+            **values_of(message, _FIGURES),
             state=_STATES.get(message.state, "unknown"),
             task=message.graph.text,
-            gaussians=message.gaussians,
-            frames_mapped=message.frames_mapped,
-            frames_skipped=message.frames_skipped,
-            frames_dropped=message.frames_dropped,
-            frames_rejected=message.frames_rejected,
-            hz=message.hz,
-            roi_share=message.roi_share,
             age_p50_s=message.age_p50_seconds,
             problem=message.uplink.stopped_because,
             notes=tuple(message.notes),
@@ -272,7 +267,8 @@ class AgentLink:
             self._changed.notify_all()
         try:
             self._sender.close(_CLOSE_S)
-            if not end_mission or self._waits_for_task():
+            waits_for_task = self._snapshot is not None and self._snapshot.state == "waiting_for_task"
+            if not end_mission or waits_for_task:
                 return ""
             return self._client.end_mission(self._settings.handover, self._settings.drain_s).summary
         finally:
@@ -280,9 +276,6 @@ class AgentLink:
             if self._follower is not None:
                 self._follower.close()
             self._thread.join(_CLOSE_S)
-
-    def _waits_for_task(self) -> bool:
-        return self._snapshot is not None and self._snapshot.state == "waiting_for_task"
 
     def _run(self) -> None:
         while True:

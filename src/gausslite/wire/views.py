@@ -30,6 +30,7 @@ from gausslite.wire.convert import (
 )
 
 MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
+_SIDES = ("left_px", "top_px", "right_px", "bottom_px")
 
 
 def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewResponse:
@@ -79,7 +80,7 @@ def camera_view_from_message(message: agent_pb.GetCameraViewResponse) -> CameraV
 
 def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
     height_px, width_px = detected.rgb.shape[:2]
-    boxes = sorted(detected.boxes, key=lambda each: -each.score)[:MAX_BOXES]
+    boxes = sorted(detected.boxes, key=lambda box: -box.score)[:MAX_BOXES]
     return agent_pb.DetectedImage(
         frame_index=detected.index,
         colour_jpeg=encode_colour(detected.rgb),
@@ -87,13 +88,7 @@ def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
         height_px=height_px,
         boxes=[
             agent_pb.DetectedBox(
-                phrase=box.phrase,
-                score=box.score,
-                left_px=box.box_px[0],
-                top_px=box.box_px[1],
-                right_px=box.box_px[2],
-                bottom_px=box.box_px[3],
-                is_weak=box.is_weak,
+                phrase=box.phrase, score=box.score, is_weak=box.is_weak, **dict(zip(_SIDES, box.box_px, strict=True))
             )
             for box in boxes
         ],
