@@ -7,7 +7,9 @@ class GaussLiteError(Exception):
     retry_after_s: the time after which the same call may succeed; None if the error does not state it.
     """
 
-    retry_after_s: float | None = None
+    def __init__(self, *args: object, retry_after_s: float | None = None) -> None:
+        super().__init__(*args)
+        self.retry_after_s = retry_after_s
 
 
 class InvalidInputError(GaussLiteError):

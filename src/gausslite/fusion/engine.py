@@ -314,7 +314,7 @@ class FusionEngine:
             agent_id = self._members.sessions.get(session_id).agent_id
             if forget:
                 self._agents.remove(agent_id)
-            self._members.sessions.end(session_id)
+            self._members.sessions.end_agent(agent_id)
             return self.maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:

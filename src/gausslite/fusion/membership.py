@@ -97,7 +97,10 @@ class SessionRegistry:
         """Raise NameInUseError while another token holds the agent's lease."""
         remaining_s = self._remaining_s(agent_id)
         if remaining_s > 0 and not self._is_holder(agent_id, token):
-            raise _name_in_use(agent_id, remaining_s)
+            raise NameInUseError(
+                f"agent {quote_name(agent_id)}: {_NAME_TAKEN}, or wait {remaining_s:.0f} s for the end of its lease",
+                retry_after_s=remaining_s,
+            )
 
     def open(self, agent_id: str, token: str) -> SessionRecord:
         """Return a new session; the agent's earlier one ends. Raises NameInUseError, StorageError."""
@@ -156,10 +159,6 @@ class SessionRegistry:
         for session_id in [key for key, session in self._elsewhere.items() if session.agent_id == agent_id]:
             del self._elsewhere[session_id]
 
-    def end(self, session_id: str) -> None:
-        """End a session and its lease. Raises SessionUnknownError, MismatchError, NameInUseError, StorageError."""
-        self.end_agent(self.get(session_id).agent_id)
-
     def end_agent(self, agent_id: str) -> None:
         """End the session and the lease of an agent, if it has one. Raises StorageError."""
         for session_id in self._sessions_of(agent_id):
@@ -198,14 +197,6 @@ class SessionRegistry:
 
 def _hash(token: str) -> bytes:
     return hashlib.sha256(token.encode()).digest()
-
-
-def _name_in_use(agent_id: str, remaining_s: float) -> NameInUseError:
-    error = NameInUseError(
-        f"agent {quote_name(agent_id)}: {_NAME_TAKEN}, or wait {remaining_s:.0f} s for the end of its lease"
-    )
-    error.retry_after_s = remaining_s
-    return error
 
 
 class Membership:

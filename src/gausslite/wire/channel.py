@@ -6,7 +6,7 @@ import ipaddress
 import json
 import os
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -137,6 +137,7 @@ _RETRY_POLICY = {
     "retryableStatusCodes": ["UNAVAILABLE"],
 }
 _Client = TypeVar("_Client", bound="ServiceChannel")
+_Response = TypeVar("_Response")
 
 
 class ServiceChannel:
@@ -188,33 +189,34 @@ class ServiceChannel:
         except grpc.RpcError as error:
             raise _raised(error, str(self), self.address) from error
 
-    def _call(self, method: Any, request: Any, deadline_s: float | None = None) -> Any:
+    def _call(self, method: Callable[..., _Response], request: Any, deadline_s: float | None = None) -> _Response:
         self._require_open()
         with self._convert_errors():
             return method(request, timeout=self._deadline_s if deadline_s is None else deadline_s)
 
-    def _stream(self, method: Any, request: Any, deadline_s: float | None = None) -> Iterator[Any]:
+    def _stream(
+        self, method: Callable[..., Iterable[_Response]], request: Any, deadline_s: float | None = None
+    ) -> Iterator[_Response]:
         """Start a call at once, and return the iterator of its answers."""
         self._require_open()
         return self._answers(method(request, timeout=deadline_s))
 
-    def _exchange(self, method: Any, requests: Iterable[Any], deadline_s: float | None = None) -> Iterator[Any]:
+    def _exchange(
+        self, method: Callable[..., Iterable[_Response]], requests: Iterable[Any], deadline_s: float | None = None
+    ) -> Iterator[_Response]:
         """Start a call with a stream of requests at once, and return the iterator of its answers."""
+        self._require_open()
         reader = _RequestReader(requests)
-        return self._ended_with(reader, self._stream(method, iter(reader), deadline_s))
+        return self._answers(method(iter(reader), timeout=deadline_s), reader)
 
-    def _ended_with(self, reader: _RequestReader, answers: Iterator[Any]) -> Iterator[Any]:
-        try:
-            yield from answers
-        finally:
-            reader.wait()
-
-    def _answers(self, call: Any) -> Iterator[Any]:
+    def _answers(self, call: Any, reader: _RequestReader | None = None) -> Iterator[Any]:
         try:
             with self._convert_errors():
                 yield from call
         finally:
             call.cancel()
+            if reader is not None:
+                reader.wait()
 
     def _require_open(self) -> None:
         if self._closed:

@@ -140,14 +140,11 @@ class AgentClient(ServiceChannel):
         request = agent_service_pb2.EndMissionRequest(handover=handover, drain_seconds=drain_s)
         # after sending, the agent also writes its results
         deadline_s = MAX_END_S if drain_s is None else drain_s + 10 * self._deadline_s
-        response: agent_service_pb2.EndMissionResponse = self._call(self._stub.EndMission, request, deadline_s)
-        return response
+        return self._call(self._stub.EndMission, request, deadline_s)
 
     def status(self) -> agent_service_pb2.GetAgentStatusResponse:
         """Return the agent's status and counters."""
-        request = agent_service_pb2.GetAgentStatusRequest()
-        response: agent_service_pb2.GetAgentStatusResponse = self._call(self._stub.GetAgentStatus, request)
-        return response
+        return self._call(self._stub.GetAgentStatus, agent_service_pb2.GetAgentStatusRequest())
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> _View:
         """Return colour and depth in metres of the agent's map, rendered from this pose."""
@@ -228,8 +225,7 @@ class FusionClient(ServiceChannel):
             token=self._token,
             frame_is_unknown=isinstance(T_fused_agent, str),
         )
-        session: Session = self._call(self._stub.JoinSession, request)
-        return session
+        return self._call(self._stub.JoinSession, request)
 
     def keep_session(self, session_id: str) -> fusion_service_pb2.KeepSessionResponse:
         """Renew the lease; returns what identifies the updates that the server has. Raises SessionUnknownError."""
@@ -239,15 +235,12 @@ class FusionClient(ServiceChannel):
                 return self._owner.keep_session(session_id)
             except UnavailableError:
                 self._leave_owner()
-        request = fusion_service_pb2.KeepSessionRequest(session_id=session_id)
-        response: fusion_service_pb2.KeepSessionResponse = self._call(self._stub.KeepSession, request)
-        return response
+        return self._call(self._stub.KeepSession, fusion_service_pb2.KeepSessionRequest(session_id=session_id))
 
     def stored_digests(self, session_id: str) -> TileDigests:
         """Return the digests of the updates that the server has of the session's agent."""
         request = fusion_service_pb2.GetUpdateDigestsRequest(session_id=session_id)
-        blocks = self._stream(self._stub.GetUpdateDigests, request, self._deadline_s)
-        return digests_from_messages(blocks)
+        return digests_from_messages(self._stream(self._stub.GetUpdateDigests, request, self._deadline_s))
 
     def contribute(
         self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
@@ -302,7 +295,7 @@ class FusionClient(ServiceChannel):
 
     def contribute_keyframes(self, session_id: str, keyframes: Iterable[Frame]) -> int:
         """Send keyframes for the refinement; returns the number stored. Raises QuotaError, SessionUnknownError."""
-        return int(self.contribute_encoded_keyframes(session_id, map(convert.frame_to_message, keyframes)).accepted)
+        return self.contribute_encoded_keyframes(session_id, map(convert.frame_to_message, keyframes)).accepted
 
     def contribute_encoded_keyframes(
         self,
@@ -319,10 +312,7 @@ class FusionClient(ServiceChannel):
             fusion_service_pb2.ContributeKeyframesRequest(session_id=session_id, keyframe=keyframe, selected=selected)
             for keyframe in keyframes
         )
-        response: fusion_service_pb2.ContributeKeyframesResponse = self._call(
-            self._stub.ContributeKeyframes, requests, deadline_s or 10 * self._deadline_s
-        )
-        return response
+        return self._call(self._stub.ContributeKeyframes, requests, deadline_s or 10 * self._deadline_s)
 
     def watch(
         self,
@@ -390,9 +380,7 @@ class FusionClient(ServiceChannel):
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first."""
         request = fusion_service_pb2.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
-        return tuple(
-            team_object_from_message(message) for message in self._call(self._stub.QueryObjects, request).objects
-        )
+        return tuple(map(team_object_from_message, self._call(self._stub.QueryObjects, request).objects))
 
     def keyframe(self, agent_id: str, index: int | None = None) -> StoredKeyframe | None:
         """Return the agent's keyframe of this frame index, or the newest one; None if the server has none of it.
@@ -405,8 +393,7 @@ class FusionClient(ServiceChannel):
     def status(self) -> fusion_service_pb2.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
         request = fusion_service_pb2.GetSessionStatusRequest(mission_id=self.mission_id)
-        response: fusion_service_pb2.GetSessionStatusResponse = self._call(self._stub.GetSessionStatus, request)
-        return response
+        return self._call(self._stub.GetSessionStatus, request)
 
     def unlocalised(self) -> dict[str, str]:
         """Return the agents whose frame nobody knows, with what the server says of it; their objects are left out."""
@@ -421,7 +408,7 @@ class FusionClient(ServiceChannel):
         Raises NotPermittedError unless the caller is an operator, InvalidInputError for an unknown agent.
         """
         request = fusion_service_pb2.EvictAgentRequest(mission_id=self.mission_id, agent_id=agent_id, ban=ban)
-        return int(self._call(self._stub.EvictAgent, request).voxels)
+        return self._call(self._stub.EvictAgent, request).voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises NotPermittedError, InvalidInputError if it is not banned."""
@@ -431,4 +418,4 @@ class FusionClient(ServiceChannel):
     def leave(self, session_id: str, forget: bool = False) -> int:
         """Leave the mission; with `forget` the server deletes the agent's updates. Returns the fused revision."""
         request = fusion_service_pb2.LeaveSessionRequest(session_id=session_id, forget=forget)
-        return int(self._call(self._stub.LeaveSession, request).fused_revision)
+        return self._call(self._stub.LeaveSession, request).fused_revision

@@ -101,37 +101,32 @@ _PERIOD_S = 60.0
 _MAX_ENTRIES = 1000
 
 
-@dataclass(slots=True)
-class _Entry:
-    logged_s: float
-    count: int = 0
-
-
 class RejectionLog:
     """Counts refusals by caller and reason. Use it from one thread. clock_s: the time in seconds."""
 
     def __init__(self, log: logging.Logger, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._log, self._clock_s = log, clock_s
-        self._entries: OrderedDict[tuple[str, str], _Entry] = OrderedDict()
+        # when each refusal was logged, and how often it has come since
+        self._entries: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
 
     def record(self, caller: str, reason: str, message: str) -> None:
         """Log a refusal, or count it for the next line about this caller and reason."""
         now_s, key = self._clock_s(), (caller, reason)
-        entry = self._entries.get(key)
-        if entry is None:
+        if key not in self._entries:
             if len(self._entries) >= _MAX_ENTRIES:
                 # a hostile network can have any number of addresses
                 self._entries.popitem(last=False)
-            self._entries[key] = _Entry(now_s)
+            self._entries[key] = now_s, 0
             self._log.warning("refused %s from %s: %s", reason, caller, message)
             return
-        entry.count += 1
-        if now_s - entry.logged_s >= _PERIOD_S:
-            period_s, entry.logged_s = now_s - entry.logged_s, now_s
+        logged_s, count = self._entries[key]
+        self._entries[key] = logged_s, count + 1
+        period_s = now_s - logged_s
+        if period_s >= _PERIOD_S:
+            self._entries[key] = now_s, 0
             self._log.warning(
-                "refused %s from %s: %d times in %.0f s, at last: %s", reason, caller, entry.count, period_s, message
+                "refused %s from %s: %d times in %.0f s, at last: %s", reason, caller, count + 1, period_s, message
             )
-            entry.count = 0
 
 
 _ANY = frozenset({Role.ROBOT, Role.VIEWER, Role.OPERATOR})
@@ -407,11 +402,10 @@ class CallUsage:
         self._forget_idle_callers()
         usage = self._usages.setdefault(caller.key, _Usage(TokenBucket(self.limits.kbps)))
         if usage.open_calls >= self.limits.calls:
-            error = RateLimitError(
-                f"calls: expected at most {self.limits.calls} open ones from {caller.key[:200]}; close some"
+            raise RateLimitError(
+                f"calls: expected at most {self.limits.calls} open ones from {caller.key[:200]}; close some",
+                retry_after_s=_RETRY_AFTER_S,
             )
-            error.retry_after_s = _RETRY_AFTER_S
-            raise error
         usage.open_calls += 1
         try:
             yield usage.bandwidth

@@ -297,35 +297,33 @@ class _Guard:
 
     def unary_method(self, inner: Any) -> Any:
         async def guarded(request: Any, context: Any) -> Any:
-            try:
-                caller = Caller.of(context)
-                require_role(self.method, caller)
-                with self.usage.open_call(caller) as bandwidth:
-                    return await inner(await self._admit(request, bandwidth, context), context)
-            except Exception as error:
-                await self._abort(error, context)
+            async with self._admit(request, context) as decoded:
+                return await inner(decoded, context)
 
         return guarded
 
     def stream_method(self, inner: Any) -> Any:
         async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
-            try:
-                caller = Caller.of(context)
-                require_role(self.method, caller)
-                with self.usage.open_call(caller) as bandwidth:
-                    async for response in inner(await self._admit(request, bandwidth, context), context):
-                        yield response
-            except Exception as error:
-                await self._abort(error, context)
+            async with self._admit(request, context) as decoded:
+                async for response in inner(decoded, context):
+                    yield response
 
         return guarded
 
-    async def _admit(self, request: Any, bandwidth: TokenBucket | None, context: Any) -> Any:
-        """Return the decoded request or stream of requests, at the caller's bandwidth. Raises InvalidInputError."""
-        if self.request_streaming:
-            return self._read_stream(context, bandwidth)
-        await wait_for_bandwidth(bandwidth, len(request))
-        return self._decode(request)
+    @contextlib.asynccontextmanager
+    async def _admit(self, request: Any, context: Any) -> AsyncIterator[Any]:
+        """Give the decoded request, or stream of requests, at the caller's bandwidth; an error ends the call."""
+        try:
+            caller = Caller.of(context)
+            require_role(self.method, caller)
+            with self.usage.open_call(caller) as bandwidth:
+                if self.request_streaming:
+                    yield self._read_stream(context, bandwidth)
+                else:
+                    await wait_for_bandwidth(bandwidth, len(request))
+                    yield self._decode(request)
+        except Exception as error:
+            await self._abort(error, context)
 
     async def _abort(self, error: Exception, context: Any) -> NoReturn:
         if isinstance(error, grpc.aio.AbortError):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import grpc
-from google.protobuf import any_pb2, duration_pb2
+from google.protobuf import any_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2  # type: ignore[import-untyped]
 from grpc_status import rpc_status
 
@@ -72,9 +72,9 @@ def to_status(error: GaussLiteError) -> grpc.Status:
     code, reason = code_and_reason(error)
     details: list[Any] = [error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN)]
     if error.retry_after_s is not None:
-        delay = duration_pb2.Duration()
-        delay.FromMilliseconds(round(1000 * error.retry_after_s))
-        details.append(error_details_pb2.RetryInfo(retry_delay=delay))
+        retry = error_details_pb2.RetryInfo()
+        retry.retry_delay.FromMilliseconds(round(1000 * error.retry_after_s))
+        details.append(retry)
     packed = [any_pb2.Any() for _ in details]
     for target, detail in zip(packed, details, strict=True):
         target.Pack(detail)
@@ -83,9 +83,9 @@ def to_status(error: GaussLiteError) -> grpc.Status:
     return status
 
 
-def error_from_reason(reason: str, message: str) -> GaussLiteError:
+def error_from_reason(reason: str, message: str, retry_after_s: float | None = None) -> GaussLiteError:
     """Return the error of the class that a reason names; an unknown reason gives the base class."""
-    return _BY_REASON.get(reason, GaussLiteError)(message)
+    return _BY_REASON.get(reason, GaussLiteError)(message, retry_after_s=retry_after_s)
 
 
 def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
@@ -95,9 +95,7 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
     code, text = error.code(), error.details() or "no details"
     reason, retry_after_s = _details(error)
     if reason is not None:
-        raised = error_from_reason(reason, text)
-        raised.retry_after_s = retry_after_s
-        return raised
+        return error_from_reason(reason, text, retry_after_s)
     if code is grpc.StatusCode.DEADLINE_EXCEEDED:
         return errors.UnavailableError(f"{address}: no answer in time")
     if code is grpc.StatusCode.UNAVAILABLE and any(cause in text for cause in _NOT_LISTENING):
