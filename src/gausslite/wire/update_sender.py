@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -122,8 +122,8 @@ class SentPart:
 
 _MIN_SUBSET_BYTES = 1 << 16
 _PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
-Count = Callable[[Callable[[UplinkCounters], UplinkCounters]], None]
-"""Replaces the uplink's counters by what the function returns for them."""
+Count = Callable[..., None]
+"""Adds to the uplink's counters of these names."""
 
 
 class UpdateSender:
@@ -230,18 +230,12 @@ class UpdateSender:
     def _drop(self, part: SpoolBatch, reason: str) -> None:
         _log.warning("uplink: updates of %d voxels are dropped: %s", len(part.batch), reason)
         self._spool.mark_done(part)
-        self._count(lambda counters: replace(counters, subsets_rejected=counters.subsets_rejected + 1))
+        self._count(subsets_rejected=1)
 
     def _count_sent(self, part: SpoolBatch, size: int, keys: set[int], rejected: bool) -> None:
         is_roi = part.purpose is Purpose.ROI
-        self._count(
-            lambda counters: replace(
-                counters,
-                roi_bytes=counters.roi_bytes + size * is_roi,
-                handover_bytes=counters.handover_bytes + size * (not is_roi),
-                gaussians_sent=counters.gaussians_sent + len(part.batch.gaussians) * (not rejected),
-                subsets_sent=counters.subsets_sent + 1,
-            )
-        )
+        gaussians = 0 if rejected else len(part.batch.gaussians)
+        bytes_of_purpose = {"roi_bytes" if is_roi else "handover_bytes": size}
+        self._count(**bytes_of_purpose, gaussians_sent=gaussians, subsets_sent=1)
         if is_roi and not rejected:
             self._roi_voxels |= keys

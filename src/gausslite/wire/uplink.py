@@ -11,7 +11,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from jaxtyping import Int64
@@ -153,9 +153,10 @@ class Uplink:
         self._thread.join()
         self._spool.close()
 
-    def _count(self, add: Callable[[UplinkCounters], UplinkCounters]) -> None:
+    def _count(self, **added: int) -> None:
         with self._changed:
-            self._counters = add(self._counters)
+            sums = {name: getattr(self._counters, name) + count for name, count in added.items()}
+            self._counters = replace(self._counters, **sums)
 
     def _is_finished(self) -> bool:
         return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
@@ -285,7 +286,7 @@ class Uplink:
         rejected = {rejection.index for rejection in response.rejected}
         with self._changed:
             self._sent_keyframes |= {keyframe.frame_index for keyframe in due} - rejected
-            self._counters = replace(self._counters, keyframe_bytes=self._counters.keyframe_bytes + byte_count)
+            self._count(keyframe_bytes=byte_count)
 
     def _join_if_needed(self) -> Session:
         if self._session is None:
