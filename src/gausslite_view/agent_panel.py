@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from gausslite.wire.convert_task import object_from_message
 from gausslite.wire.map_follower import MapFollower
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
-from gausslite_view.map_page import MapPage, text_html
+from gausslite_view.map_page import MapPage, TaskField, text_html
 from gausslite_view.plots import HistoryPlot, QualityPlot
 from gausslite_view.pointing import PointingPanel
 
@@ -34,8 +34,7 @@ class AgentPanel:
         gui = page.server.gui
         with gui.add_folder("Agent", order=0):
             self._status = gui.add_html("")
-            self._task: Any = gui.add_text("Task", "")
-            self._assign = gui.add_button("Assign task")
+            TaskField(gui, client.assign_task)
             self._end = gui.add_button("End mission", color="red")
             self._message = gui.add_html("")
         self._pointing = PointingPanel(page, client)
@@ -45,8 +44,7 @@ class AgentPanel:
             self._roi = HistoryPlot(gui, "pixels in the task's region (%)", ["ROI %"])
             self._quality = QualityPlot(gui)
             self._traffic = HistoryPlot(gui, "sent (kB/s)", ["kB/s"])
-        self._assign.on_click(lambda _: self._run(self._assign, self._assign_task))
-        self._end.on_click(lambda _: self._run(self._end, self._end_mission))
+        self._end.on_click(lambda _: self._end_mission())
 
     def poll(self) -> None:
         """Read the agent's status and draw what changed. Raises GaussLiteError."""
@@ -89,22 +87,15 @@ class AgentPanel:
         self._polled_s = now_s
         self._status.content = text_html(list(_status_lines(status)))
 
-    def _assign_task(self) -> str:
-        graph = self._client.assign_task(str(self._task.value))
-        return f"assigned: targets {', '.join(graph.targets)}"
-
-    def _end_mission(self) -> str:
-        return str(self._client.end_mission().summary)
-
-    def _run(self, button: Any, action: Callable[[], str]) -> None:
-        """Run a button's action on a thread of the page's server, and show its result or error."""
-        button.disabled = True
+    def _end_mission(self) -> None:
+        """End the mission, on a thread of the page's server, and show what was sent or the error."""
+        self._end.disabled = True
         try:
-            self._message.content = text_html([action()])
+            self._message.content = text_html([str(self._client.end_mission().summary)])
         except GaussLiteError as error:
             self._message.content = text_html([str(error)])
         finally:
-            button.disabled = False
+            self._end.disabled = False
 
 
 def _status_lines(status: Any) -> Iterator[str]:

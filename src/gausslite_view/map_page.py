@@ -9,8 +9,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import viser
 
+from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.gaussians import choose_gaussians
+from gausslite.domain.task import TaskGraph
 from gausslite_view.contents import (
     DEFAULT_LIMIT,
     ColourMode,
@@ -167,6 +170,27 @@ class MapPage:
             shown = contents.gaussians.take(rows)
             splats = Splats(shown.means_m, covariances_m2(shown), colours_of(contents, mode)[rows], shown.opacities)
             self._layer.show(SplatLevels(splats, self._start_view or start_view(contents)))
+
+
+class TaskField:
+    """Owns the field and the button with which a person assigns a task. assign: it may raise GaussLiteError."""
+
+    def __init__(self, gui: viser.GuiApi, assign: Callable[[str], TaskGraph], task: str = "") -> None:
+        self._assign = assign
+        self.text: Any = gui.add_text("Task", task)
+        button = gui.add_button("Assign task")
+        self._message = gui.add_html("")
+        button.on_click(lambda _: self._press())
+
+    def _press(self) -> None:
+        """Assign the sentence, on a thread of the page's server, and show the targets or the error."""
+        self._message.content = text_html(["the mission answers after its current frame"])
+        try:
+            graph = self._assign(str(self.text.value))
+            lines = [f"assigned: targets {', '.join(graph.targets)}", *graph.warnings]
+        except GaussLiteError as error:
+            lines = [str(error)]
+        self._message.content = text_html(lines)
 
 
 def legend_html(entries: Sequence[tuple[str, tuple[int, int, int]]]) -> str:

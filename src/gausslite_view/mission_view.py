@@ -23,9 +23,10 @@ from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.schedule import ScheduledTaskMapper
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.process import print_message
+from gausslite.task.rules import RuleParser
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
-from gausslite_view.map_page import MapPage
+from gausslite_view.map_page import MapPage, TaskField
 from gausslite_view.pages import open_page
 from gausslite_view.plots import HistoryPlot, QualityPlot
 from gausslite_view.pointing import PointingPanel
@@ -61,6 +62,11 @@ class MissionRequests:
     def assign_task(self, *, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()) -> TaskGraph:
         """Change the task as `ScheduledTaskMapper.point_at`, with its errors and those of `camera_view`."""
         return self._ask(lambda: self._mission.point_at(pointed, excluded_m))
+
+    def assign(self, task: str) -> TaskGraph:
+        """Change the task as `ScheduledTaskMapper.assign`, with its errors; also raises TaskError, UnavailableError."""
+        graph = RuleParser().parse(task)
+        return self._ask(lambda: self._mission.assign(graph))
 
     def answer(self) -> None:
         """Answer all requests that wait; call it from the thread that maps."""
@@ -99,6 +105,8 @@ class MissionView:
         self._due_s = 0.0
         self._requests = MissionRequests(mission)
         gui = page.server.gui
+        with gui.add_folder("Task", order=0):
+            self._task = TaskField(gui, self._requests.assign, "" if mission.graph is None else mission.graph.text)
         self._pointing = PointingPanel(page, self._requests)
         self._camera = CameraPanel(page)
         with gui.add_folder("History", expand_by_default=False):

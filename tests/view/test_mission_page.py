@@ -106,7 +106,11 @@ def test_a_click_on_the_camera_image_is_a_target_until_it_is_left_out() -> None:
                 assert (searched.graph.targets, searched.graph.pointed) == (("mug", "wall"), ("wall",))
                 tab.get_by_role("button", name="Not this one").click()
                 tab.get_by_text("is left out").wait_for()
+                view._task.text.value = "Find the lamp"
+                tab.get_by_role("button", name="Assign task").click()
+                tab.get_by_text("assigned: targets lamp").wait_for()
             assert searched.process(wall_frame(len(shares))).roi_share == 0
+            assert searched.graph.targets == ("lamp",)
         finally:
             view.close()
 
@@ -140,6 +144,20 @@ def test_what_a_person_points_at_is_meant_until_the_next_task() -> None:
     assert searched.graph.targets == ("chair",)
 
 
+def test_a_task_of_a_person_is_meant_until_the_next_scheduled_one() -> None:
+    searched = mission((2, "Find the chair"))
+    searched.process(wall_frame())
+    searched.point_at([PointedObject(points_px=((32.0, 24.0),), noun="mug")])
+    lamp = RuleParser().parse("Find the lamp")
+    (warning,) = searched.assign(lamp).warnings
+    assert "'lamp'" in warning
+    assert searched.process(wall_frame(1)).roi_share == 0
+    assert searched.graph == lamp
+    assert [(frame, graph.targets) for frame, graph in searched.schedule.switches] == [(2, ("chair",)), (1, ("lamp",))]
+    searched.process(wall_frame(2))
+    assert searched.graph.targets == ("chair",)
+
+
 def test_a_keyframe_that_was_shown_can_be_pointed_at_when_newer_ones_have_replaced_it() -> None:
     searched, indices = mission(), range(80)
     shown = 0
@@ -160,7 +178,7 @@ def test_a_keyframe_that_was_shown_can_be_pointed_at_when_newer_ones_have_replac
     assert searched.process(wall_frame(len(indices))).roi_share > 0
 
 
-def test_a_run_without_a_task_cannot_be_pointed_at() -> None:
+def test_a_run_without_a_task_gets_none_later() -> None:
     estimators = EstimatorFactory(PerceptionSettings(), SceneInfo)
     uniform = ScheduledTaskMapper(
         build_task_mapper(MissionSettings(policy="uniform", threads=1), estimators, []),
@@ -171,6 +189,8 @@ def test_a_run_without_a_task_cannot_be_pointed_at() -> None:
     )
     with pytest.raises(InvalidInputError, match="expected a run with a task"):
         uniform.point_at([PointedObject(points_px=((32.0, 24.0),))])
+    with pytest.raises(InvalidInputError, match="expected a run that began with one"):
+        uniform.assign(RuleParser().parse("Find the mug"))
 
 
 def test_a_resumed_run_keeps_what_a_person_has_pointed_at(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import logging
 import threading
 import time
 from concurrent.futures import Future
-from dataclasses import replace
 from pathlib import Path
 
 from gausslite.codec.json import graph_as_json, noun_as_json, object_as_json
@@ -14,7 +13,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchE
 from gausslite.domain.frame import ClockJumps, Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import match_warnings
-from gausslite.domain.task import LIMITS, TaskGraph
+from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
@@ -164,8 +163,7 @@ class AgentMission:
             raise MismatchError(f"task: {NO_DETECTOR}")
         graph = self._worker.assign(assigned.graph, assigned.pointed, assigned.excluded_m).result()
         self._begin()
-        unknown = match_warnings([noun.match for noun in self._worker.status().nouns])
-        return replace(graph, warnings=(*graph.warnings, *unknown)[: LIMITS.max_warnings])
+        return graph.with_warnings(match_warnings([noun.match for noun in self._worker.status().nouns]))
 
     def assign_task(self) -> None:
         """Assign the task of the command line.

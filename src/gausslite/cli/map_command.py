@@ -262,6 +262,8 @@ class _Run:
 
             checkpoint = None if options.save_state is None else self._save
             result = MissionRunner(self._scheduled.process, report, checkpoint).run(frames, resumed_after)
+        # a person may have given other tasks on the page
+        self._inputs = replace(inputs, schedule=self._scheduled.schedule)
         if result.processed == 0 and self._corrupt.first_error is not None:
             raise self._corrupt.first_error
         self._gaussians = self._mapper.gaussians()
@@ -380,7 +382,7 @@ class _Run:
             extra = {**extra, **self._prior.state()}
         if self._scheduled.graph is not None and self._scheduled.graph.pointed:
             extra = {**extra, _POINTED: encode_text("\n".join(self._scheduled.graph.pointed))}
-        config = self._recorded.resume_config(last_index)
+        config = replace(self._recorded, schedule=self._scheduled.schedule).resume_config(last_index)
         try:
             save_run(self._options.save_state, self._mapper, config, last_index, extra)
         except StorageError as error:

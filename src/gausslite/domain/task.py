@@ -149,6 +149,10 @@ class TaskGraph:
         require_graph(graph)
         return graph
 
+    def with_warnings(self, more: Iterable[str]) -> TaskGraph:
+        """Return the graph with more warnings, as many as the limits allow."""
+        return replace(self, warnings=(*self.warnings, *more)[: LIMITS.max_warnings])
+
     @property
     def excluded_nouns(self) -> tuple[str, ...]:
         """The nouns of excluded objects that no target has: their pixels belong to no target."""

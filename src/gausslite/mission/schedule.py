@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from gausslite.codec.state_file import write_atomic
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.objects import match_warnings
 from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.state import EvenHistory
 from gausslite.domain.task import TaskGraph
@@ -85,11 +86,17 @@ class TaskSchedule:
         past = [(first_frame, graph) for first_frame, graph in self.switches if first_frame <= frame_index]
         return max(past, key=lambda switch: switch[0])[1] if past else self.first
 
+    def with_switch(self, first_frame: int, graph: TaskGraph) -> TaskSchedule:
+        """Return the schedule with another task from this frame on, until the next switch."""
+        others = (switch for switch in self.switches if switch[0] != first_frame)
+        return replace(self, switches=(*others, (first_frame, graph)))
+
 
 class ScheduledTaskMapper:
-    """Process frames with a TaskMapper, assign each scheduled task before its first frame, and take pointed objects.
+    """Process frames with a TaskMapper, assign each scheduled task before its first frame, and take what a person says.
 
     graph: the task that the mapper has now, with what a person points at; None without a task in natural language.
+    schedule: all tasks, those of a person included.
     """
 
     def __init__(
@@ -101,19 +108,32 @@ class ScheduledTaskMapper:
         last_index: int,
     ) -> None:
         """last_index: of the last frame that the mapper has processed, -1 for none."""
-        self.mapper, self.graph = mapper, graph
-        self._schedule = schedule
+        self.mapper, self.graph, self.schedule = mapper, graph, schedule
         self._estimators = estimators
         self._scheduled = schedule.at(last_index)
+        self._last_index = last_index
 
     def process(self, frame: Frame) -> FrameOutcome:
         """Process one frame for the task that is scheduled for it."""
-        scheduled = self._schedule.at(frame.index)
+        scheduled = self.schedule.at(frame.index)
         if scheduled is not None and self._scheduled is not None and not scheduled.is_equivalent_to(self._scheduled):
             self.mapper.assign(self._estimators.build(scheduled))
             self.graph = scheduled
-        self._scheduled = scheduled
+        self._scheduled, self._last_index = scheduled, frame.index
         return self.mapper.process(frame)
+
+    def assign(self, graph: TaskGraph) -> TaskGraph:
+        """Switch to a person's task, until the next scheduled one; return it with a warning for each unknown noun.
+
+        Call it between two frames. Raises InvalidInputError.
+        """
+        if self.graph is None:
+            raise InvalidInputError("task: expected a run that began with one (--task TEXT), which another can follow")
+        if not graph.is_equivalent_to(self.graph):
+            self.mapper.assign(self._estimators.build(graph))
+        self.graph = self._scheduled = graph
+        self.schedule = self.schedule.with_switch(self._last_index + 1, graph)
+        return graph.with_warnings(match_warnings(self._estimators.noun_matches(graph)))
 
     def point_at(self, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM] = ()) -> TaskGraph:
         """Add the objects that a person points at to the task, leave out those at points, and return the task.
