@@ -26,7 +26,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import Twist, UpAxis, require_rigid
 from gausslite.domain.recording import DepthRegistration, PoseExposurePrior
-from gausslite.domain.relevance import BallRegion, Region
+from gausslite.domain.relevance import BallRegion, PointedObject, Region
 from gausslite.domain.voxels import empty_batch
 from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
@@ -67,6 +67,7 @@ __all__ = [
     "MissionSettings",
     "ParserClient",
     "PerceptionSettings",
+    "PointedObject",
     "PoseExposurePrior",
     "PoseMode",
     "RenderedImage",

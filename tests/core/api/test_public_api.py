@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,6 +39,8 @@ def test_every_public_name_is_importable_and_documented() -> None:
     for name in gl.__all__:
         assert getattr(gl, name).__doc__, name
     assert set(gl.__all__) <= set(dir(gl))
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "python.md").read_text()
+    assert [name for name in gl.__all__ if not re.search(rf"\b{name}\b", page)] == []
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = gl.no_such_name
 
