@@ -22,6 +22,12 @@ _MIN_UNITS_PER_METRE = 0.1
 """Smaller values are metres per unit, the reciprocal."""
 
 
+def example_camera_file(width_px: int, height_px: int) -> str:
+    """Return the name and the form of a camera file for images of this size, for messages."""
+    size = f'"w": {width_px}, "h": {height_px}'
+    return f'{CAMERA_FILE} ({{"camera": {{{size}, "fx": FX, "fy": FY, "cx": CX, "cy": CY, "scale": UNITS_PER_METRE}}}})'
+
+
 def find_in_or_above(folder: Path, name: str) -> Path | None:
     """Return the file of this name in the folder or in its parent, or None."""
     return next((path for path in (folder / name, folder.parent / name) if path.is_file()), None)

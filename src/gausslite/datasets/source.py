@@ -150,9 +150,18 @@ def require_matches(folder: Path, count: int, expected: str, times_s: Mapping[st
         ranges = (
             f"{name} from {min(times):.3f} to {max(times):.3f} s" for name, times in times_s.items() if len(times)
         )
-        raise DatasetError(
-            f"{folder}: expected {expected}, got none: {', '.join(ranges)}; are these times of the same clock?"
-        )
+        units = {name: unit for name, times in times_s.items() if len(times) and (unit := _probable_unit(max(times)))}
+        advice = "are these times of the same clock?"
+        if units:
+            found = (f"those of {name} look like {unit}" for name, unit in units.items())
+            advice = f"times are seconds, but {', '.join(found)}"
+        raise DatasetError(f"{folder}: expected {expected}, got none: {', '.join(ranges)}; {advice}")
+
+
+def _probable_unit(time: float) -> str:
+    """Return the unit of a time since 1970 that is too large for seconds; empty for seconds."""
+    limits = ((1e11, ""), (1e14, "milliseconds"), (1e17, "microseconds"))
+    return next((unit for limit, unit in limits if time < limit), "nanoseconds")
 
 
 _DOWNSCALED_PIXELS = 320 * 240

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, FolderCamera, read_folder_camera
+from gausslite.datasets.camera_files import FolderCamera, example_camera_file, read_folder_camera
 from gausslite.datasets.files import (
     DepthUnits,
     first_readable_size,
@@ -231,7 +231,7 @@ def read_tum_camera(folder: Path, width_px: int, height_px: int) -> FolderCamera
     found = read_folder_camera(folder, width_px, height_px, published)
     if found is None:
         raise DatasetError(
-            f"{folder}: the camera is unknown: expected the file {INTRINSICS_FILE} (three rows: fx 0 cx, 0 fy cy, "
-            f"0 0 1) or {CAMERA_FILE}, or a folder named after fr1, fr2 or fr3 (or freiburg1 ...) with images of 4:3"
+            f"{folder}: the camera is unknown: expected {example_camera_file(width_px, height_px)}, or a folder named "
+            "after fr1, fr2 or fr3 (or freiburg1 ...) with images of 4:3"
         )
     return found

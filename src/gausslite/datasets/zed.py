@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.datasets.camera_files import CAMERA_FILE, INTRINSICS_FILE, read_folder_camera
+from gausslite.datasets.camera_files import example_camera_file, read_folder_camera
 from gausslite.datasets.files import DepthUnits, first_readable_size, parse_numbers, read_rows
 from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource, is_lost, pose_from_quaternion
 from gausslite.domain.errors import DatasetError
@@ -40,10 +40,11 @@ class ZedSource(NumberedFolderSource):
         self._find_colours(folder, folder.iterdir(), _COLOUR_NAME, "left000000.png")
         self._pose_rows = _read_pose_rows(folder, require_poses)
         self._select_frames(require_poses)
-        found = read_folder_camera(folder, *first_readable_size(self._colours[number] for number in self._numbers))
+        size_px = first_readable_size(self._colours[number] for number in self._numbers)
+        found = read_folder_camera(folder, *size_px)
         if found is None:
             raise DatasetError(
-                f"{folder}: the camera is unknown: expected {CAMERA_FILE} or {INTRINSICS_FILE} with the SDK's "
+                f"{folder}: the camera is unknown: expected {example_camera_file(*size_px)} with the SDK's "
                 "calibration_parameters.left_cam (the file SN*.conf has those of the unrectified images)"
             )
         self._set_camera(found, _MILLIMETRES)

@@ -93,6 +93,12 @@ CASES: list[tuple[str, Damage, type[GaussLiteError], str]] = [
         DatasetError,
         "fr1: expected a colour image with depth within 20 ms",
     ),
+    (
+        "tum",
+        lambda f: (f / "groundtruth.txt").write_text("1305031453000 0 0 0 0 0 0 1\n1305031454000 0 0 0 0 0 0 1\n"),
+        DatasetError,
+        "times are seconds, but those of poses look like milliseconds",
+    ),
     ("tum", lambda f: f.rename(f.with_name("odd")), DatasetError, "odd: the camera is unknown"),
     (
         "tum",
