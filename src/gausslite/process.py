@@ -80,21 +80,31 @@ def raise_interrupts() -> None:
 def run_program(program: str, module: str, function: str = "run") -> int:
     """Import the module, call its function and return the exit code; signals are handled from the start.
 
-    A library that is older than its generated code gives one line and exit code 2.
+    A library older than its generated code, and modules that were not compiled, give one line and exit code 2.
     """
     end_quietly_while_starting(program)
     try:
         return int(getattr(import_module(module), function)())
     except Exception as error:
-        package = _outdated_package(error)
-        if package is None:
+        advice = _installation_advice(error)
+        if advice is None:
             raise
         reason = " ".join(str(error).split()).partition(". ")[0]
-        print_message(
-            f"{program}: the installed {package} is too old, perhaps because another package has pinned it; "
-            f"run pip install --upgrade {package} ({reason})"
-        )
+        print_message(f"{program}: {advice} ({reason})")
         return 2
+
+
+def _installation_advice(error: Exception) -> str | None:
+    """Return how to mend an installation that causes an import to fail; None for other errors."""
+    if isinstance(error, ImportError) and (error.name or "").startswith("gausslite."):
+        return "its compiled modules are not built for this Python; install GaussLite again with it"
+    package = _outdated_package(error)
+    if package is None:
+        return None
+    return (
+        f"the installed {package} is too old, perhaps because another package has pinned it; "
+        f"run pip install --upgrade {package}"
+    )
 
 
 def _outdated_package(error: Exception) -> str | None:

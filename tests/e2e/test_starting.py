@@ -77,6 +77,14 @@ def test_a_library_older_than_its_generated_code_gives_one_line(tmp_path: Path, 
     assert f"pip install --upgrade {name.split()[0]} (" in line
 
 
+def test_compiled_modules_that_are_missing_give_one_line(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text("from gausslite.codec import _not_compiled")
+    code = "import sys\nfrom gausslite.process import run_program\nsys.exit(run_program('gausslite', 'program'))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, timeout=60, capture_output=True, text=True)
+    [line] = done.stderr.splitlines()
+    assert (done.returncode, "install GaussLite again with it" in line, "_not_compiled" in line) == (2, True, True)
+
+
 def test_another_error_of_an_import_keeps_its_traceback(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text("import no_such_module")
     code = "from gausslite.process import run_program\nrun_program('gausslite', 'program')"
