@@ -29,6 +29,8 @@ def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.Captur
         "vote",
         "vote of shared regions",
         "refine",
+        "agent-0 alone",
+        "agent-1 alone",
     }
     assert all(5 < value < 60 for value in task["full_psnr"].values())
     assert task["alignment"]["agent-0"] == "reference"
@@ -36,7 +38,7 @@ def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.Captur
     assert task["bytes_sent"] > 0
     # a policy without a task has no region to send
     assert uniform["share_percent"] == 0
-    assert (tmp_path / "team.md").read_text().count("| home-4 x 2 |") == 8
+    assert (tmp_path / "team.md").read_text().count("| home-4 x 2 |") == 12
 
 
 def test_four_agents_of_a_home_see_different_views() -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
+from gausslite.datasets.source import Source
+from gausslite.domain.frame import Frame
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite_bench.quality.home_tasks import HomeTask
@@ -65,12 +68,13 @@ class HomeScenePlan:
         """Return the scene; the training trajectories follow each other as one mission."""
         recorded = self.recorded_size or size
         size_option = f"&size={recorded[0]}x{recorded[1]}"
-        training_sources = [open_source(f"{spec}{size_option}") for spec in self._training_specs()]
-        training = [source.frame(i, size) for source in training_sources for i in range(len(source))]
-        held_out_source = open_source(f"{self._held_out_spec()}{size_option}")
-        regions = choose_regions(training_sources[0].regions(), self.pair.objects)
-        views = [HeldOutView.of(held_out_source.frame(i, size), regions) for i in range(len(held_out_source))]
-        return make_scene(self.task, training, views, regions, SceneInfo.of(training_sources[0]))
+        walks = [_walk(f"{spec}{size_option}", size) for spec in (*self._training_specs(), self._held_out_spec())]
+        *training, held_out = (frames for _, frames in walks)
+        source = walks[0][0]
+        regions = choose_regions(source.regions(), self.pair.objects)
+        views = [HeldOutView.of(frame, regions) for frame in held_out]
+        frames = [frame for walk in training for frame in walk]
+        return make_scene(self.task, frames, views, regions, SceneInfo.of(source))
 
     def _training_specs(self) -> list[str]:
         first = max(1, round(_FIRST_TRAJECTORY_SHARE * self.frames))
@@ -82,3 +86,10 @@ class HomeScenePlan:
 
     def _spec(self, trajectory: int, frames: int) -> str:
         return f"sim:home-{self.pair.home}?seed={self.seed}&trajectory={trajectory}&frames={frames}"
+
+
+@lru_cache(maxsize=len(_TRAINING_TRAJECTORIES) + 1)
+def _walk(spec: str, size: tuple[int, int]) -> tuple[Source, tuple[Frame, ...]]:
+    """Return a source with its frames; cached, because a home's tasks follow each other and have the same walks."""
+    source = open_source(spec)
+    return source, tuple(source.frame(i, size) for i in range(len(source)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from statistics import fmean, pstdev
 
@@ -53,10 +53,11 @@ FULL_METRICS = (
     Metric("Laplacian ratio↑", "full_laplacian_ratio", 2),
     Metric("GMSD↓", "full_gradient_deviation", 3),
 )
-FITTED_METRICS = (
-    Metric("PSNR, views fitted↑", "roi_psnr", 2, fit=ViewFit.FITTED),
-    Metric("PSNR, views fitted↑", "full_psnr", 2, fit=ViewFit.FITTED),
+ROI_FITTED_METRICS, FULL_FITTED_METRICS = (
+    tuple(replace(metric, title=f"{metric.title}, views fitted", fit=ViewFit.FITTED) for metric in metrics[:3])
+    for metrics in (ROI_METRICS, FULL_METRICS)
 )
+FITTED_PSNR = (ROI_FITTED_METRICS[0], FULL_FITTED_METRICS[0])
 REGION_FITTED_METRICS = (
     Metric("PSNR, fitted at the region↑", "roi_psnr", 2, fit=ViewFit.REGION_FITTED),
     Metric("Laplacian ratio, fitted at the region↑", "roi_laplacian_ratio", 2, fit=ViewFit.REGION_FITTED),
@@ -142,10 +143,12 @@ class StudyResults:
         """Return the scene's task."""
         return next(trial.trial.plan.task for trial in self._finished if trial.trial.plan.name == scene)
 
-    def cost(self, variant: str, budget: TrialBudget) -> tuple[float, float]:
-        """Return the mean iterations and milliseconds per frame, over all scenes and seeds."""
-        results = [result for scene in self.scenes for result in (e.result for e in self._of(scene, variant, budget))]
-        return fmean(r.iterations_mean for r in results), fmean(r.ms_per_frame for r in results)
+    def cost_text(self, variant: str, budget: TrialBudget) -> str:
+        """Return the mean iterations and milliseconds per frame and sizes of the maps, over all scenes and seeds."""
+        results = [trial.result for scene in self.scenes for trial in self._of(scene, variant, budget)]
+        columns = [(r.iterations_mean, r.ms_per_frame, r.gaussians, r.map_bytes / 1e3) for r in results]
+        iterations, ms, gaussians, kilobytes = (fmean(column) for column in zip(*columns, strict=True))
+        return f"{iterations:.1f} iterations and {ms:.0f} ms per frame, {gaussians:.0f} Gaussians, {kilobytes:.0f} kB"
 
     def as_json(self) -> dict[str, object]:
         """Return all means and all trials as JSON values."""
@@ -163,7 +166,8 @@ class StudyResults:
         ]
 
     def _scene_as_json(self, scene: str) -> dict[str, object]:
-        metrics = (*ROI_METRICS, *FULL_METRICS, *FITTED_METRICS, *REGION_FITTED_METRICS)
+        fitted = (*ROI_FITTED_METRICS, *FULL_FITTED_METRICS, *REGION_FITTED_METRICS)
+        metrics = (*ROI_METRICS, *FULL_METRICS, *fitted)
         results = []
         for budget in self.budgets:
             for variant in self.variants:
@@ -182,7 +186,7 @@ class StudyResults:
         return {"scene": scene, "task": self.task(scene), "roi_share": self.roi_share(scene), "results": results}
 
     def _summary(self, budget: TrialBudget) -> dict[str, object]:
-        metrics = (*RAW_PSNR, ROI_METRICS[1], *FITTED_METRICS)
+        metrics = (*RAW_PSNR, ROI_METRICS[1], *FITTED_PSNR)
         known = {metric.name: self.margins(metric, budget) for metric in metrics}
         return {
             "equal": str(budget.equal),
@@ -195,20 +199,20 @@ class StudyResults:
 def quality_table(results: StudyResults) -> str:
     """Return the comparison of policies: per place as in the paper's Replica table, per pair, and a summary."""
     blocks = results.notes
-    fitted = FITTED_METRICS if results.has_fitted else ()
-    at_region = REGION_FITTED_METRICS if results.has_fitted else ()
+    roi_fitted = (*ROI_FITTED_METRICS, *REGION_FITTED_METRICS) if results.has_fitted else ()
+    full_fitted = FULL_FITTED_METRICS if results.has_fitted else ()
     for budget in results.budgets:
         blocks += [
             f"## Equal {budget.equal} ({budget}), at most {budget.max_gaussians} Gaussians",
             "Inside the task's ground-truth mask (mean over a place's tasks):",
-            _by_place(results, (*ROI_METRICS, *fitted[:1], *at_region), budget),
+            _by_place(results, (*ROI_METRICS, *roi_fitted), budget),
             "Over the full image:",
-            _by_place(results, (*FULL_METRICS, *fitted[1:]), budget),
+            _by_place(results, (*FULL_METRICS, *full_fitted), budget),
             "Per pair, ROI PSNR in dB (mean ± standard deviation over the seeds):",
             _by_scene(results, RAW_PSNR, budget),
         ]
-        if fitted:
-            blocks += ["The same with fitted poses and exposures:", _by_scene(results, FITTED_METRICS, budget)]
+        if results.has_fitted:
+            blocks += ["The same with fitted poses and exposures:", _by_scene(results, FITTED_PSNR, budget)]
         blocks.append(_summary_text(results, budget))
     return "\n\n".join(blocks) + "\n"
 
@@ -227,8 +231,8 @@ def ablation_table(results: StudyResults) -> str:
 def _by_component(results: StudyResults, scenes: Sequence[str]) -> str:
     """Return the rows of the ablation: with the spread for a single scene, with fitted PSNR if all scenes have it."""
     columns = [("ROI PSNR", ROI_METRICS[0]), ("full PSNR", FULL_METRICS[0])]
-    if results.mean(scenes, results.variants[0], FITTED_METRICS[1], results.budgets[0]) is not None:
-        columns += zip(("ROI PSNR, views fitted", "full PSNR, views fitted"), FITTED_METRICS, strict=True)
+    if results.mean(scenes, results.variants[0], FITTED_PSNR[1], results.budgets[0]) is not None:
+        columns += zip(("ROI PSNR, views fitted", "full PSNR, views fitted"), FITTED_PSNR, strict=True)
     shown = [(metric, budget) for budget in results.budgets for _, metric in columns]
     rows = [["components", *(f"{title}, equal {budget.equal}" for budget in results.budgets for title, _ in columns)]]
     for variant in results.variants:
@@ -266,7 +270,7 @@ def _by_scene(results: StudyResults, roi_and_full: tuple[Metric, Metric], budget
 
 def _summary_text(results: StudyResults, budget: TrialBudget) -> str:
     lines = []
-    for (roi, full), suffix in ((RAW_PSNR, ""), (FITTED_METRICS, " with views fitted")):
+    for (roi, full), suffix in ((RAW_PSNR, ""), (FITTED_PSNR, " with views fitted")):
         roi_margins, full_margins = results.margins(roi, budget), results.margins(full, budget)
         if roi_margins:
             wins = f"{sum(margin > 0 for margin in roi_margins)} of {len(roi_margins)}"
@@ -274,9 +278,7 @@ def _summary_text(results: StudyResults, budget: TrialBudget) -> str:
                 f"`{results.variants[0]}` exceeds the best other policy in {wins}, by {fmean(roi_margins):+.2f} dB "
                 f"inside the mask on average and by {fmean(full_margins):+.2f} dB over the full image{suffix}."
             )
-    for variant in results.variants:
-        iterations, ms = results.cost(variant, budget)
-        lines.append(f"`{variant}`: {iterations:.1f} iterations and {ms:.0f} ms per frame.")
+    lines += [f"`{variant}`: {results.cost_text(variant, budget)}." for variant in results.variants]
     return "\n".join(lines)
 
 

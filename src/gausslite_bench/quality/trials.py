@@ -14,8 +14,10 @@ from typing import Any
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.evaluation.compare import MapScores, average, score_view
 from gausslite.evaluation.lpips import Lpips
 from gausslite.evaluation.pictures import to_uint8
@@ -146,16 +148,17 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TrialResult:
-    """Result of a trial. roi_share: region's share of the held-out views. ms_per_frame: perception and mapping.
+    """Result of a trial. roi_share: region's share of the held-out views. map_bytes: size of the whole map in messages.
 
-    fitted: scores after fitting each view's pose and exposure; region_fitted: fitted at the region alone, on the
-    views that show it. None if that was not requested, or if no view shows the region.
+    ms_per_frame: perception and mapping. fitted: scores after fitting each view's pose and exposure; region_fitted:
+    fitted at the region alone, on the views that show it. None if that was not requested, or if no view shows it.
     """
 
     scores: MapScores
     fitted: MapScores | None
     roi_share: float
     gaussians: int
+    map_bytes: int
     iterations_mean: float
     ms_per_frame: float
     region_fitted: MapScores | None = None
@@ -187,8 +190,15 @@ class TrialMap:
     """A trial's map at the end of its mission. ms_per_frame: perception and mapping."""
 
     gaussians: Gaussians
+    map_bytes: int
     iterations_mean: float
     ms_per_frame: float
+
+
+def message_bytes(gaussians: Gaussians, grid: VoxelGrid) -> int:
+    """Return the size of these Gaussians in an agent's messages."""
+    parts = split_batch(group_by_voxel(gaussians, grid))
+    return sum(len(encode_subset(RoiSubset("agent", "", 1, 1, part), grid)) for part in parts)
 
 
 def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> TrialMap:
@@ -207,8 +217,10 @@ def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> Tr
         on_frame(outcome.gaussians)
 
     MissionRunner(loop.process, record).run(scene.training).raise_if_stopped()
+    gaussians = loop.gaussians()
     return TrialMap(
-        gaussians=loop.gaussians(),
+        gaussians=gaussians,
+        map_bytes=message_bytes(gaussians, VoxelGrid()),
         iterations_mean=fmean(outcome.iterations for outcome in outcomes),
         ms_per_frame=1e3 * fmean(outcome.timing.seconds for outcome in outcomes),
     )
@@ -235,6 +247,7 @@ def evaluate_map(
         fitted=average(fitted) if fitted else None,
         roi_share=scene.roi_share,
         gaussians=len(trial_map.gaussians),
+        map_bytes=trial_map.map_bytes,
         iterations_mean=trial_map.iterations_mean,
         ms_per_frame=trial_map.ms_per_frame,
         region_fitted=average(region_fitted) if region_fitted else None,

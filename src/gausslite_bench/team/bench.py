@@ -27,7 +27,7 @@ from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.scenes import TeamPlan, TeamScene
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
-TRUSTED = ", frames trusted"
+ALONE, TRUSTED = " alone", ", frames trusted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +51,9 @@ class TeamTrial:
 
 @dataclass(frozen=True, slots=True)
 class TeamResult:
-    """Scores by strategy; share of all maps' Gaussians in the final sent regions, and totals sent with resends.
-    bytes_whole: size of all whole maps in messages.
+    """Scores by strategy and of each agent's own map; share of all maps' Gaussians in the final sent regions.
+
+    bytes_sent, gaussians_sent: totals sent with resends. bytes_whole: size of all whole maps in messages.
     alignment: the state of each agent's frame after the vote.
     """
 
@@ -92,7 +93,9 @@ def run_trial(trial: TeamTrial, scene: TeamScene, on_frame: Callable[[FrameOutco
         wrong = agent if i == 0 else replace(agent, frames=trial.frame_error.apply(agent.frames))
         maps.append(map_agent(wrong, replace(trial.settings, seed=trial.seed + i), trial.grid, on_frame))
     fused, engine = _fuse(trial, maps, align=True)
-    if not trial.frame_error.is_zero:
+    if trial.frame_error.is_zero:
+        fused |= {f"{agent_map.agent_id}{ALONE}": agent_map.gaussians for agent_map in maps}
+    else:
         trusted, _ = _fuse(trial, maps, align=False)
         fused |= {f"{name}{TRUSTED}": gaussians for name, gaussians in trusted.items() if name != CONCATENATION}
     rasterizer = choose_rasterizer(threads=trial.settings.threads)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion.keyframes import AgentKeyframe
 from gausslite.mapping.keyframe_selection import KeyframeSelection
 from gausslite.mapping.keyframes import Keyframe
@@ -22,6 +22,7 @@ from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
+from gausslite_bench.quality.trials import message_bytes
 from gausslite_bench.team.scenes import AgentScene
 
 _ROUND_FRAMES = 4
@@ -102,8 +103,6 @@ def map_agent(
     )
     gaussians_sent = sum(len(message.batch.gaussians) for message in sent.messages)
     gaussians = gaussian_mapper.shared_gaussians()
-    whole = split_batch(group_by_voxel(gaussians, grid), _SUBSET_BYTES)
-    bytes_whole = sum(len(encode_subset(RoiSubset(agent.agent_id, "", 1, 1, part), grid)) for part in whole)
     return AgentMap(
         agent_id=agent.agent_id,
         gaussians=gaussians,
@@ -111,7 +110,7 @@ def map_agent(
         messages=tuple(sent.messages),
         bytes_sent=sent.byte_count,
         gaussians_sent=gaussians_sent,
-        bytes_whole=bytes_whole,
+        bytes_whole=message_bytes(gaussians, grid),
     )
 
 
