@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.calibrate import StatedValues, calibrate
+from gausslite.calibration.calibrate import StatedValues, as_recorded_notes, calibrate
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
@@ -218,8 +218,9 @@ def map_sequence(
 
     The map has the same bits as that of `gausslite map` with the same options. regions: for instance
     `[source.regions()["mug"]]`. frames: "START:STOP:STEP" of the sequence's frame numbers. size: (width, height) in
-    pixels. Frames that cannot be read are skipped and named in the notes. Ctrl-C ends the call after the current frame
-    with KeyboardInterrupt. Raises DatasetError if no frame could be mapped, and the errors of `create_mapper`.
+    pixels. Frames that cannot be read are skipped. The notes name them, and what the sequence does not state. Ctrl-C
+    ends the call after the current frame with KeyboardInterrupt. Raises DatasetError if no frame could be mapped,
+    and the errors of `create_mapper`.
     """
     require_instance("source", source, Source, "a sequence, pass gausslite.open_sequence(...)")
     require_instance("frames", frames, str, 'text such as "0:100" or "0:100:2"')
@@ -234,7 +235,7 @@ def map_sequence(
     result.raise_if_stopped()
     if result.totals.frames == 0:
         raise corrupt.first_error or DatasetError(f"{source.name}: expected frames with depth, got none")
-    return MapResult(mapper.gaussians(), result.summary(), (*skipped, *mapper.notes))
+    return MapResult(mapper.gaussians(), result.summary(), (*as_recorded_notes(source), *skipped, *mapper.notes))
 
 
 def save_ply(path: str | Path, gaussians: Gaussians, *, world_frame: str = "") -> None:

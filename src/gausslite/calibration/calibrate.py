@@ -120,17 +120,19 @@ def calibrate(
     )
 
 
-def recording_notes(source: Source) -> tuple[str, ...]:
-    """Return what an operator has to know of a source that is mapped as it is, without estimates.
+def as_recorded_notes(source: Source) -> tuple[str, ...]:
+    """Return the notes of a source that is mapped as it is, and what is not estimated or corrected then."""
+    depth = (
+        "this layout does not state whether depth is registered to colour, and it is used as recorded; "
+        "`gausslite calibrate` estimates register-depth"
+    )
+    lens = f"the files state the lens {source.lens}, which is not corrected; gl.open_calibrated corrects it"
+    return (*source.notes, *(() if source.depth_registered else (depth,)), *(() if source.lens is None else (lens,)))
 
-    These are its notes, depth that may not belong to colour, and poses or depth that contradict the images.
-    """
-    notes = list(source.notes)
-    if not source.depth_registered:
-        notes.append(
-            "this layout does not state whether depth is registered to colour, and it is used as recorded; "
-            "`gausslite calibrate` estimates register-depth"
-        )
+
+def recording_notes(source: Source) -> tuple[str, ...]:
+    """Return the notes of `as_recorded_notes`, and how poses or depth contradict the images."""
+    notes = list(as_recorded_notes(source))
     if not (source.poses_exact or source.camera_ideal):
         with suppress(DatasetError, PoseError):  # a damaged pose is reported with its frame
             found = find_contradiction(source)

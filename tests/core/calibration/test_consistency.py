@@ -15,6 +15,7 @@ from gausslite.calibration.consistency import find_contradiction
 from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source, WrappedSource
+from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, transform_of
@@ -207,9 +208,16 @@ def test_poses_that_do_not_fit_in_places_are_noted(home: Source, change: Callabl
     assert "was tracking lost there?" in note
 
 
-def test_a_recording_used_as_it_is_has_notes_on_its_depth_and_poses(recording: Recording) -> None:
-    recording.depth_registered = False
+class Distorted(Recording):
+    """Depth that may not be registered, and a lens that is nearly a pinhole's."""
+
+    depth_registered, lens = False, Lens(LensModel.RADTAN, (1e-4, 0.0, 0.0, 0.0))
+
+
+def test_a_recording_used_as_it_is_has_notes_on_its_depth_lens_and_poses(home: Source) -> None:
+    recording = Distorted(home, list(range(14)))
     recording.poses = np.linalg.inv(recording.poses)
-    depth, poses = recording_notes(recording)
+    depth, lens, poses = recording_notes(recording)
     assert "does not state whether depth is registered" in depth
+    assert "the lens radtan:0.0001,0,0,0, which is not corrected" in lens
     assert "world-to-camera poses would agree" in poses
