@@ -112,11 +112,17 @@ def _indirect_light(
 def _cosine_directions(normals: Float64[ndarray, "n 3"], rng: np.random.Generator) -> Float32[ndarray, "r 3"]:
     """Return _SKY_RAYS unit directions per vertex, cosine-distributed about its normal."""
     points = rng.standard_normal((len(normals), _SKY_RAYS, 3))
-    points /= np.linalg.norm(points, axis=2, keepdims=True)
+    points /= _lengths(points)
     # points on a unit sphere tangent to the surface are cosine-distributed
     directions = (points + 1.001 * normals[:, None, :]).reshape(-1, 3)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions /= _lengths(directions)
     return directions.astype(np.float32)
+
+
+def _lengths(vectors: Float64[ndarray, "*n 3"]) -> Float64[ndarray, "*n 1"]:
+    """Return the lengths of many vectors, in half of the time of `np.linalg.norm`."""
+    x, y, z = (vectors[..., axis, None] for axis in range(3))
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def _lamp(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
@@ -64,7 +65,7 @@ class HomeScene:
         corners_m = merged.positions_m[merged.faces]
         uv = merged.uv[merged.faces] / repeats_m[:, None, None]
         texture = np.repeat([texture_ids[part.texture] for _, part in parts], counts)
-        albedo = np.array([material.rgb.mean(axis=(0, 1)) / 255.0 for material in textures.values()])
+        albedo = np.array([cv2.mean(material.rgb)[:3] for material in textures.values()]) / 255.0
         self._embree = new_caster(corners_m.astype(np.float32))
         light = vertex_light(merged, albedo[texture], self, plan.lighting, plan.seed)
         self.triangles = Triangles(
