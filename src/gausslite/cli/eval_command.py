@@ -133,6 +133,8 @@ def run(options: argparse.Namespace) -> int:
                 (corrected.before, f"given poses with {MAP_TO_ODOM} of the frame before"),
             ):
                 print(f"  {meaning}: {_as_line(average(scored), bool(regions))}")
+        if not regions:
+            print("  --roi, --objects or --set target-at=X,Y,Z,R also scores a region")
     return 0
 
 

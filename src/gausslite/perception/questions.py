@@ -46,7 +46,6 @@ def answer(
     notes = [f"the map has no {noun_of(name)!r}" for name in relations.unseen_anchors]
     if notes:
         return Answer((), tuple(notes))
-    excluded = {id(landmark) for name in graph.excluded for landmark in mapped.seen(name)}
     superlatives = {attribute.name: attribute.superlative for attribute in graph.attributes if attribute.superlative}
     notes += [
         f"the map does not store colours: {attribute.colour!r} is not evaluated"
@@ -55,7 +54,8 @@ def answer(
     ]
     chosen: list[Landmark] = []
     for target in graph.targets:
-        seen = [landmark for landmark in mapped.seen(target) if id(landmark) not in excluded]
+        left_out = _left_out(graph, target, mapped)
+        seen = [landmark for landmark in mapped.seen(target) if landmark.number not in left_out]
         camera_m = None if T_world_camera is None else T_world_camera[:3, 3]
         fitting = [landmark for landmark in seen if relations.satisfies(target, _observed(landmark, camera_m))]
         superlative = superlatives.get(target)
@@ -68,6 +68,14 @@ def answer(
         chosen += fitting
     numbers = sorted({landmark.number for landmark in chosen})
     return Answer(tuple(objects[number] for number in numbers), tuple(notes))
+
+
+def _left_out(graph: TaskGraph, target: str, mapped: _MappedObjects) -> set[int]:
+    """Return the numbers of excluded objects, and of the anchors: a chair is not what is near the chair."""
+    noun = noun_of(target)
+    anchors = [relation.anchor for relation in graph.relations if relation.target == target]
+    others = [anchor for anchor in anchors if noun_of(anchor) != noun]
+    return {landmark.number for name in (*graph.excluded, *others) for landmark in mapped.seen(name)}
 
 
 class _MappedObjects:
