@@ -110,6 +110,7 @@ class AgentMission:
         """
         self.can_find, self._source_notes = can_find, source_notes
         self._settings, self._worker, self._parser, self._resumed = settings, worker, parser, resumed
+        self._up_axis = settings.up_axis or (0.0, 0.0, 1.0)
         self._state_machine = MissionStateMachine()
         self._start_s = time.monotonic()
         self._corrupt = CorruptFrames(_log.warning)
@@ -193,7 +194,7 @@ class AgentMission:
 
         An error after the first mapped frame ends the mission early: the map so far is sent and written first.
         """
-        self._start_s = time.monotonic()
+        self._start_s, self._up_axis = time.monotonic(), stream.source.up_axis
         try:
             self.assign_task()
             failure = self._replay(stream)
@@ -341,6 +342,7 @@ class AgentMission:
         seconds = time.monotonic() - self._start_s
         report = {
             **mission_report(self._settings.agent_id, self._worker.status(), gaussians, counters, seconds),
+            "up": list(self._up_axis),
             "frames_corrupt": self._corrupt.count,
             "memory_mib": self._worker.run(lambda mapper: mapper.memory_mib()).result(),
             "stopped_by": ended_by,

@@ -11,7 +11,7 @@ from gausslite.codec.run_files import KeyframeView
 from gausslite.config.command_parser import bounded
 from gausslite.domain.errors import InvalidInputError
 from gausslite.evaluation.views import view_map
-from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map
+from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map, upright
 from gausslite.export.occupancy import OccupancySettings
 from gausslite.mission.results import as_text, prepare_folder, read_report, require_absent
 from gausslite.process import print_message, size_text
@@ -68,6 +68,7 @@ def run(options: argparse.Namespace) -> int:
         if not options.overwrite:
             require_absent(file)
     content = read_map(options.map, region, report, chosen.max_extent_m)
+    content = upright(content) if chosen.is_upright else content
     prepare_folder(out.absolute().parent)
     voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
     min_opacity = _MIN_OPACITY if options.min_opacity is None else options.min_opacity

@@ -139,6 +139,7 @@ class MapInputs:
         prior = self.mission.pose_prior
         return {
             "source": self.source.spec,
+            "up": list(self.stream.source.up_axis),
             "colour_camera": None if registration is None else str(registration),
             "camera_correction": None if correction is None else str(correction),
             "view_error": None if prior.is_exact else str(prior),

@@ -25,7 +25,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import merge_objects
-from gausslite.mission.results import TRAJECTORY, as_text, read_report
+from gausslite.mission.results import TRAJECTORY, as_text, read_report, stated_up
 from gausslite.wire.security import TlsFiles
 
 _NS_PER_S = 1e9
@@ -135,7 +135,7 @@ def _read_folder(folder: Path) -> _Place:
     poses = read_pose_rows(trajectory)[1] if trajectory.is_file() else np.zeros((0, 4, 4))
     return _Place(
         objects,
-        _up_axis(poses),
+        stated_up(report) or _up_axis(poses),
         read_ply(map_file) if map_file.is_file() else None,
         poses[-1] if len(poses) else None,
     )

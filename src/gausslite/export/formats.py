@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -16,7 +16,8 @@ from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
 from gausslite.codec.run_files import KeyframeView, read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
-from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.gaussians import Gaussians, move_gaussians
+from gausslite.domain.pose import transform_of
 from gausslite.export.free_space import free_voxels
 from gausslite.export.mesh import Render, write_mesh
 from gausslite.export.occupancy import (
@@ -30,6 +31,7 @@ from gausslite.export.occupancy import (
 )
 from gausslite.export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite.export.video import write_video
+from gausslite.mission.results import stated_up
 from gausslite.process import import_extra
 
 _PCD_ROW = np.dtype(
@@ -84,6 +86,7 @@ def write_las(path: Path, gaussians: Gaussians) -> None:
     write_atomic_with(path, write)
 
 
+_LEAST_TURN = 1e-6
 Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
 MAX_EXTENT_M = 1e5
 """Limit of the coordinates that the mapper's voxel grid of 0.1 m can hold; a file with larger ones is damaged."""
@@ -127,6 +130,7 @@ class Format:
     suffix: of the written file. companion: suffix of a second file with the same name. summary: one line of the help.
     region_only: if the user selects nothing, write only the
     Gaussians of the task's region. max_extent_m: the largest coordinate and standard deviation that the format holds.
+    is_upright: its z axis points up.
     """
 
     suffix: str
@@ -135,6 +139,7 @@ class Format:
     region_only: bool = False
     max_extent_m: float = MAX_EXTENT_M
     companion: str = ""
+    is_upright: bool = False
 
     def files(self, out: Path) -> tuple[Path, ...]:
         """Return the files that are written for this path. Raises InvalidInputError for the suffix of another format.
@@ -188,6 +193,31 @@ def read_map(
     )
 
 
+def upright(content: MapContent) -> MapContent:
+    """Return the map turned so that its z axis points up, with a note; the same map if it does, or states no direction.
+
+    Raises InvalidInputError.
+    """
+    up = np.array(stated_up(content.report) or (0.0, 0.0, 1.0))
+    axis = np.array((up[1], -up[0], 0.0))
+    length = float(np.linalg.norm(axis))
+    if length < _LEAST_TURN and up[2] > 0:
+        return content
+    angle_rad, axis = float(np.arctan2(length, up[2])), axis / length if length > 0 else np.array((1.0, 0.0, 0.0))
+    T = transform_of(np.concatenate([np.zeros(3), angle_rad * axis]))
+    about, shown = (",".join(f"{value + 0.0:.3g}" for value in np.round(vector, 3)) for vector in (axis, up))
+    note = (
+        f"up is {shown} in the map: it is turned by {np.degrees(angle_rad):.1f} deg about {about}, so that z points up"
+    )
+    return replace(
+        content,
+        gaussians=move_gaussians(content.gaussians, T),
+        chosen=move_gaussians(content.chosen, T),
+        views=[replace(view, T_world_camera=T @ view.T_world_camera) for view in content.views],
+        notes=(*content.notes, note),
+    )
+
+
 def _largest_extent_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
     """Return the largest absolute coordinate or standard deviation of each Gaussian."""
     largest: Float32[ndarray, " n"] = np.maximum(np.abs(gaussians.means_m), gaussians.scales_m).max(axis=1)
@@ -238,7 +268,9 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
             max_extent_m=MAX_SPZ_COORDINATE_M,
         ),
         "splat": Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen)),
-        "gltf": Format(".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen)),
+        "gltf": Format(
+            ".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen), is_upright=True
+        ),
         "pcd": Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen)),
         "las": Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen)),
         "octomap": Format(
@@ -252,6 +284,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
             "2D grid",
             lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy, _free(map_, settings)),
             companion=NAV2_IMAGE,
+            is_upright=True,
         ),
         "mesh": Format(".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True),
         "video": Format(".mp4", "fly-through along the keyframes", _video),

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,9 +25,9 @@ from gausslite.codec.run_files import KeyframeView, ViewImage, write_keyframe_vi
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.codec.state_file import write_atomic
 from gausslite.datasets.folder import format_pose_rows, read_pose_rows
-from gausslite.domain.errors import MapFileError, StorageError
+from gausslite.domain.errors import InvalidInputError, MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import CorrectionTrack, pose_at
+from gausslite.domain.pose import CorrectionTrack, UpAxis, pose_at, unit_up_axis
 from gausslite.evaluation.views import largest_roi_per_segment
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseHistory
@@ -194,6 +195,17 @@ def read_trajectory(folder: Path) -> Callable[[int], Float64[ndarray, "4 4"]]:
 def read_report(folder: Path) -> Mapping[str, object]:
     """Return the content of report.json; empty if there is none or it is not a JSON object."""
     return _read_json(folder / _REPORT)
+
+
+def stated_up(report: Mapping[str, object]) -> UpAxis | None:
+    """Return the upward direction in the map's frame; None if the report states none. Raises InvalidInputError."""
+    stated: Any = report.get("up")
+    if stated is None:
+        return None
+    numbers = [value for value in stated if isinstance(value, int | float)] if isinstance(stated, list) else []
+    if len(numbers) != 3:
+        raise InvalidInputError(f"{_REPORT}: up: expected three numbers, got {stated!r}")
+    return unit_up_axis((numbers[0], numbers[1], numbers[2]))
 
 
 def read_evaluation(folder: Path) -> Mapping[str, object]:

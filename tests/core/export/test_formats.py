@@ -16,8 +16,9 @@ import yaml
 from gausslite.codec.ply import SH_C0, read_ply, write_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.domain.errors import InvalidInputError, MapFileError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.export.formats import FORMATS, ExportSettings, read_map
+from gausslite.domain.gaussians import Gaussians, move_gaussians
+from gausslite.domain.pose import transform_of
+from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map, upright
 from gausslite.export.occupancy import OccupancySettings, occupied_voxels
 
 COUNT = 50
@@ -255,6 +256,18 @@ def test_nav2_grid_has_obstacles_floor_and_unknown_cells(tmp_path):
     assert cell(0.2, -0.2) == 0
     assert cell(0.8, -0.8) == 254  # the floor
     assert set(np.unique(image)) <= {0, 205, 254}
+
+
+@pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.0, 0.6, -0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
+def test_a_map_with_another_up_is_turned_until_z_points_up(up):
+    room = Gaussians.concatenate([plate(0.0, size_m=2.0), plate(0.7, size_m=0.5)])
+    T_map_upright = transform_of(np.array([0.0, 0.0, 0.0, -np.arctan2(up[1], up[2]), 0.0, 0.0]))
+    turned = move_gaussians(room, T_map_upright)
+    content = upright(MapContent(turned, turned, report={"up": list(up)}))
+    np.testing.assert_allclose(content.chosen.means_m, room.means_m, atol=1e-6)
+    assert len(content.notes) == (up != (0.0, 0.0, 1.0))
+    with pytest.raises(InvalidInputError, match="up: expected three numbers"):
+        upright(MapContent(turned, turned, report={"up": "north"}))
 
 
 def test_a_map_without_a_region_names_the_option(tmp_path):
