@@ -13,6 +13,10 @@ from pathlib import Path
 
 # lexicographer files of things that can be seen
 KINDS = {5: "animal", 6: "artifact", 8: "body", 13: "food", 17: "object", 18: "person", 20: "plant", 27: "substance"}
+# the file of the top nouns, of which these count
+TOP, TOP_WORDS = 3, ("animal", "person", "plant")
+# meanings that a task in a room seldom has: a plant is no factory
+RARE_KINDS, BUILDINGS = ("person", "body"), ("building", "building_complex")
 # all nouns of these kinds; of the others, those that occur in WordNet's tagged texts
 COMPLETE = (6, 13)
 MAX_WORDS = 3
@@ -21,8 +25,9 @@ MAX_WORDS = 3
 def main(folder: Path, licence: Path) -> None:
     """Print the licence as comments, then one line per synset: the lines of its hypernyms, and its words."""
     synsets = read_synsets(folder)
-    order = sense_order(folder, synsets)
-    kept = kept_words(folder, synsets)
+    frequency = word_frequency(folder)
+    order = sense_order(folder, synsets, frequency)
+    kept = kept_words(synsets, frequency)
     used: dict[str, None] = {}
     for offset in kept:
         visit(offset, synsets, used)
@@ -43,8 +48,8 @@ def main(folder: Path, licence: Path) -> None:
 
 
 def read_synsets(folder: Path) -> dict[str, tuple[int, list[str], list[str]]]:
-    """Return the kind, the words and the hypernyms of each synset that is no instance, such as a town."""
-    synsets = {}
+    """Return kind, words and hypernyms of each synset that is no instance, such as a town, the top ones last."""
+    synsets, top = {}, {}
     for line in (folder / "data.noun").read_text().splitlines():
         if line.startswith("  "):
             continue
@@ -52,28 +57,55 @@ def read_synsets(folder: Path) -> dict[str, tuple[int, list[str], list[str]]]:
         count = int(fields[3], 16)
         pointers = fields[5 + 2 * count :]
         hypernyms = [pointers[at + 1] for at in range(0, len(pointers), 4) if pointers[at] == "@"]
-        if "@i" not in pointers:
-            synsets[fields[0]] = int(fields[1]), fields[4 : 4 + 2 * count : 2], hypernyms
-    return synsets
+        kind, words = int(fields[1]), fields[4 : 4 + 2 * count : 2]
+        if kind == TOP and words[0] in TOP_WORDS:
+            kind = next(of for of, name in KINDS.items() if name == words[0])
+            top[fields[0]] = kind, words[:1], hypernyms
+        elif "@i" not in pointers:
+            synsets[fields[0]] = kind, words, hypernyms
+    return {**synsets, **top}
 
 
-def sense_order(folder: Path, synsets: dict[str, tuple[int, list[str], list[str]]]) -> dict[str, list[str]]:
-    """Return the synsets of each word: the more frequent first, and persons and parts of the body last."""
+def sense_order(
+    folder: Path, synsets: dict[str, tuple[int, list[str], list[str]]], frequency: Counter[str]
+) -> dict[str, list[str]]:
+    """Return the synsets of each word: persons, parts of the body and buildings last, before them the more frequent.
+
+    Of two that are as frequent, one that is no plant is first: a banana is a fruit, a bulb a lamp.
+    """
+
+    def is_building(offset: str) -> bool:
+        _, words, above = synsets[offset]
+        return words[0] in BUILDINGS or any(is_building(at) for at in above if at in synsets)
+
     order = {}
     for line in (folder / "index.noun").read_text().splitlines():
         if not line.startswith("  "):
-            fields = line.split()
-            senses = [at for at in fields[-int(fields[2]) :] if at in synsets and synsets[at][0] in KINDS]
-            order[fields[0]] = sorted(senses, key=lambda at: KINDS[synsets[at][0]] in ("person", "body"))
+            word, *fields = line.split()
+            keys = {}
+            for number, offset in enumerate(fields[-int(fields[1]) :], 1):
+                kind = KINDS.get(synsets[offset][0]) if offset in synsets else None
+                if kind is not None:
+                    is_rare = kind in RARE_KINDS or is_building(offset)
+                    keys[offset] = is_rare, -frequency[f"{word}%{number}"], kind == "plant"
+            order[word] = sorted(keys, key=keys.__getitem__)
     return order
 
 
-def kept_words(folder: Path, synsets: dict[str, tuple[int, list[str], list[str]]]) -> dict[str, list[str]]:
-    """Return the words of each synset that a task may name."""
+def word_frequency(folder: Path) -> Counter[str]:
+    """Return how often WordNet's texts have each word, and each noun with the number of its meaning: `bulb%2`."""
     frequency: Counter[str] = Counter()
     for line in (folder / "cntlist.rev").read_text().splitlines():
-        key, _, count = line.split()
-        frequency[key.partition("%")[0]] += int(count)
+        key, number, count = line.split()
+        word, _, rest = key.partition("%")
+        frequency[word] += int(count)
+        if rest.startswith("1:"):
+            frequency[f"{word}%{number}"] += int(count)
+    return frequency
+
+
+def kept_words(synsets: dict[str, tuple[int, list[str], list[str]]], frequency: Counter[str]) -> dict[str, list[str]]:
+    """Return the words of each synset that a task may name."""
     kept: dict[str, list[str]] = {}
     for offset, (kind, words, _) in synsets.items():
         if kind in KINDS:

@@ -103,16 +103,30 @@ def synonymous_classes(noun: str, class_names: Iterable[str]) -> tuple[str, ...]
     )
 
 
-def kinds_among(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
-    """Return the lower-case class names that are kinds of the noun, unless they are few of its many kinds."""
+def kinds_of(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
+    """Return the lower-case class names that are the noun or kinds of it."""
     known = vocabulary()
     ours = known.main(noun)
-    found = []
-    for name in class_names:
-        is_compound = name.endswith(f" {noun}") and not is_thing(name)
-        if is_compound or (ours is not None and known.steps(known.main(name), ours) is not None):
-            found.append(name)
-    return tuple(found) if ours is None or known.kinds[ours] <= _KINDS_PER_CLASS * len(found) else ()
+    return tuple(
+        name
+        for name in class_names
+        if name == noun or known.steps(known.main(name), ours) or _is_compound_of(name, noun)
+    )
+
+
+def kinds_among(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
+    """Return `kinds_of`, which stand for the noun, unless they are few of its many kinds."""
+    known, found = vocabulary(), kinds_of(noun, class_names)
+    ours = known.main(noun)
+    return found if ours is None or known.kinds[ours] <= _KINDS_PER_CLASS * len(found) else ()
+
+
+def _is_compound_of(name: str, noun: str) -> bool:
+    """Return True if a name ends with the noun, and WordNet has it as a kind of the noun, or does not have it."""
+    before = name.removesuffix(noun)
+    if before == name or is_thing(name):
+        return before != name and is_kind_of(name, noun)
+    return before.endswith(" ") or is_thing(before)
 
 
 def nearest_above(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:

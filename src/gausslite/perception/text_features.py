@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
@@ -13,7 +13,15 @@ from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import KernelError, ModelFileError
-from gausslite.domain.nouns import is_kind_of, is_thing, kinds_among, nearest_above, nearest_names, synonymous_classes
+from gausslite.domain.nouns import (
+    is_kind_of,
+    is_thing,
+    kinds_among,
+    kinds_of,
+    nearest_above,
+    nearest_names,
+    synonymous_classes,
+)
 from gausslite.domain.objects import MatchBasis, NounMatch, head_of, is_generic, is_structure, normalised_noun, synonyms
 from gausslite.perception.model_file import OpenModel, open_model, run_once
 from gausslite.perception.settings import require_plausible
@@ -99,9 +107,10 @@ def match_noun(
 ) -> NounMatch:
     """Return the detector's classes that a phrase means.
 
-    The first match counts: the phrase, its synonyms, its kinds or what it is a kind of, then the same of its head noun,
-    then the embeddings. A generic noun ("object", "obstacle") matches every class except building structure (walls,
-    floors, doors). A class that is only similar is not searched unless the settings accept it.
+    The first match counts: the phrase and its synonyms, with the classes that are their kinds, its kinds, what it is a
+    kind of, then the same of its head noun, then the embeddings. A generic noun ("object", "obstacle") matches every
+    class except building structure (walls, floors, doors). A class that is only similar is not searched unless the
+    settings accept it.
     """
     settings = settings or ClassMatchSettings()
     if is_generic(phrase):
@@ -113,14 +122,16 @@ def match_noun(
     nouns = dict.fromkeys((noun, head) if not is_thing(noun) or is_kind_of(noun, head) else (noun,))
     for name in nouns:
         is_whole = name == noun or not (is_thing(noun) or any(map(is_thing, noun.split()[:-1])))
+        own_names = (name, *(known for known in by_name if _joined(known) == _joined(name)))
+        other_names = synonymous_classes(name, by_name) if name == noun or not is_thing(noun) else ()
         for basis, classes in (
-            (MatchBasis.NAME, (name, *(known for known in by_name if _joined(known) == _joined(name)))),
+            (MatchBasis.NAME, _with_kinds(own_names, by_name) if is_whole else own_names),
             (MatchBasis.SYNONYM, (synonyms().get(name, ""),)),
-            (MatchBasis.SYNONYM, synonymous_classes(name, by_name) if name == noun or not is_thing(noun) else ()),
+            (MatchBasis.SYNONYM, _with_kinds(other_names, by_name) if is_whole else other_names),
             (MatchBasis.KIND, kinds_among(name, by_name) if is_whole else ()),
             (MatchBasis.KIND, nearest_above(name, by_name) if is_whole else ()),
         ):
-            if found := tuple(by_name[known] for known in dict.fromkeys(classes) if known in by_name):
+            if found := tuple(dict.fromkeys(by_name[known] for known in classes if known in by_name)):
                 return NounMatch(phrase, basis, found)
     row = {synonyms()[name] for name in nouns if name in synonyms()}
     if found := tuple(by_name[known] for known in by_name if synonyms().get(known) in row):
@@ -132,6 +143,12 @@ def match_noun(
     if similarity >= settings.min_similarity and margin >= settings.min_margin:
         return NounMatch(phrase, MatchBasis.TEXT_FEATURES, (class_names[index],), similarity)
     return NounMatch(phrase, MatchBasis.SIMILAR, (class_names[index],), similarity, settings.accept_similar)
+
+
+def _with_kinds(names: Iterable[str], class_names: Collection[str]) -> tuple[str, ...]:
+    """Return the names that are classes, and the classes that are their kinds: a detector takes no desk for a table."""
+    classes = [name for name in names if name in class_names]
+    return (*classes, *(kind for name in classes for kind in kinds_of(name, class_names)))
 
 
 def _joined(name: str) -> str:

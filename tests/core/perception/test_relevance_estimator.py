@@ -258,6 +258,22 @@ def test_the_vocabulary_finds_the_class_of_a_noun(noun, name):
     assert match_noun(noun, OPEN_IMAGES, None).classes == (name,)
 
 
+@pytest.mark.parametrize(
+    ("noun", "names"),
+    [
+        ("plant", ("Plant", "Houseplant")), ("big plant", ("Plant", "Houseplant")), ("table", ("Table", "Desk")),
+        ("sofa", ("Couch", "Sofa bed")), ("mouse", ("Mouse", "Computer mouse")), ("fruit", ("Fruit", "Banana")),
+        ("houseplant", ("Houseplant",)), ("ant", ("Ant",)), ("dog", ("Dog",)), ("banana", ("Banana",)),
+    ],
+)  # fmt: skip
+def test_a_noun_with_a_class_of_its_name_is_also_searched_as_its_kinds(noun, names):
+    classes = (
+        "Plant", "Houseplant", "Table", "Desk", "Couch", "Sofa bed", "Mouse", "Computer mouse", "Fruit", "Banana",
+        "Ant", "Dog", "Hot dog", "Chair",
+    )  # fmt: skip
+    assert match_noun(noun, classes, None).classes == names
+
+
 @pytest.mark.parametrize("noun", ["shoe", "laundry basket", "coffee machine", "mattress", "unicorn", "crate", "pan"])
 def test_a_noun_without_a_class_is_refused_with_the_nearest_names(noun):
     match = match_noun(noun, OPEN_IMAGES, None)
