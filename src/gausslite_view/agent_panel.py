@@ -47,11 +47,11 @@ class AgentPanel:
         self._end.on_click(lambda _: self._end_mission())
 
     def poll(self) -> None:
-        """Read the agent's status and draw what changed. Raises GaussLiteError."""
+        """Read the agent's status, and draw what changed unless a person points. Raises GaussLiteError."""
         status = self._client.status()
         self._show_status(status)
         followed = self._follower.newest()
-        if followed is None or followed.revision == self._shown_revision:
+        if followed is None or followed.revision == self._shown_revision or self._page.is_held:
             return
         objects = tuple(object_from_message(message) for message in status.objects)
         contents = replace(
@@ -59,8 +59,8 @@ class AgentPanel:
             targets=tuple(status.graph.targets),
             objects=objects,
         )
-        self._pointing.show_objects(objects)
         view = self._client.camera_view()
+        self._pointing.show(view, objects)
         if view is not None:
             self._camera.show(view, objects)
             rendered, _ = self._client.render(view.camera, view.T_world_camera)

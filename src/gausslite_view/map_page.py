@@ -50,6 +50,7 @@ class MapPage:
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
         self._lock = threading.RLock()
+        self._is_held = False
         self._contents: ViewContents | None = None
         self._drawn_past: PastMap | None = None
         self._viewed_count = 0
@@ -106,6 +107,16 @@ class MapPage:
         shown = text_html([f"Not up to date: {text}"]) if text else ""
         if self._problem.content != shown:
             self._problem.content = shown
+
+    @property
+    def is_held(self) -> bool:
+        """True while a person points: a slow browser gets nothing new to draw, so that it answers at once."""
+        return self._is_held
+
+    @is_held.setter
+    def is_held(self, is_held: bool) -> None:
+        self._is_held = is_held
+        self._layer.set_held(is_held)
 
     def close(self) -> None:
         """Stop serving."""

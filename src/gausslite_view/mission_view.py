@@ -17,7 +17,7 @@ from numpy import ndarray
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import UnavailableError
-from gausslite.domain.relevance import CameraView, PointedObject, PointM
+from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.schedule import ScheduledTaskMapper
@@ -48,10 +48,6 @@ class MissionRequests:
         self._waiting: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
         self._has_ended = False
 
-    def camera_view(self) -> CameraView | None:
-        """Return the newest keyframe; None before the first one. Raises UnavailableError at the end of the mission."""
-        return self._ask(self._mission.mapper.camera_view)
-
     def render(
         self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
     ) -> tuple[Float32[ndarray, "h w 3"], Float32[ndarray, "h w"]]:
@@ -60,7 +56,7 @@ class MissionRequests:
         return rendering.rgb, rendering.expected_depth_m()
 
     def assign_task(self, *, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()) -> TaskGraph:
-        """Change the task as `ScheduledTaskMapper.point_at`, with its errors and those of `camera_view`."""
+        """Change the task as `ScheduledTaskMapper.point_at`, with its errors and those of `render`."""
         return self._ask(lambda: self._mission.point_at(pointed, excluded_m))
 
     def assign(self, task: str) -> TaskGraph:
@@ -115,14 +111,14 @@ class MissionView:
             self._quality = QualityPlot(gui)
 
     def update(self, outcome: FrameOutcome) -> None:
-        """Answer the page after a frame; draw the map if the next drawing is due."""
+        """Answer the page after a frame; draw the map if the next drawing is due and nobody points."""
         self._requests.answer()
-        self._pointing.show_objects(self._mission.mapper.objects)
         now_s = time.monotonic()
-        if now_s < self._due_s or not outcome.gaussians:
+        if now_s < self._due_s or not outcome.gaussians or self._page.is_held:
             return
         mapper = self._mission.mapper
         contents, view, keyframes = self._contents(), mapper.camera_view(), mapper.keyframes()
+        self._pointing.show(view, mapper.objects)
         if view is not None:
             self._camera.show(view, mapper.objects)
             self._add_quality(now_s - self._started_s, keyframes[-1])

@@ -1,30 +1,32 @@
-"""What a person points at on a page: by a click in the map, by a click or a box on the camera's image."""
+"""What a person points at on a page: by a click or a box on the camera's image, or on an image of the map."""
 
 from __future__ import annotations
 
+import base64
+import html
+import json
+import math
 from collections.abc import Callable, Sequence
+from importlib.resources import files
 from typing import Any, Final, Protocol
 
 import numpy as np
 import viser
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 from viser.transforms import SO3
 
-from gausslite.domain.camera import Camera, project
+from gausslite.domain.camera import Camera
 from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
-from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import UNNAMED, CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph, noun_of
+from gausslite.wire.convert import KEYFRAME_JPEG_QUALITY, encode_colour
 from gausslite_view.map_page import MapPage, text_html
 
 _NO_OBJECT = "none yet"
-_RAY_CAMERA = Camera(1000.0, 1000.0, 8.5, 8.5, 17, 17)
-"""A view so narrow that its middle pixel shows what a click on the page hits."""
-_IMAGE_M: Final = 0.05
-"""Distance of the image from the page's camera: nearer than what the map shows."""
-_MARGIN = 1.05
+_MAP_WIDTH_PX: Final = 640
+"""Of the image of the map that a person clicks."""
 
 Prompt = tuple[tuple[float, float], ...]
 """A point (x, y) in pixels of an image, or two opposite corners of a box, the left top one first."""
@@ -36,11 +38,7 @@ class PointableMission(Protocol):
     All methods raise GaussLiteError.
     """
 
-    def camera_view(self) -> CameraView | None:
-        """Return the newest keyframe; None before the first one."""
-        ...
-
-    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> tuple[object, Float32[ndarray, "h w"]]:
+    def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> tuple[Any, Float32[ndarray, "h w"]]:
         """Return colour and depth in metres of the map."""
         ...
 
@@ -53,84 +51,87 @@ class PointingPanel:
     """Owns the controls with which a person points at objects, and leaves out objects."""
 
     def __init__(self, page: MapPage, mission: PointableMission) -> None:
-        self._scene, self._mission = page.server.scene, mission
+        self._page, self._mission = page, mission
+        self._view: CameraView | None = None
         self._objects: dict[str, ObjectLandmark] = {}
+        self._open: dict[int, Callable[[], None]] = {}
         gui = page.server.gui
         with gui.add_folder("Point", order=0):
-            self._noun: Any = gui.add_text("Noun", "", hint="what it is, for the team; may be empty")
-            in_map = gui.add_button("Point at an object", hint="then click the object in the map")
-            in_image = gui.add_button("Point in the image", hint="then click the object, or drag a box around it")
+            in_image = gui.add_button("Point in the image", hint="at the object, on the newest keyframe")
+            in_map = gui.add_button("Point in the map", hint="at the object, on an image of the map as it is shown")
             self._object: Any = gui.add_dropdown("Object", (_NO_OBJECT,))
             self._exclude = gui.add_button("Not this one")
             self._message = gui.add_html("")
-        self._end_wait: Callable[[], None] | None = None
-        in_map.on_click(lambda _: self._run(lambda: self._wait(self._await_click)))
-        in_image.on_click(lambda event: self._run(lambda: self._wait(lambda: self._await_prompt(event.client))))
+        in_image.on_click(lambda event: self._run(lambda: self._ask_in_image(event.client)))
+        in_map.on_click(lambda event: self._run(lambda: self._ask_in_map(event.client)))
         self._exclude.on_click(lambda _: self._run(self._exclude_object))
+        page.server.on_client_disconnect(lambda browser: self._close(browser.client_id))
 
-    def show_objects(self, objects: Sequence[ObjectLandmark]) -> None:
-        """Offer the task's targets, the best one first, to be left out."""
+    def show(self, view: CameraView | None, objects: Sequence[ObjectLandmark]) -> None:
+        """Offer the newest keyframe, and the task's targets, the best one first, to be left out."""
+        self._view = view
         targets = [found for found in objects if found.role is ObjectRole.TARGET]
         self._objects = {f"{found.object_id} ({found.confidence:.2f})": found for found in targets}
         options = tuple(self._objects) or (_NO_OBJECT,)
         if tuple(self._object.options) != options:
             self._object.options = options
 
-    def _wait(self, begin: Callable[[], str]) -> str:
-        """Begin to wait for a click; a button that is pressed while the page waits ends that wait."""
-        if self._end_wait is None:
-            return begin()
-        self._end_wait()
-        self._end_wait = None
-        return "no object was chosen"
-
-    def _answer(self, action: Callable[[], str]) -> None:
-        self._end_wait = None
-        self._run(action)
-
-    def _await_click(self) -> str:
-        """Take the next click in the scene as the object."""
-
-        @self._scene.on_click()
-        def clicked(event: Any) -> None:
-            self._scene.remove_click_callback(clicked)
-            self._answer(lambda: self._point_at(event.ray_origin, event.ray_direction))
-
-        self._end_wait = lambda: self._scene.remove_click_callback(clicked)
-        return "click the object in the map"
-
-    def _await_prompt(self, browser: viser.ClientHandle | None) -> str:
-        """Show the newest keyframe to this browser, and take the next click or box as the object."""
-        view = self._mission.camera_view()
-        if view is None or browser is None:
+    def _ask_in_image(self, browser: Any) -> str:
+        """Take a click or a box on the newest keyframe as the object. Raises InvalidInputError before the first one."""
+        view = self._view
+        if view is None:
             raise InvalidInputError("point: expected a mapped frame first, there is no image yet")
-        self._end_wait = ask_on_image(browser, view, lambda prompt: self._answer(lambda: self._point_in(view, prompt)))
-        return f"frame {view.frame_index}: click the object, or drag a box around it"
+        caption = f"Frame {view.frame_index}"
+        return self._ask(browser, view.rgb, caption, lambda prompt, noun: self._point_in(view, prompt, noun))
 
-    def _point_at(self, origin_m: PointM, direction: PointM) -> str:
-        """Point at the map's surface along a ray. Raises GaussLiteError."""
-        T_world_camera = _looking_along(np.array(origin_m), np.array(direction))
-        _, depth_m = self._mission.render(_RAY_CAMERA, T_world_camera)
-        middle_m = float(depth_m[depth_m.shape[0] // 2, depth_m.shape[1] // 2])
-        if not middle_m > 0:
-            raise InvalidInputError("point: expected a click on the map, there is nothing")
-        x, y, z = (T_world_camera[:3, 3] + middle_m * T_world_camera[:3, 2]).tolist()
-        noun = self._chosen_noun
+    def _ask_in_map(self, browser: Any) -> str:
+        """Take a click on the map, rendered as the browser shows it, as the object. Raises GaussLiteError."""
+        camera, T_world_camera = _shown_view(browser.camera)
+        rgb, depth_m = self._mission.render(camera, T_world_camera)
+        image = (255 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
+
+        def answered(prompt: Prompt, noun: str) -> str:
+            x, y = np.mean(prompt, axis=0)
+            z_m = float(depth_m[int(y), int(x)])
+            if not z_m > 0:
+                raise InvalidInputError("point: expected a click on the map, there is nothing")
+            slope_x, slope_y = camera.slopes(float(x), float(y))
+            return self._point_at(T_world_camera @ np.array([z_m * slope_x, z_m * slope_y, z_m, 1.0]), noun)
+
+        return self._ask(browser, image, "The map", answered)
+
+    def _ask(
+        self, browser: Any, rgb: UInt8[ndarray, "h w 3"], caption: str, answered: Callable[[Prompt, str], str]
+    ) -> str:
+        """Show an image to a browser and run `answered` with what the person chose; until then the page is held."""
+        self._close(browser.client_id)
+
+        def chosen(prompt: Prompt, noun: str) -> None:
+            self._open.pop(browser.client_id, lambda: None)()
+            self._run(lambda: answered(prompt, noun_of(noun.strip()) or UNNAMED) if prompt else "no object was chosen")
+            self._page.is_held = bool(self._open)
+
+        self._page.is_held = True
+        self._open[browser.client_id] = ask_on_image(browser, rgb, caption, chosen)
+        return "click the object, or drag a box around it"
+
+    def _close(self, browser_id: int) -> None:
+        """Remove the image that a browser shows, if it shows one."""
+        if (end := self._open.pop(browser_id, None)) is not None:
+            end()
+            self._page.is_held = bool(self._open)
+
+    def _point_at(self, p_world: Float64[ndarray, "4"], noun: str) -> str:
+        x, y, z = p_world[:3].tolist()
         self._mission.assign_task(pointed=[PointedObject(point_m=(x, y, z), noun=noun)])
         return f"{noun} at ({x:.2f}, {y:.2f}, {z:.2f}) m is a target"
 
-    def _point_in(self, view: CameraView, prompt: Prompt) -> str:
-        """Point at what a click or a box on a keyframe shows. Raises GaussLiteError."""
-        index, noun = view.frame_index, self._chosen_noun
+    def _point_in(self, view: CameraView, prompt: Prompt, noun: str) -> str:
+        index = view.frame_index
         points_px, boxes_px = (prompt[:1], ()) if len(prompt) == 1 else ((), (prompt[0] + prompt[1],))
-        pointed = PointedObject(points_px, boxes_px, frame_index=index, noun=noun)
-        self._mission.assign_task(pointed=[pointed])
+        self._mission.assign_task(pointed=[PointedObject(points_px, boxes_px, frame_index=index, noun=noun)])
         place = " to ".join(f"{x:.0f},{y:.0f}" for x, y in prompt)
         return f"{noun} at {place} of frame {index} is a target"
-
-    @property
-    def _chosen_noun(self) -> str:
-        return noun_of(str(self._noun.value).strip()) or UNNAMED
 
     def _exclude_object(self) -> str:
         chosen = self._objects.get(str(self._object.value))
@@ -141,77 +142,66 @@ class PointingPanel:
 
     def _run(self, action: Callable[[], str]) -> None:
         """Run an action on a thread of the page's server, and show its result or error."""
+        self._message.content = text_html(["the mission answers after its current frame"])
         try:
             self._message.content = text_html([action()])
         except GaussLiteError as error:
             self._message.content = text_html([str(error)])
 
 
-def ask_on_image(
-    browser: viser.ClientHandle, view: CameraView, prompted: Callable[[Prompt], None]
-) -> Callable[[], None]:
-    """Show a keyframe's image in front of one browser's camera until a person clicks it or drags a box on it.
+_DIALOG = """<dialog id="{uuid}" style="border:0;padding:0.7em;border-radius:0.4em">
+<p style="margin:0 0 0.6em;display:flex;gap:0.8em;align-items:center">{caption}: click the object, or drag a box around
+it <input placeholder="noun, may be empty" value="" style="flex:1"><button>Close</button></p>
+<div style="position:relative;line-height:0"><img src="data:image/jpeg;base64,{jpeg}" onload="({script})(this)" alt=""
+style="width:min(92vw,{aspect:.4f}*84vh);cursor:crosshair;touch-action:none">
+<div style="display:none;position:absolute;border:2px solid #3ce65a;pointer-events:none"></div></div></dialog>"""
 
-    Then the browser shows the map as before, and `prompted` gets the point or the box, clipped to the image. Return a
-    function that ends this without an answer.
+
+def ask_on_image(
+    browser: viser.ClientHandle,
+    rgb: UInt8[ndarray, "h w 3"],
+    caption: str,
+    chosen: Callable[[Prompt, str], None],
+) -> Callable[[], None]:
+    """Show an image over one browser's page until a person clicks it, drags a box on it or closes it.
+
+    It is HTML, which a browser without a GPU shows between two images of the map. `chosen` gets the point or the box,
+    empty if the image was closed, and the noun typed beside it. Return a function that removes the image.
     """
-    camera, T_world_camera, scene = view.camera, view.T_world_camera, browser.scene
-    left_top_m = np.array(camera.slopes(0.0, 0.0)) * _IMAGE_M
-    size_m = np.array(camera.slopes(float(camera.width_px), float(camera.height_px))) * _IMAGE_M - left_top_m
-    middle_m = T_world_camera @ np.array([*(left_top_m + size_m / 2), _IMAGE_M, 1.0])
-    image = scene.add_image(
-        "/camera_image",
-        view.rgb,
-        *size_m.tolist(),
-        format="jpeg",
-        wxyz=SO3.from_matrix(T_world_camera[:3, :3]).wxyz,
-        position=middle_m[:3],
+    height_px, width_px = rgb.shape[:2]
+    answer: Any = browser.gui.add_text("", "", visible=False)
+    jpeg = encode_colour(rgb, quality=KEYFRAME_JPEG_QUALITY)
+    dialog = browser.gui.add_html(
+        _DIALOG.format(
+            uuid=answer._impl.uuid,
+            caption=html.escape(caption),
+            jpeg=base64.b64encode(jpeg).decode(),
+            script=html.escape((files("gausslite_view") / "pointing.js").read_text()),
+            aspect=width_px / height_px,
+        )
     )
-    shown = browser.camera
-    before = shown.position, shown.look_at, shown.up_direction, shown.fov
-    shown.position, shown.look_at, shown.up_direction = T_world_camera[:3, 3], middle_m[:3], -T_world_camera[:3, 1]
-    shown.fov = 2 * float(np.arctan(_MARGIN * max(size_m[1], size_m[0] / shown.aspect) / 2 / _IMAGE_M))
+
+    answer.on_update(lambda _: chosen(*_chosen(str(answer.value), width_px, height_px)))
 
     def end() -> None:
-        scene.remove_click_callback(clicked)
-        scene.remove_rect_select_callback(drawn)
-        image.remove()
-        shown.position, shown.look_at, shown.up_direction, shown.fov = before
-
-    def answer(*screen: tuple[float, float]) -> None:
-        corners = tuple(_pixel(shown, position, view) for position in screen)
-        end()
-        prompted(corners)
-
-    @scene.on_click()
-    def clicked(event: viser.SceneClickEvent) -> None:
-        answer(event.screen_pos)
-
-    @scene.on_rect_select()
-    def drawn(event: viser.SceneRectSelectEvent) -> None:
-        answer(event.screen_min, event.screen_max)
+        dialog.remove()
+        answer.remove()
 
     return end
 
 
-def _pixel(shown: viser.CameraHandle, screen: tuple[float, float], view: CameraView) -> tuple[float, float]:
-    """Return the image's pixel at a place (0 to 1) on the browser's canvas, the nearest one for a place beside it."""
-    half = np.tan(shown.fov / 2)
-    direction = np.array([(2 * screen[0] - 1) * half * shown.aspect, (2 * screen[1] - 1) * half, 1.0])
-    T_camera_world = inverse(view.T_world_camera)
-    origin_m = T_camera_world[:3] @ np.append(shown.position, 1.0)
-    ray = T_camera_world[:3, :3] @ SO3(shown.wxyz).as_matrix() @ direction
-    on_image_m = origin_m + (_IMAGE_M - origin_m[2]) / ray[2] * ray
-    x, y = project(on_image_m[None].astype(np.float32), view.camera)[0].tolist()
-    last_px = np.nextafter((view.camera.width_px, view.camera.height_px), 0)
-    return float(np.clip(x, 0, last_px[0])), float(np.clip(y, 0, last_px[1]))
+def _chosen(message: str, width_px: int, height_px: int) -> tuple[Prompt, str]:
+    """Return the prompt, from shares to pixels of the image, and the noun of a browser's message."""
+    answer = json.loads(message)
+    last_px = np.nextafter((width_px, height_px), 0)
+    prompt = np.clip(np.array(answer["prompt"]).reshape(-1, 2) * (width_px, height_px), 0, last_px)
+    return tuple((x, y) for x, y in prompt.tolist()), str(answer["noun"])
 
 
-def _looking_along(origin_m: Float64[ndarray, "3"], direction: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
-    """Return the pose of a camera at the origin that looks along the direction."""
-    forward = direction / np.linalg.norm(direction)
-    right = np.cross(np.eye(3)[np.argmin(np.abs(forward))], forward)
-    right /= np.linalg.norm(right)
+def _shown_view(shown: viser.CameraHandle) -> tuple[Camera, Float64[ndarray, "4 4"]]:
+    """Return the camera with which a browser shows the map."""
+    width_px, height_px = _MAP_WIDTH_PX, max(1, round(_MAP_WIDTH_PX / shown.aspect))
+    focal_px = height_px / 2 / math.tan(shown.fov / 2)
     T_world_camera = np.eye(4)
-    T_world_camera[:3] = np.column_stack([right, np.cross(forward, right), forward, origin_m])
-    return T_world_camera
+    T_world_camera[:3] = np.column_stack([SO3(shown.wxyz).as_matrix(), shown.position])
+    return Camera(focal_px, focal_px, width_px / 2, height_px / 2, width_px, height_px), T_world_camera

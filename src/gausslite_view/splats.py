@@ -54,7 +54,7 @@ class BrowserDetail:
         with folder:
             self._note = client.gui.add_html("")
         self._changed = threading.Condition()
-        self._is_adaptive, self._is_restarted, self._is_closed = is_adaptive, False, False
+        self._is_adaptive, self._is_restarted, self._is_held, self._is_closed = is_adaptive, False, False, False
         self._splats: SplatLevels | None = None
         self._moved_s = time.monotonic()
         # only the thread uses what follows
@@ -74,6 +74,12 @@ class BrowserDetail:
         """Find the number of splats again, or draw all of them."""
         with self._changed:
             self._is_adaptive, self._is_restarted = is_adaptive, True
+            self._changed.notify_all()
+
+    def hold(self, is_held: bool) -> None:
+        """Draw nothing until this is called with False."""
+        with self._changed:
+            self._is_held = is_held
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -104,6 +110,9 @@ class BrowserDetail:
         """Return splats to draw, or those that are drawn if more of them can be tried; None at the end."""
         with self._changed:
             while not self._is_closed:
+                if self._is_held:
+                    self._changed.wait()
+                    continue
                 if self._is_restarted:
                     self._is_restarted, self._drawn = False, None
                     self._start_again()
@@ -218,6 +227,12 @@ class SplatLayer:
             self._is_adaptive = is_adaptive
             for browser in self._browsers.values():
                 browser.restart(is_adaptive)
+
+    def set_held(self, is_held: bool) -> None:
+        """Draw nothing in any browser until this is called with False."""
+        with self._lock:
+            for browser in self._browsers.values():
+                browser.hold(is_held)
 
     def close(self) -> None:
         """End the threads of all browsers."""

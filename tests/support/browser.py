@@ -21,3 +21,16 @@ def open_browser(size: tuple[int, int] = (720, 420)) -> Iterator[Any]:
         except InvalidInputError as error:
             pytest.skip(str(error))
         yield context
+
+
+def point(tab: Any, button: str, noun: str, *places: tuple[float, float]) -> None:
+    """Press a button of a page and click its image, or drag a box on it; places: in shares of the image."""
+    tab.get_by_role("button", name=button).click()
+    dialog = tab.locator("dialog[open]")
+    dialog.get_by_placeholder("noun").fill(noun)
+    shown = dialog.locator("img").bounding_box()
+    pixels = [(shown["x"] + x * shown["width"], shown["y"] + y * shown["height"]) for x, y in places]
+    tab.mouse.move(*pixels[0])
+    tab.mouse.down()
+    tab.mouse.move(*pixels[-1], steps=4)
+    tab.mouse.up()

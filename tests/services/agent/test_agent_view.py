@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from agent_running import TASK, agent
-from browser import open_browser
+from browser import open_browser, point
 from fusion_running import frame
 
 from gausslite.domain.errors import InvalidInputError
@@ -110,7 +110,7 @@ def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe():
             page.close()
 
 
-def test_a_click_in_the_scene_is_a_target_until_it_is_left_out():
+def test_a_click_on_the_map_is_a_target_until_it_is_left_out():
     with (
         agent(lambda graph: TaskRelevanceEstimator(graph, RegionDetector({}))) as running,
         open_browser((1200, 900)) as browser,
@@ -122,10 +122,7 @@ def test_a_click_in_the_scene_is_a_target_until_it_is_left_out():
         tab = browser.new_page()
         tab.goto(url)
         tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
-        write(tab, 1, "wall")
-        tab.get_by_role("button", name="Point at an object").click()
-        tab.get_by_text("click the object in the map").wait_for()
-        tab.mouse.click(450, 450)
+        point(tab, "Point in the map", "wall", (0.5, 0.5))
         tab.get_by_text("is a target").wait_for()
         assert next(running.client.ingest([frame(4)])).roi_share > 0
         (wall,) = running.worker.status().objects
@@ -136,8 +133,8 @@ def test_a_click_in_the_scene_is_a_target_until_it_is_left_out():
         assert next(running.client.ingest([frame(5)])).roi_share == 0
 
 
-@pytest.mark.parametrize("is_box", [False, True])
-def test_a_click_or_a_box_on_the_camera_image_is_a_target(is_box):
+@pytest.mark.parametrize("places", [[(0.5, 0.5)], [(0.3, 0.3), (0.7, 0.7)]])
+def test_a_click_or_a_box_on_the_camera_image_is_a_target(places):
     with (
         agent(lambda graph: TaskRelevanceEstimator(graph, RegionDetector({}))) as running,
         open_browser((1200, 900)) as browser,
@@ -148,20 +145,11 @@ def test_a_click_or_a_box_on_the_camera_image_is_a_target(is_box):
         tab = browser.new_page()
         tab.goto(url)
         tab.get_by_text(f"{report.gaussians:,} Gaussians", exact=True).wait_for()
-        write(tab, 1, "wall")
-        in_image = tab.get_by_role("button", name="Point in the image")
-        in_image.click()
-        tab.get_by_text("frame 0: click the object, or drag a box around it").wait_for()
-        in_image.click()
+        tab.get_by_role("button", name="Point in the image").click()
+        tab.get_by_text("Frame 0: click the object, or drag a box around it").wait_for()
+        tab.keyboard.press("Escape")
         tab.get_by_text("no object was chosen").wait_for()
-        in_image.click()
-        tab.get_by_text("frame 0: click the object, or drag a box around it").wait_for()
-        tab.wait_for_timeout(1000)
-        tab.mouse.move(430, 430)
-        tab.mouse.down()
-        if is_box:
-            tab.mouse.move(700, 620, steps=4)
-        tab.mouse.up()
+        point(tab, "Point in the image", "wall", *places)
         tab.get_by_text("of frame 0 is a target").wait_for()
         assert next(running.client.ingest([frame(1)])).roi_share > 0
         (wall,) = running.worker.status().objects
