@@ -6,6 +6,7 @@ use the code.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import grpc
@@ -58,8 +59,17 @@ _BY_CODE: dict[grpc.StatusCode, type[GaussLiteError]] = {
 }
 
 
-# what the transport reports for a port or a socket file without a server
-_NOT_LISTENING = ("Connection refused", "No such file or directory")
+# what the transport reports while it connects, and what that means
+_NOT_CONNECTED = (
+    ("Connection refused|No such file or directory", "connection refused"),
+    ("CERTIFICATE_VERIFY_FAILED", "its certificate is not from an authority in tls-ca, or not for this name"),
+    ("WRONG_VERSION_NUMBER", "no TLS there; expected a server with certificates, or this program without them"),
+    ("Tls handshake failed", "no encrypted connection; are the certificates of both sides from one authority?"),
+    (
+        "failed to connect.*Socket closed",
+        "it closes the connection; a server with certificates expects tls-cert, tls-key and tls-ca",
+    ),
+)
 
 
 def code_and_reason(error: GaussLiteError) -> tuple[grpc.StatusCode, str]:
@@ -98,8 +108,10 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> GaussLiteError:
         return error_from_reason(reason, text, retry_after_s)
     if code is grpc.StatusCode.DEADLINE_EXCEEDED:
         return errors.UnavailableError(f"{address}: no answer in time")
-    if code is grpc.StatusCode.UNAVAILABLE and any(cause in text for cause in _NOT_LISTENING):
-        return errors.UnavailableError(f"{address}: connection refused")
+    if code is grpc.StatusCode.UNAVAILABLE:
+        meaning = next((meaning for cause, meaning in _NOT_CONNECTED if re.search(cause, text)), None)
+        if meaning is not None:
+            return errors.UnavailableError(f"{address}: {meaning}")
     if code is grpc.StatusCode.UNIMPLEMENTED:
         return errors.InvalidInputError(f"{address}: another service listens there, or one of another version")
     first_line = text.splitlines()[0]

@@ -44,6 +44,8 @@ class FailingParser(parser_service_pb2_grpc.ParserServiceServicer):
         self.calls += 1
         if request.text == "UNAUTHENTICATED":
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, "no certificate")
+        if request.text.startswith("failed"):
+            await context.abort(grpc.StatusCode.UNAVAILABLE, request.text)
         raise getattr(errors, request.text)("one line: expected a, got b")
 
 
@@ -81,6 +83,23 @@ def test_a_status_without_our_details_gets_the_class_of_its_code() -> None:
             client.parse("UNAUTHENTICATED")
         with pytest.raises(QuotaError):
             client.parse("x" * (MAX_MESSAGE_BYTES + 1))
+
+
+@pytest.mark.parametrize(
+    ("cause", "meaning"),
+    [
+        ("Failed to connect to remote host: Connection refused", "connection refused"),
+        ("Socket closed", "a server with certificates expects tls-cert, tls-key and tls-ca"),
+        ("Tls handshake failed: OPENSSL_internal:CERTIFICATE_VERIFY_FAILED", "not from an authority in tls-ca"),
+        ("Tls handshake failed: OPENSSL_internal:WRONG_VERSION_NUMBER", "no TLS there"),
+    ],
+)
+def test_a_failed_connection_says_what_to_change(cause: str, meaning: str) -> None:
+    text = f"failed to connect to all addresses; last error: UNKNOWN: ipv4:127.0.0.1:50051: {cause}"
+    with serving([service(FailingParser())]) as server, ParserClient(server.address) as client:
+        with pytest.raises(UnavailableError, match=f"^[^ ]+ [^ ]+: .*{meaning}") as raised:
+            client.parse(text)
+        assert "last error" not in str(raised.value)
 
 
 def test_a_missed_deadline_is_unavailable() -> None:
