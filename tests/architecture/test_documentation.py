@@ -112,7 +112,7 @@ def test_flags_named_in_pages_exist(help_texts: str) -> None:
     known_flags = set(re.findall(r"--[a-z][\w-]*", help_texts))
     # of pip, docker and our own scripts
     others = {"--check", "--editable", "--no-index", "--build", "--python"}
-    others |= {"--masks", "--homes", "--gains", "--pose-noise"}
+    others |= {"--homes", "--gains", "--pose-noise"}
     # of venv and rosbag
     others |= {"--system-site-packages", "--clock"}
     # of cibuildwheel, mkdocs, pytest-xdist and cmake
