@@ -211,7 +211,9 @@ def test_a_task_independent_map_is_built_once_for_all_tasks(tmp_path: Path) -> N
     together = Study(plans, [TASK, UNIFORM], [TrialBudget(max_gaussians=1500, iterations=1)], [0], conditions)
     seen = Frames()
     results = run_study(together, TrialCache(tmp_path / "together"), None, seen)
-    assert seen.count == (3 + 1) * len(plans[0].load((96, 72)).training)
+    training = plans[0].load((96, 72)).training
+    assert [frame.index for frame in training] == [0, 1, 2, 3]
+    assert seen.count == (3 + 1) * len(training)
     alone = replace(together, plans=plans[2:], variants=[UNIFORM])
     [last] = run_study(alone, TrialCache(tmp_path / "alone"), None, seen)
     assert results[-1].trial.key == last.trial.key

@@ -32,6 +32,8 @@ def test_recorded_relevance_matches_frames_by_identity() -> None:
     estimator = RecordedRelevanceEstimator(Scene("Find it", frames, masks, [], SceneInfo()))
     assert [estimator.estimate(frame).relevance for frame in frames] == masks
     assert estimator.evaluate_past(frames[0]) is masks[0]
+    with pytest.raises(InvalidInputError, match="different indices"):
+        RecordedRelevanceEstimator(Scene("Find it", [frames[0], frames[0]], masks, [], SceneInfo()))
 
 
 def test_changed_regions_change_the_settings_of_a_scene(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 from gausslite.datasets.open import open_source
@@ -73,7 +73,8 @@ class HomeScenePlan:
         source = walks[0][0]
         regions = choose_regions(source.regions(), self.pair.objects)
         views = [HeldOutView.of(frame, regions) for frame in held_out]
-        frames = [frame for walk in training for frame in walk]
+        # one mission: each walk counts its own frames from 0
+        frames = [replace(frame, index=i) for i, frame in enumerate(frame for walk in training for frame in walk)]
         return make_scene(self.task, frames, views, regions, SceneInfo.of(source))
 
     def _training_specs(self) -> list[str]:

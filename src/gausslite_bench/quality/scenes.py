@@ -91,6 +91,8 @@ class RecordedRelevanceEstimator(RelevanceEstimator):
     def __init__(self, scene: Scene) -> None:
         # not by pose: frames of equal pose differ in holes and moving objects. Not by frame: a loop moves later frames
         self._masks = {frame.index: mask for frame, mask in zip(scene.training, scene.masks, strict=True)}
+        if len(self._masks) < len(scene.training):
+            raise InvalidInputError(f"{scene.task!r}: expected frames with different indices, got some twice")
 
     def estimate(self, frame: Frame, rendered_depth_m: Float32[ndarray, "h w"] | None = None) -> RelevanceEstimate:
         """Return the ground-truth mask."""
