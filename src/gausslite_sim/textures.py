@@ -50,9 +50,10 @@ def grain(rng: np.random.Generator) -> Shade:
 
 def tint(shade: Shade, colour: Colour) -> UInt8[ndarray, "s s 3"]:
     """Return a colour (components 0 to 1) multiplied by the shade."""
-    bright = np.multiply.outer(shade * 255.0, np.asarray(colour))
+    bright: Float64[ndarray, "s s 3"] = np.multiply.outer(shade * 255.0, np.asarray(colour))
     bright += 0.5
-    return np.minimum(bright, 255.0, out=bright).astype(np.uint8)
+    np.minimum(bright, 255.0, out=bright)
+    return bright.astype(np.uint8)
 
 
 def wood(rng: np.random.Generator, colour: Colour, repeat_m: float = 0.9) -> Texture:

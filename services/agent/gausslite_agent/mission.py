@@ -7,6 +7,7 @@ import threading
 import time
 from concurrent.futures import Future
 from pathlib import Path
+from typing import Any
 
 from gausslite.codec.json import graph_as_json, noun_as_json, object_as_json
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, StorageError
@@ -340,7 +341,7 @@ class AgentMission:
         self, folder: Path, gaussians: Gaussians, counters: UplinkCounters, ended_by: str | None
     ) -> None:
         seconds = time.monotonic() - self._start_s
-        report = {
+        report: dict[str, Any] = {
             **mission_report(self._settings.agent_id, self._worker.status(), gaussians, counters, seconds),
             "up": list(self._up_axis),
             "frames_corrupt": self._corrupt.count,
