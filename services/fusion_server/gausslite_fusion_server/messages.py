@@ -36,11 +36,6 @@ from gausslite.wire.views import region_from_png
 _MAX_SELECTED_KEYFRAMES = 10_000
 
 
-def agent_of_session(engine: FusionEngine, session_id: str, caller: Caller) -> str:
-    """Return the agent of a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
-    return session_of(engine, session_id, caller).agent_id
-
-
 def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> SessionRecord:
     """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
     session = engine.session(session_id)
@@ -48,9 +43,19 @@ def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> Session
     return session
 
 
+def kept_session(engine: FusionEngine, session_id: str, caller: Caller) -> pb.KeepSessionResponse:
+    """Renew the lease of a session; return what identifies the stored updates. Raises as `session_of`."""
+    agent_id = session_of(engine, session_id, caller).agent_id
+    return pb.KeepSessionResponse(
+        highest_update_seq=engine.highest_update_seq(agent_id),
+        incarnation_id=engine.incarnation_id,
+        alignment=alignment_to_message(engine.alignment(agent_id)),
+    )
+
+
 def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest, caller: Caller) -> None:
     """Store a keyframe as it was received. Raises InvalidInputError, QuotaError, SessionUnknownError."""
-    agent_id = agent_of_session(engine, request.session_id, caller)
+    agent_id = session_of(engine, request.session_id, caller).agent_id
     message = request.keyframe
     # before any image is decoded: its header must then state the camera's size
     pixels = message.camera.width_px * message.camera.height_px

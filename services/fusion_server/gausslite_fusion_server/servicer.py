@@ -40,11 +40,10 @@ from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server.contributions import Contributions, PacedLock, StoredCount
 from gausslite_fusion_server.messages import (
     ExportedFile,
-    agent_of_session,
-    alignment_to_message,
     contribution_to_message,
     declare_frame,
     declared_frame_from_message,
+    kept_session,
     layer_from_message,
     read_keyframe,
     select_map,
@@ -137,8 +136,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
-        find = functools.partial(self._work, session_of, engine)
-        self._contributions = Contributions(find, self._store_message, engine.traffic.record, RejectionLog(_log))
+        self._contributions = Contributions(
+            self._session, self._store_message, engine.traffic.record, RejectionLog(_log)
+        )
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
         self._exports, self._queries, self._joins, self._keyframes = *(asyncio.Lock() for _ in range(3)), PacedLock()
 
@@ -226,19 +226,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
         """Renew the agent's lease; return what identifies the stored updates."""
-        agent_id = agent_of_session(self.engine, request.session_id, Caller.of(context))
-        return pb.KeepSessionResponse(
-            highest_update_seq=self.engine.highest_update_seq(agent_id),
-            incarnation_id=self.engine.incarnation_id,
-            alignment=alignment_to_message(self.engine.alignment(agent_id)),
-        )
+        return await self._work(kept_session, self.engine, request.session_id, Caller.of(context))
 
     async def GetUpdateDigests(
         self, request: pb.GetUpdateDigestsRequest, context: Any
     ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
         """Return the digests of the agent's stored updates."""
-        agent_of_session(self.engine, request.session_id, Caller.of(context))
-        for block in digests_to_messages(await self._work(self.engine.stored_digests, request.session_id)):
+        agent_id = (await self._session(request.session_id, Caller.of(context))).agent_id
+        for block in digests_to_messages(await self._work(self.engine.stored_digests, agent_id)):
             with read_deadline():
                 yield block
 
@@ -327,7 +322,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
         """Replace the agent's task graph and objects."""
-        agent_of_session(self.engine, request.session_id, Caller.of(context))
+        await self._session(request.session_id, Caller.of(context))
         await self._work(self.engine.report_objects, request.session_id, report_from_message(request))
         return pb.ReportObjectsResponse()
 
@@ -370,7 +365,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
         """End a session; with `forget` the agent's updates are deleted."""
-        agent_of_session(self.engine, request.session_id, Caller.of(context))
+        await self._session(request.session_id, Caller.of(context))
         revision = await self._work(self.engine.leave, request.session_id, request.forget)
         self.publish_changes()
         return pb.LeaveSessionResponse(fused_revision=revision)
@@ -418,6 +413,13 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             self._align_again |= self.engine.is_alignment_due
             if is_changed:
                 self._map_changes.notify()
+
+    async def _session(self, session_id: str, caller: Caller) -> SessionRecord:
+        """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
+        if self.engine.known_session(session_id) is None:
+            # it may wait for the engine's lock, and so for the disk
+            return await self._work(session_of, self.engine, session_id, caller)
+        return session_of(self.engine, session_id, caller)
 
     async def _work(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
         """Run the function in a worker thread. Raises UnavailableError if the server drains."""

@@ -119,9 +119,9 @@ class FusionEngine:
         """Return the highest sequence number among the agent's stored updates; 0 without any."""
         return self._store.totals(agent_id).highest_update_seq
 
-    def stored_digests(self, session_id: str) -> TileDigests:
-        """Return the digests of the stored updates of the session's agent. Raises SessionUnknownError."""
-        return self._store.digests(self.session(session_id).agent_id)
+    def stored_digests(self, agent_id: str) -> TileDigests:
+        """Return the digests of the agent's stored updates; empty for an unknown agent."""
+        return self._store.digests(agent_id)
 
     @property
     def revision(self) -> int:

@@ -176,9 +176,8 @@ class FusedMapLayers:
             self._refined_log.record(self._restore_refined(stored, vote).tolist())
 
     def revision(self, layer: MapLayer = MapLayer.VOTE) -> int:
-        """Return the layer's revision; it increases with every change."""
-        with self._lock:
-            return self._log_of(layer).revisions.revision
+        """Return the layer's revision; it increases with every change. It does not wait for the lock."""
+        return self._log_of(layer).revisions.revision
 
     def size(self) -> tuple[int, int]:
         """Return the number of voxels and of Gaussians of the vote."""

@@ -23,6 +23,7 @@ from gausslite.fusion import traffic
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.traffic import Acknowledgements, StorageProbe
+from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire import server
 from gausslite.wire.clients import FusionClient
 
@@ -157,6 +158,25 @@ def test_health_follows_the_acknowledgements_and_a_check_that_does_not_end(
             store.running.set()
         sender.join()
         assert next(health) == SERVING
+
+
+def test_calls_are_answered_while_a_join_waits_for_the_disk() -> None:
+    store = StandingStore()
+    with fusion_server(store) as t:
+        session = t.client.join("ant", GRID).session_id
+        store.running.clear()
+        joining = threading.Thread(target=t.client.join, args=["bee", GRID])
+        joining.start()
+        try:
+            # these need the lock that the join holds, and wait for it in threads
+            waiting = [t.stub.KeepSession.future(pb.KeepSessionRequest(session_id=name)) for name in (session, "none")]
+            assert [check_health(t.channel, "") for _ in range(20)] == [SERVING] * 20
+            assert t.servicer.engine.maps.revision() > 0
+        finally:
+            store.running.set()
+        joining.join()
+        assert waiting[0].result(WAIT_S).incarnation_id == store.incarnation_id
+        assert waiting[1].exception(WAIT_S).code() == grpc.StatusCode.NOT_FOUND
 
 
 def test_acknowledgements_are_late_after_five_seconds_and_counted_by_their_time() -> None:
