@@ -253,11 +253,6 @@ def require_serving(address: str, tls: Tls | None) -> None:
         raise UnavailableError(f"{address}: not serving")
 
 
-def serves(address: str, service: str, tls: Tls | None) -> bool:
-    """Return whether the service of this full name serves at the address. Raises UnavailableError without an answer."""
-    return _status(address, service, tls) == int(_SERVING)
-
-
 def is_agent(address: str, tls: Tls | None) -> bool:
     """Return True for an agent's address, False for a fusion server's.
 
@@ -265,7 +260,7 @@ def is_agent(address: str, tls: Tls | None) -> bool:
     """
     require_callable("address", address)
     for name in ("Agent", "Fusion"):
-        if serves(address, f"gausslite.v1.{name}Service", tls):
+        if _status(address, f"gausslite.v1.{name}Service", tls) == _SERVING:
             return name == "Agent"
     raise InvalidInputError(f"{address}: expected an agent or a fusion server, got another service")
 
