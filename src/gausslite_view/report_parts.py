@@ -168,7 +168,8 @@ def short_text(value: object) -> str:
     """Return a value of a report as text of limited length; empty for None, empty lists and empty objects."""
     if value is None or value in ([], {}, ""):
         return ""
-    text = ", ".join(str(item) for item in value) if isinstance(value, list) else str(value)
+    items = value if isinstance(value, list) else [value]
+    text = ", ".join(as_count(item) if type(item) is int else str(item) for item in items)
     return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT - 1]}…"
 
 

@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
         print(as_text(report))
     else:
         wins = ", ".join(f"{name} won {count} voxels" for name, count in voxels_won.items())
-        print(f"{len(fused.gaussians)} Gaussians → {options.out} ({wins})")
+        print(f"{len(fused.gaussians):,} Gaussians → {options.out} ({wins})")
     return 0
 
 

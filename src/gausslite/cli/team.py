@@ -15,7 +15,7 @@ from gausslite.config.program import add_flags
 from gausslite.config.values import read_path
 from gausslite.domain.checks import require_identifier
 from gausslite.mission.results import MAP_FILE, prepare_file
-from gausslite.process import TASK_NOT_FOUND
+from gausslite.process import TASK_NOT_FOUND, size_text
 from gausslite.wire.channel import is_agent, require_callable
 from gausslite.wire.clients import AgentClient, Export, FusionClient
 from gausslite.wire.convert import message_to_values
@@ -140,7 +140,7 @@ def run_fetch(options: argparse.Namespace) -> int:
     with fusion_client(options) as client:
         data = client.export(Export(options.strategy, options.agent))
     write_atomic(options.out, data)
-    print(f"wrote {options.out}, {len(data)} bytes")
+    print(f"wrote {options.out}, {size_text(len(data))}")
     return 0
 
 
@@ -183,7 +183,7 @@ def run_refine(options: argparse.Namespace) -> int:
                 bar.total, gaussians = progress.iterations, progress.gaussians
                 bar.set_postfix_str(f"loss {progress.loss:.4f}", refresh=False)
                 bar.update(progress.iteration - bar.n)
-        print(f"refined {gaussians} Gaussians")
+        print(f"refined {gaussians:,} Gaussians")
         if options.out is not None:
             write_atomic(options.out, client.export(Export("refined")))
             print(f"wrote {options.out}")
@@ -224,7 +224,7 @@ def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:
         f"{status['frames_dropped']} dropped, {status['frames_rejected']} rejected"
     )
     roi_percent = 100 * status["roi_share"]
-    yield f"map        {status['gaussians']} Gaussians, {roi_percent:.1f} % of the pixels in the task's region"
+    yield f"map        {status['gaussians']:,} Gaussians, {roi_percent:.1f} % of the pixels in the task's region"
     if "uplink" in status:
         yield from _uplink_lines(status["uplink"])
     for note in status["notes"]:
@@ -234,8 +234,8 @@ def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:
 def _uplink_lines(uplink: Mapping[str, Any]) -> Iterator[str]:
     connection = "connected" if uplink["connected"] else uplink["stopped_because"] or "not connected"
     yield (
-        f"uplink     {connection}; sent {uplink['voxels_sent']} voxels ({uplink['bytes_sent']} bytes) and "
-        f"{uplink['keyframes_sent']} keyframes ({uplink['keyframe_bytes']} bytes)"
+        f"uplink     {connection}; sent {uplink['voxels_sent']:,} voxels ({size_text(uplink['bytes_sent'])}) and "
+        f"{uplink['keyframes_sent']} keyframes ({size_text(uplink['keyframe_bytes'])})"
     )
     yield f"waiting    {uplink['voxels_waiting']} voxels, {uplink['keyframes_waiting']} keyframes"
 
@@ -248,13 +248,13 @@ def _frame_line(alignment: Mapping[str, Any]) -> str:
 
 def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
     yield f"fusion server, mission {status['mission_id'] or '(no agent has joined yet)'}"
-    yield f"fused map  {status['fused_gaussians']} Gaussians in {status['fused_voxels']} voxels"
+    yield f"fused map  {status['fused_gaussians']:,} Gaussians in {status['fused_voxels']:,} voxels"
     yield f"keyframes  {status['keyframes']}; {'refined' if status['refined'] else 'not refined yet'}"
     for agent in status["agents"]:
         yield (
-            f"{agent['agent_id']:10} {'joined' if agent['joined'] else 'absent'}; {agent['gaussians']} Gaussians, "
-            f"wins {agent['won_voxels']} of {agent['voxels']} voxels, {agent['keyframes']} keyframes; "
-            f"received {agent['roi_bytes']} bytes of the task's region, {agent['handover_bytes']} of handovers"
+            f"{agent['agent_id']:10} {'joined' if agent['joined'] else 'absent'}; {agent['gaussians']:,} Gaussians, "
+            f"wins {agent['won_voxels']:,} of {agent['voxels']:,} voxels, {agent['keyframes']} keyframes; "
+            f"received {size_text(agent['roi_bytes'])} of the region, {size_text(agent['handover_bytes'])} of handovers"
         )
         yield f"           {_frame_line(agent['alignment'])}"
     if status["banned_agents"]:

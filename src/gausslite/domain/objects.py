@@ -324,7 +324,8 @@ def found_text(
     parts = []
     for noun in targets:
         centres_m = [found.centroid_m for found in meant if found.noun in (noun, noun_of(noun))]
-        places = " and ".join("({:.2f}, {:.2f}, {:.2f}) m".format(*centre_m) for centre_m in centres_m)
+        *others, last = ["({:.2f}, {:.2f}, {:.2f})".format(*centre_m) for centre_m in centres_m] or [""]
+        places = f"{', '.join(others)} and {last} m" if others else last and f"{last} m"
         parts.append(f"{noun} at {places}" if places else f"no {noun}")
     return ", ".join(parts)
 

@@ -204,7 +204,10 @@ class ServiceChannel:
     def _exchange(
         self, method: Callable[..., Iterable[_Response]], requests: Iterable[Any], deadline_s: float | None = None
     ) -> Iterator[_Response]:
-        """Start a call with a stream of requests at once, and return the iterator of its answers."""
+        """Start a call with a stream of requests at once, and return the iterator of its answers.
+
+        An error of the requests' own iterator ends the call and is raised as it is.
+        """
         self._require_open()
         reader = _RequestReader(requests)
         return self._answers(method(iter(reader), timeout=deadline_s), reader)
@@ -213,6 +216,11 @@ class ServiceChannel:
         try:
             with self._convert_errors():
                 yield from call
+        except GaussLiteError:
+            if reader is None or reader.error is None:
+                raise
+            # gRPC says only that there was one
+            raise reader.error from None
         finally:
             call.cancel()
             if reader is not None:
@@ -232,10 +240,15 @@ class _RequestReader:
     def __init__(self, requests: Iterable[Any]) -> None:
         self._requests = requests
         self._thread: threading.Thread | None = None
+        self.error: Exception | None = None
 
     def __iter__(self) -> Iterator[Any]:
         self._thread = threading.current_thread()
-        yield from self._requests
+        try:
+            yield from self._requests
+        except Exception as error:
+            self.error = error
+            raise
 
     def wait(self) -> None:
         """Wait until the thread ends; it may still wait for the caller's next request."""
