@@ -9,6 +9,7 @@ from typing import Any
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.errors import GaussLiteError
 from gausslite.evaluation.compare import map_purpose
+from gausslite.process import size_text
 from gausslite.wire.clients import Export, FusionClient
 from gausslite.wire.map_follower import MapFollower
 from gausslite_view.cameras import TeamCameras, TeamKeyframes
@@ -100,7 +101,7 @@ class FusionPanel:
             *(
                 f"{agent.agent_id}{'' if agent.joined else ' (left)'}{_task_text(agent)}: wins {agent.won_voxels:,} of "
                 f"{agent.voxels:,} voxels, alone lacks {max(status.fused_voxels - agent.voxels, 0):,}; "
-                f"{(agent.roi_bytes + agent.handover_bytes) / 1e6:.1f} MB received"
+                f"{size_text(agent.roi_bytes + agent.handover_bytes)} received"
                 f"{'; ' if agent.alignment.message else ''}{agent.alignment.message}"
                 for agent in status.agents
             ),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gausslite.config.values import read_path
 from gausslite.mission.results import REPORT_PAGE, as_text, prepare_folder
-from gausslite.process import print_message
+from gausslite.process import print_message, size_text
 from gausslite_view.report import require_replaceable, write_page
 from gausslite_view.report_parts import read_results
 
@@ -38,5 +38,5 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print(as_text({"file": str(out), "maps": [run_contents.name for run_contents in contents.runs], "bytes": size}))
     else:
-        print(f"{', '.join(run_contents.name for run_contents in contents.runs)} → {out} ({size / 1e6:.1f} MB)")
+        print(f"{', '.join(run_contents.name for run_contents in contents.runs)} → {out} ({size_text(size)})")
     return 0

@@ -20,6 +20,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.mapping.training import SkippableStage
 from gausslite.mission.checkpoint import SavedRun
 from gausslite.mission.task_mapper import FrameOutcome
+from gausslite.process import size_text
 from gausslite.v1 import task_pb2
 from gausslite.wire.convert_task import graph_from_message, graph_to_message
 from gausslite.wire.update_sender import UplinkCounters
@@ -112,14 +113,14 @@ class MissionSummary:
     def line(self) -> str:
         """Return one line for the operator: what was mapped, what was sent, what was left and where it is."""
         ending = "ended" if self.ended_by is None else f"ended early ({self.ended_by})"
-        mapped = f"mission {ending}: {self.frames} frames at {self.hz:.2f} Hz, {self.gaussians} Gaussians"
+        mapped = f"mission {ending}: {self.frames} frames at {self.hz:.2f} Hz, {self.gaussians:,} Gaussians"
         uplink = self.uplink
         if uplink is None:
             return mapped
         sent = (
-            f"{uplink.voxels_sent} voxels of the task's region in {uplink.roi_bytes} bytes, "
-            f"{uplink.keyframes_sent} keyframes in {uplink.keyframe_bytes} bytes, "
-            f"a handover of {uplink.handover_bytes} bytes"
+            f"{uplink.voxels_sent:,} voxels of the task's region in {size_text(uplink.roi_bytes)}, "
+            f"{uplink.keyframes_sent} keyframes in {size_text(uplink.keyframe_bytes)}, "
+            f"a handover of {size_text(uplink.handover_bytes)}"
         )
         return f"{mapped}; sent {sent}; {self._left(uplink)}"
 
