@@ -29,7 +29,8 @@ from gausslite.places.localisation import PlaceMap, rendered_frame
 
 MAX_LOCALISED_FRAMES = 12
 _NEEDED = 2
-"""Frames whose poses in the saved map must agree on one motion; a single one could show a repeated room."""
+"""Frames whose poses in the saved map must agree on one motion, more than those that contradict it: a single one could
+show a repeated room."""
 _AGREE_M, _AGREE_DEG = 0.3, 10.0
 
 
@@ -116,7 +117,7 @@ class SequenceLocaliser:
         self._motions: list[Float64[ndarray, "4 4"]] = []
         self.tried = 0
         self.T_map_sequence: Float64[ndarray, "4 4"] | None = None
-        # the motion that two frames agree on
+        # the motion on which two frames more agree than contradict it
 
     @property
     def is_done(self) -> bool:
@@ -130,9 +131,9 @@ class SequenceLocaliser:
         if place is None:
             return
         motion = place.T_world_camera @ inverse(frame.T_world_camera)
-        near = [other for other in self._motions if _agree(other, motion, frame)]
         self._motions.append(motion)
-        if len(near) + 1 >= _NEEDED:
+        agreeing = sum(_agree(other, motion, frame) for other in self._motions)
+        if agreeing - (len(self._motions) - agreeing) >= _NEEDED:
             self.T_map_sequence = motion
 
     def localise(self, frames: Iterable[Frame]) -> Float64[ndarray, "4 4"] | None:

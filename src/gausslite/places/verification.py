@@ -46,6 +46,9 @@ _MIN_LAYOUT, _FLAT_CHROMA = 0.8, 2.0
 """A symmetric cupboard with a television, mirrored, has textures of 0.73 to 0.83 and chroma of 7.0 to 7.7, which right
 poses have too, but layouts of at most 0.73; of 55 right poses in that home and in the kitchen, the least is 0.86."""
 
+_SPREAD, _CHROMA_SPREAD = 0.15, 2.0
+"""By which texture and layout, and chroma, differ between two maps of one place."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verification:
@@ -75,6 +78,11 @@ class Verification:
         """True if the map covers the view, and depth, texture and colours agree."""
         colours_agree = self.chroma <= _MAX_CHROMA and self.layout >= _MIN_LAYOUT
         return self.depth_agrees and self.texture >= _MIN_TEXTURE and colours_agree
+
+    def is_about_as_good(self, best: Verification) -> bool:
+        """True if the map shows the image here too, or nearly as well as at the best pose."""
+        colours_agree = self.chroma <= best.chroma + _CHROMA_SPREAD and self.layout >= best.layout - _SPREAD
+        return self.shows_the_same or (self.depth_agrees and self.texture >= best.texture - _SPREAD and colours_agree)
 
     @property
     def depth_agrees(self) -> bool:

@@ -18,7 +18,8 @@ from gausslite.config.program import Program
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import frame_size, select_frames
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.pose import rotation_angle_deg, transform_of, translation_m
 from gausslite.evaluation.views import view_map
 from gausslite.mission.prior import MAX_LOCALISED_FRAMES, SavedMap
 from gausslite.mission.results import as_text
@@ -27,6 +28,7 @@ from gausslite.places.localisation import PlaceMap
 from gausslite_bench.loop_trials import LoopScore, LoopTrials
 
 _WRONG_M, _WRONG_DEG = 0.25, 10.0
+_BESIDE = np.array([20.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +37,9 @@ class PlacesOptions:
 
     place: Path = option(MISSING, "folder of the run whose map is the place", metavar="RUN")
     elsewhere: bool = option(False, "SOURCE shows another place: every localised frame is wrong")
+    beside: Path | None = option(
+        None, "folder of a run whose map is put 20 m beside: of the same rooms, no place is known", metavar="RUN"
+    )
     mirror: bool = option(False, "mirror the images, which makes a look-alike of the place (implies elsewhere)")
     loops: str = option(
         "",
@@ -121,7 +126,7 @@ def configure_places(parser: CommandParser) -> None:
     """Add the options of `bench places`."""
     Program.of(
         *(PlacesOptions, SourceSettings),
-        flags="frames size elsewhere mirror loops threads json",
+        flags="frames size elsewhere beside mirror loops threads json",
         positional="place source",
         omit=("test-every", "camera-correction", "register-depth"),
     ).add_to(parser)
@@ -131,6 +136,8 @@ def configure_places(parser: CommandParser) -> None:
 def run_places(options: argparse.Namespace) -> int:
     """Localise the selected frames and print the result."""
     saved, source = SavedMap.read(options.place), open_source(options.source, options.up)
+    if options.beside is not None:
+        saved = _beside(saved, SavedMap.read(options.beside))
     size, positions = frame_size(options.size, source), select_frames(source, options.frames)
     frames = (source.frame(position, size) for position in positions)
     if options.mirror:
@@ -146,6 +153,13 @@ def run_places(options: argparse.Namespace) -> int:
         score = PlaceScore.of(places, frames, elsewhere)
     print(as_text(asdict(score)) if options.json else score.line())
     return 0
+
+
+def _beside(saved: SavedMap, other: SavedMap) -> SavedMap:
+    """Return one map with a second one 20 m away."""
+    other = other.moved(transform_of(_BESIDE))
+    gaussians = Gaussians.concatenate([saved.gaussians, other.gaussians])
+    return replace(saved, gaussians=gaussians, keyframes=[*saved.keyframes, *other.keyframes])
 
 
 def mirrored(frame: Frame) -> Frame:

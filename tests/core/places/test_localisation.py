@@ -9,7 +9,7 @@ import pytest
 from place_scenes import CAMERA, ROOM_M, MapCamera, looking, room
 
 from gausslite.domain.gaussians import Gaussians, move_gaussians
-from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite.domain.pose import rotation_angle_deg, transform_of, translation_m
 from gausslite.places.localisation import PlaceMap
 from gausslite.places.registration import can_match_without_guess
 
@@ -59,6 +59,23 @@ def test_a_frame_that_fits_two_rooms_is_refused() -> None:
     frame = twice.frame(looking(*KEYFRAMES[0]))
     assert once.localise(frame) is not None
     assert both.localise(frame) is None
+
+
+@pytest.mark.skipif(not can_match_without_guess(), reason="kiss-matcher comes with the extra slam")
+@pytest.mark.parametrize(("texture_seed", "is_known"), [(3, False), (9, True)], ids=["alike", "other colours"])
+def test_a_frame_that_fits_another_room_whose_keyframes_are_not_tried_is_refused(
+    texture_seed: int, is_known: bool
+) -> None:
+    T = transform_of(np.array([20.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
+    second = move_gaussians(room(3, texture_seed=texture_seed), T)
+    camera = MapCamera(Gaussians.concatenate([room(3), second]))
+    places = _place_map(camera)
+    for i in range(12):
+        places.add_rendered(CAMERA, looking(0.9, 0.7 + 0.001 * i, 45.0))  # more similar than all of the second room
+    for pose in KEYFRAMES:
+        places.add_rendered(CAMERA, T @ looking(*pose))
+    found = places.localise(camera.frame(looking(0.9, 0.7, 45.0)))
+    assert (found is not None) == is_known
 
 
 def test_an_empty_map_has_no_place() -> None:
