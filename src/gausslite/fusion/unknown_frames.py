@@ -1,8 +1,9 @@
 """Find the frame of an agent that does not know it: match its surfaces with the team's without a guess, or abstain.
 
 A wrong frame would spoil the team's map, so a motion has to pass every test on samples that did not find it: shared
-surface is near, its texture agrees inside small blocks, and no other motion passes nearly as well. The texture decides:
-of unrelated, mirrored and disjoint rooms, many have walls and floors that fit.
+surface is near, its texture agrees inside small blocks, and no other motion passes nearly as well, unless what that one
+leaves out passes too. The texture decides: of unrelated, mirrored and disjoint rooms, many have walls and floors that
+fit.
 """
 
 from __future__ import annotations
@@ -119,7 +120,9 @@ def find_frame(source: SurfaceSamples, target: SurfaceSamples) -> FrameSearch:
     if agreement.reason:
         return FrameSearch(None, agreement.reason)
     others = (other for other in search.alternatives(motion, motions) if search.is_apart(other, motion))
-    if any(search.agreement(other).is_about_as_good(agreement) for other in others):
+    if any(
+        search.agreement(other).is_about_as_good(agreement) and not search.excels(motion, other) for other in others
+    ):
         return FrameSearch(None, f"overlap {100 * agreement.overlap:.0f} %, but it fits in several places")
     return FrameSearch(search.fit(motion))
 
@@ -178,10 +181,12 @@ class _Search:
         distance, colour, _ = self._places.residuals(self._first.moved(motion))
         return float(((1.0 - distance) * (1.0 - colour)).mean())
 
-    def agreement(self, motion: Float64[ndarray, "4 4"]) -> _Agreement:
-        """Return how the held-out half agrees with the target."""
+    def agreement(self, motion: Float64[ndarray, "4 4"], beyond: Float64[ndarray, "4 4"] | None = None) -> _Agreement:
+        """Return how the held-out half agrees with the target; beyond: in what another motion does not lay on it."""
         moved = self._source.moved(motion)
         shared = self._shared(moved)
+        if beyond is not None:
+            shared &= ~self._shared(self._source.moved(beyond))
         if not shared.any():
             return _Agreement()
         samples, blocks = moved.take(shared), self._blocks[shared]
@@ -193,6 +198,11 @@ class _Search:
             matched=float(matched.mean()),
             texture=_block_correlation(samples.luminance[matched], theirs[matched], blocks[matched]),
         )
+
+    def excels(self, motion: Float64[ndarray, "4 4"], other: Float64[ndarray, "4 4"]) -> bool:
+        """Return whether a motion lays all on the target that another one does, and a part that passes by itself."""
+        more, less = self.agreement(motion, beyond=other), self.agreement(other, beyond=motion)
+        return not more.reason and less.blocks < _OTHER_BLOCKS
 
     def fit(self, motion: Float64[ndarray, "4 4"]) -> FrameFit:
         """Return the fit of a motion that passes, refined on the whole first half."""

@@ -128,7 +128,12 @@ def test_an_agent_in_an_unknown_frame_stays_apart_until_the_server_has_found_it(
 
 def doubled(gaussians: Gaussians) -> Gaussians:
     """Two equal rooms beside each other."""
-    return Gaussians.concatenate([gaussians, move_gaussians(gaussians, transform_of(np.array([6.0, 0, 0, 0, 0, 0.5])))])
+    return two_rooms(gaussians, gaussians, away_m=6.0)
+
+
+def two_rooms(one: Gaussians, other: Gaussians, away_m: float = 12.0) -> Gaussians:
+    """Return two rooms, the second one turned."""
+    return Gaussians.concatenate([one, move_gaussians(other, transform_of(np.array([away_m, 0, 0, 0, 0, 0.5])))])
 
 
 @pytest.mark.parametrize(
@@ -139,13 +144,25 @@ def doubled(gaussians: Gaussians) -> Gaussians:
         (lambda: room(0, texture_seed=3), lambda: room(0), "texture differs"),
         (lambda: scan(1), lambda: doubled(scan(0)), "overlap"),
         (lambda: doubled(scan(1)), lambda: scan(0), "fits in several places"),
+        (lambda: scan(1), lambda: two_rooms(scan(0), scan(2)), "overlap"),
     ],
-    ids=["another room", "a mirrored room", "other colours", "a repeated room", "one of two equal rooms"],
+    ids=["another room", "a mirrored room", "other colours", "a repeated room", "one of two equal rooms", "two maps"],
 )
 def test_look_alike_rooms_are_not_aligned(source, target, reason: str) -> None:
     found = find_frame(samples(move_gaussians(source(), T_BEE_ROOM)), samples(target()))
     assert found.fit is None
     assert reason in found.reason
+
+
+def test_a_room_that_the_team_has_twice_is_found_with_the_rooms_beside_it() -> None:
+    east, north = (transform_of(np.array([*shift_m, 0.0, 0.0, 0.0, 0.0])) for shift_m in ((4.0, 0.0), (0.0, 3.0)))
+    beside = Gaussians.concatenate([move_gaussians(room(8), east), move_gaussians(room(5), north)])
+    team = samples(two_rooms(Gaussians.concatenate([scan(0), beside]), scan(2)))
+    walked_on = move_gaussians(Gaussians.concatenate([scan(1), beside]), T_BEE_ROOM)
+    found = find_frame(samples(walked_on), team)
+    assert found.fit is not None
+    error_m, error_deg = error_of(found.fit.motion, T_BEE_ROOM)
+    assert (error_m < 0.03, error_deg < 0.5) == (True, True)
 
 
 def test_without_a_known_frame_the_first_agent_defines_it_until_one_that_knows_its_own_joins() -> None:
