@@ -132,11 +132,7 @@ class CameraPeriods:
 
 def same_camera(a: FolderCamera, b: FolderCamera) -> bool:
     """Return True for cameras of one size and lens with nearly equal intrinsics."""
-    first, second = a.camera, b.camera
-    sizes = (first.width_px, first.height_px), (second.width_px, second.height_px)
-    numbers = np.array([(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) for camera in (first, second)])
-    differs = np.abs(numbers[0] - numbers[1]).max() > _SAME_CAMERA * first.fx_px
-    return sizes[0] == sizes[1] and a.lens == b.lens and not differs
+    return a.lens == b.lens and a.camera.is_close_to(b.camera, _SAME_CAMERA)
 
 
 def optical_pose(T_world_camera: Float64[ndarray, "4 4"], axes: str) -> Float64[ndarray, "4 4"]:

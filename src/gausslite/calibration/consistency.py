@@ -86,9 +86,8 @@ class _Pair:
 
     def with_focal_length(self, factor: float) -> _Pair:
         """Return the pair of a camera whose focal length is multiplied."""
-        camera = replace(self.camera, fx_px=factor * self.camera.fx_px, fy_px=factor * self.camera.fy_px)
         points_m = self.matched.points_m * (1 / factor, 1 / factor, 1.0)
-        return replace(self, matched=replace(self.matched, points_m=points_m), camera=camera)
+        return replace(self, matched=replace(self.matched, points_m=points_m), camera=self.camera.zoomed(factor))
 
     def scale(self, motion: Float64[ndarray, "4 4"]) -> float:
         """Return the factor of the motion's translation that fits the points best; NaN if they do not show it."""
