@@ -99,6 +99,8 @@ class BrowserDetail:
                     self._grow(splats)
                 else:
                     self._draw(splats, self._limit if self._is_adaptive else len(splats))
+                    if not self._is_adaptive:
+                        self._note.content = ""
         except (ConnectionError, TimeoutError):
             return
         except RuntimeError:

@@ -217,10 +217,13 @@ class ServiceChannel:
             with self._convert_errors():
                 yield from call
         except GaussLiteError:
-            if reader is None or reader.error is None:
-                raise
-            # gRPC says only that there was one
-            raise reader.error from None
+            if reader is not None:
+                call.cancel()
+                reader.wait()
+                if reader.error is not None:
+                    # gRPC says only that there was one
+                    raise reader.error from None
+            raise
         finally:
             call.cancel()
             if reader is not None:

@@ -166,18 +166,6 @@ def test_frames_need_a_task_first() -> None:
         list(a.client.ingest([frame(0)]))
 
 
-def test_an_error_of_the_callers_frames_is_raised_as_it_is() -> None:
-    def frames() -> Iterator[Frame]:
-        yield frame(0)
-        raise OSError("the camera was unplugged")
-
-    with agent() as a:
-        a.client.assign_task(TASK)
-        with pytest.raises(OSError, match="unplugged"):
-            list(a.client.ingest(frames()))
-        assert next(a.client.ingest([frame(1)])).gaussians > 0
-
-
 def test_of_many_tasks_the_newest_is_assigned_and_none_of_them_delays_a_frame() -> None:
     begun, opened = threading.Event(), threading.Event()
 
