@@ -224,18 +224,27 @@ def _agent_lines(status: Mapping[str, Any]) -> Iterator[str]:
         f"{status['frames_dropped']} dropped, {status['frames_rejected']} rejected"
     )
     roi_percent = 100 * status["roi_share"]
-    yield f"map        {status['gaussians']:,} Gaussians, {roi_percent:.1f} % of the pixels in the task's region"
+    yield f"map        {_count(status['gaussians'])} Gaussians, {roi_percent:.1f} % of the pixels in the task's region"
     if "uplink" in status:
         yield from _uplink_lines(status["uplink"])
     for note in status["notes"]:
         yield f"note       {note}"
 
 
+def _count(value: str) -> str:
+    """Return a 64-bit integer, which is text in the JSON of a message, with separated thousands."""
+    return f"{int(value):,}"
+
+
+def _size(value: str) -> str:
+    return size_text(int(value))
+
+
 def _uplink_lines(uplink: Mapping[str, Any]) -> Iterator[str]:
     connection = "connected" if uplink["connected"] else uplink["stopped_because"] or "not connected"
     yield (
-        f"uplink     {connection}; sent {uplink['voxels_sent']:,} voxels ({size_text(uplink['bytes_sent'])}) and "
-        f"{uplink['keyframes_sent']} keyframes ({size_text(uplink['keyframe_bytes'])})"
+        f"uplink     {connection}; sent {_count(uplink['voxels_sent'])} voxels ({_size(uplink['bytes_sent'])}) and "
+        f"{uplink['keyframes_sent']} keyframes ({_size(uplink['keyframe_bytes'])})"
     )
     yield f"waiting    {uplink['voxels_waiting']} voxels, {uplink['keyframes_waiting']} keyframes"
 
@@ -248,13 +257,14 @@ def _frame_line(alignment: Mapping[str, Any]) -> str:
 
 def _fusion_lines(status: Mapping[str, Any]) -> Iterator[str]:
     yield f"fusion server, mission {status['mission_id'] or '(no agent has joined yet)'}"
-    yield f"fused map  {status['fused_gaussians']:,} Gaussians in {status['fused_voxels']:,} voxels"
+    yield f"fused map  {_count(status['fused_gaussians'])} Gaussians in {_count(status['fused_voxels'])} voxels"
     yield f"keyframes  {status['keyframes']}; {'refined' if status['refined'] else 'not refined yet'}"
     for agent in status["agents"]:
+        state = "joined" if agent["joined"] else "absent"
         yield (
-            f"{agent['agent_id']:10} {'joined' if agent['joined'] else 'absent'}; {agent['gaussians']:,} Gaussians, "
-            f"wins {agent['won_voxels']:,} of {agent['voxels']:,} voxels, {agent['keyframes']} keyframes; "
-            f"received {size_text(agent['roi_bytes'])} of the region, {size_text(agent['handover_bytes'])} of handovers"
+            f"{agent['agent_id']:10} {state}; {_count(agent['gaussians'])} Gaussians, "
+            f"wins {_count(agent['won_voxels'])} of {_count(agent['voxels'])} voxels, {agent['keyframes']} keyframes; "
+            f"received {_size(agent['roi_bytes'])} of the region, {_size(agent['handover_bytes'])} of handovers"
         )
         yield f"           {_frame_line(agent['alignment'])}"
     if status["banned_agents"]:

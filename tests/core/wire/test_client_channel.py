@@ -52,15 +52,6 @@ def test_no_thread_reads_frames_after_a_failed_stream() -> None:
     assert not readers[0].is_alive()
 
 
-def test_an_error_of_the_callers_frames_is_raised_as_it_is() -> None:
-    def frames() -> Iterator[Frame]:
-        yield FRAME
-        raise OSError("the camera was unplugged")
-
-    with serving([]) as server, AgentClient(server.address) as agent, pytest.raises(OSError, match="unplugged"):
-        list(agent.ingest(frames()))
-
-
 @pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])
 def test_a_service_of_this_machine_is_reached_without_the_proxy(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
     monkeypatch.setenv(variable, f"http://{NOBODY}")

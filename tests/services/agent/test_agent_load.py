@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import sqlite3
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from agent_running import SETTINGS, TASK, Gate, agent, ball_estimator
 from fusion_running import CAMERA, GRID, frame, fusion_server
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.sqlite_store import MemoryStore
@@ -229,3 +231,14 @@ def test_after_a_full_spool_all_changes_are_published_again(tmp_path: Path) -> N
             active = a.worker.run(lambda mapper: mapper.roi_gaussians()).result()
         uplink.close()
     assert int(store.batches()["robot"].counts.sum()) == len(active) > 0
+
+
+def test_an_error_of_the_callers_frames_is_raised_as_it_is() -> None:
+    def frames() -> Iterator[Frame]:
+        yield frame(0)
+        raise OSError("the camera was unplugged")
+
+    with agent() as a:
+        a.client.assign_task(TASK)
+        with pytest.raises(OSError, match="unplugged"):
+            list(a.client.ingest(frames()))
