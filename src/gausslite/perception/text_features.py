@@ -123,19 +123,19 @@ def match_noun(
     for name in nouns:
         is_whole = name == noun or not (is_thing(noun) or any(map(is_thing, noun.split()[:-1])))
         own_names = (name, *(known for known in by_name if _joined(known) == _joined(name)))
+        kinds = kinds_among(name, by_name)
         other_names = synonymous_classes(name, by_name) if name == noun or not is_thing(noun) else ()
         for basis, classes in (
             (MatchBasis.NAME, _with_kinds(own_names, by_name) if is_whole else own_names),
             (MatchBasis.SYNONYM, (synonyms().get(name, ""),)),
             (MatchBasis.SYNONYM, _with_kinds(other_names, by_name) if is_whole else other_names),
-            (MatchBasis.KIND, kinds_among(name, by_name) if is_whole else ()),
+            (MatchBasis.KIND, (*kinds, *_alike(name, by_name)) if kinds and is_whole else ()),
             (MatchBasis.KIND, nearest_above(name, by_name) if is_whole else ()),
         ):
             if found := tuple(dict.fromkeys(by_name[known] for known in classes if known in by_name)):
                 return NounMatch(phrase, basis, found)
-    row = {synonyms()[name] for name in nouns if name in synonyms()}
-    if found := tuple(by_name[known] for known in by_name if synonyms().get(known) in row):
-        return NounMatch(phrase, MatchBasis.SYNONYM, found)
+    if found := tuple(by_name[known] for name in nouns for known in _alike(name, by_name)):
+        return NounMatch(phrase, MatchBasis.SYNONYM, tuple(dict.fromkeys(found)))
     nearest = embeddings.nearest_class(phrase, class_names) if embeddings is not None else None
     if nearest is None or nearest[1] < settings.min_reported_similarity:
         return NounMatch(phrase, MatchBasis.NONE, known=nearest_names(noun, class_names))
@@ -149,6 +149,12 @@ def _with_kinds(names: Iterable[str], class_names: Collection[str]) -> tuple[str
     """Return the names that are classes, and the classes that are their kinds: a detector takes no desk for a table."""
     classes = [name for name in names if name in class_names]
     return (*classes, *(kind for name in classes for kind in kinds_of(name, class_names)))
+
+
+def _alike(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
+    """Return the class names that detectors do not tell apart from the noun."""
+    row = synonyms().get(noun)
+    return tuple(name for name in class_names if row is not None and synonyms().get(name) == row)
 
 
 def _joined(name: str) -> str:

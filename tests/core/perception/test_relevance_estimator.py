@@ -264,12 +264,13 @@ def test_the_vocabulary_finds_the_class_of_a_noun(noun, name):
         ("plant", ("Plant", "Houseplant")), ("big plant", ("Plant", "Houseplant")), ("table", ("Table", "Desk")),
         ("sofa", ("Couch", "Sofa bed")), ("mouse", ("Mouse", "Computer mouse")), ("fruit", ("Fruit", "Banana")),
         ("houseplant", ("Houseplant",)), ("ant", ("Ant",)), ("dog", ("Dog",)), ("banana", ("Banana",)),
+        ("cup", ("Coffee cup", "Mug")),
     ],
 )  # fmt: skip
 def test_a_noun_with_a_class_of_its_name_is_also_searched_as_its_kinds(noun, names):
     classes = (
         "Plant", "Houseplant", "Table", "Desk", "Couch", "Sofa bed", "Mouse", "Computer mouse", "Fruit", "Banana",
-        "Ant", "Dog", "Hot dog", "Chair",
+        "Ant", "Dog", "Hot dog", "Chair", "Coffee cup", "Mug",
     )  # fmt: skip
     assert match_noun(noun, classes, None).classes == names
 
