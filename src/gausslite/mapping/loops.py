@@ -113,18 +113,22 @@ class LoopCloser:
 
         prior: the frame with the pose before refinement, by the odometry or by tracking. kept: keyframes with images.
         """
+        last = None
         for old in kept:
             if old.frame.capture_time_ns == self._times_ns[old.anchor]:
                 self._graph.set_pose(old.anchor, old.frame.T_world_camera)
-        self._graph.add(prior.T_world_camera, keyframe.frame.T_world_camera)
+                last = old if old.anchor == keyframe.anchor - 1 else last
+        T_last_keyframe = None if last is None else _aligned(last, keyframe, _relative(last, keyframe))
+        self._graph.add(prior.T_world_camera, keyframe.frame.T_world_camera, T_last_keyframe)
         self._times_ns.append(keyframe.frame.capture_time_ns)
         view = View.of(keyframe.frame)
         self._descriptors.append(view.descriptor)
         loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - MIN_GAP])
-        if loop is None:
-            return None
-        is_noise = self._is_noise(loop)
-        self._graph.add_loop(loop)
+        # until a loop has shown a drift, images may err more than the odometry from one keyframe to the next
+        step = self._graph.newest_step if self._corrections else None
+        is_noise = (loop is None or self._is_noise(loop)) and (step is None or self._is_noise(step, _NOISE))
+        if loop is not None:
+            self._graph.add_loop(loop)
         return None if is_noise else self._solve(loop)
 
     def state(self) -> State:
@@ -146,7 +150,7 @@ class LoopCloser:
         self._descriptors = [PlaceDescriptor(values.copy()) for values in descriptors]
         self._times_ns = get_array(state, "times_ns", (len(self._graph),), np.int64).tolist()
 
-    def _solve(self, newest: Loop) -> Float64[ndarray, "k 4 4"]:
+    def _solve(self, newest: Loop | None) -> Float64[ndarray, "k 4 4"]:
         """Solve the pose graph and report the loops that it rejects."""
         solution = self._graph.solve()
         for i in np.flatnonzero(self._graph.accepted & ~solution.accepted).tolist():
@@ -166,8 +170,7 @@ class LoopCloser:
         frame = keyframe.frame
         nearest = min(earlier, key=lambda old: _distance(old.frame, frame))
         if _distance(nearest.frame, frame) < _MAX_DISTANCE:
-            guess = inverse(nearest.frame.T_world_camera) @ frame.T_world_camera
-            loop = self._registered(keyframe, view, nearest, guess)
+            loop = self._registered(keyframe, view, nearest, _relative(nearest, keyframe))
             if loop is not None:
                 return loop
         similar = max(earlier, key=self._similarity)
@@ -220,10 +223,17 @@ class LoopCloser:
 
         return render
 
-    def _is_noise(self, loop: Loop) -> bool:
-        """True if the poses agree with a loop, so that it does not move the map."""
-        error_m, error_deg = self._graph.residual(loop)
-        return error_m < self._noise[0] and error_deg < self._noise[1]
+    def _is_noise(self, motion: Loop, limits: tuple[float, float] | None = None) -> bool:
+        """True if the poses agree with a motion to these limits (m, degrees), so that it does not move the map."""
+        error_m, error_deg = self._graph.residual(motion)
+        limit_m, limit_deg = limits or self._noise
+        return error_m < limit_m and error_deg < limit_deg
+
+
+def _relative(old: Keyframe, keyframe: Keyframe) -> Float64[ndarray, "4 4"]:
+    """Return T_old_keyframe by the poses in the map."""
+    T_old_keyframe: Float64[ndarray, "4 4"] = inverse(old.frame.T_world_camera) @ keyframe.frame.T_world_camera
+    return T_old_keyframe
 
 
 def _render_image(old: Frame) -> RenderMap:

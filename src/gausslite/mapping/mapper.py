@@ -30,12 +30,7 @@ from gausslite.domain.state import (
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.free_space import contradicted_rows, guessed_far, left_behind
-from gausslite.mapping.keyframes import (
-    Keyframe,
-    KeyframeStore,
-    WindowView,
-    window_view,
-)
+from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
 from gausslite.mapping.loops import LoopCloser, LoopCounts
 from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
 from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
@@ -47,6 +42,7 @@ from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
 from gausslite.render.rasterizer import Rasterizer, Rendering
 
 _MAX_KEYFRAMES = 2**31 - 1
+_STAYS = np.eye(4)
 _EXTENT_PER_DEPTH = 1.0 / 3.0
 """Scene extent as a fraction of the largest depth so far, as in SplaTAM's released configuration."""
 
@@ -158,7 +154,7 @@ class GaussianMapper:
         motions = self._close_loop(frame, view.keyframe, scheduler) if self._keyframes.next_is_keyframe else None
         if motions is not None:
             view = self._window_view(view.keyframe.moved(motions))
-        iterations = self._train(view, scheduler)
+        iterations = self._train(view, motions, scheduler)
         self._keyframes.add(view)
         if self._has_prior and self._keyframes.buffer[-1] is view.keyframe:
             self._revise(view.keyframe)
@@ -440,7 +436,14 @@ class GaussianMapper:
         min_background = int(seeding.background_share * table.capacity)
         return insert_seeds(table, seeds, seeding.opacity, self._rng, min_background)
 
-    def _train(self, current: WindowView, scheduler: StageScheduler) -> int:
-        """Train on the window and the current view (MVO, Sec. III-D.2); without MVO on the current view alone."""
-        views = (*self._keyframes.window, current) if self._settings.components.mvo else (current,)
-        return self._trainer.train(views, self._extent_m, scheduler)
+    def _train(self, current: WindowView, motions: Float64[ndarray, "k 4 4"] | None, scheduler: StageScheduler) -> int:
+        """Train on the window and the current view (MVO, Sec. III-D.2); without MVO on the current view alone.
+
+        motions: of the keyframes by a loop, or None. The views that it moved train once more, because the map was
+        trained from other poses.
+        """
+        window = self._keyframes.window
+        views = (*window, current) if self._settings.components.mvo else (current,)
+        done = self._trainer.train(views, self._extent_m, scheduler)
+        moved = [] if motions is None else [view for view in window if (motions[view.keyframe.anchor] != _STAYS).any()]
+        return done + self._trainer.retrain(moved, self._extent_m, scheduler)

@@ -1,13 +1,15 @@
 """Correct the poses of keyframes by a pose graph: odometry, alignment to the map, and loops, which may be false.
 
 Nodes are keyframes. Between successive ones there are two factors, the motion by the odometry and that of the poses
-refined against the map. A loop states the motion between two keyframes far apart in time. Loops are robust by graduated
-non-convexity (GNC, Yang et al. 2020): each solution decides anew which ones count, so that a loop which later ones
-contradict no longer corrects the map. GTSAM solves the graph (extra: slam).
+refined against the map, or that by both images if the loops show that images err less than the odometry. A loop states
+the motion between two keyframes far apart in time. Loops are robust by graduated non-convexity (GNC, Yang et al. 2020):
+each solution decides anew which ones count, so that a loop which later ones contradict no longer corrects the map.
+GTSAM solves the graph (extra: slam).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,9 +33,10 @@ _LEAST_STD_M, _LEAST_STD_DEG = 0.002, 0.1
 _MAP_SHARE = 1.0 / 3.0
 """Error of the motion between two successive poses that are refined against the map, as a share of the odometry's."""
 _IMAGE_STD_M, _IMAGE_STD_DEG = 0.004, 0.1
-"""Error of a loop by alignment of two images; in a home, 1.0 mm and 0.03 degrees (root mean square). The defects of a
+"""Error of a motion by alignment of two images; in a home, 1.0 mm and 0.03 degrees (root mean square). The defects of a
 camera from which the prior was estimated also disturb the alignment, so its error is at least the prior."""
 _START_STD = 1e-4
+_MAX_STDS = 3.0
 _STAYS_M, _STAYS_DEG = 0.002, 0.05
 _INLIER_PROBABILITY = 0.99
 _MIN_WEIGHT = 0.5
@@ -58,10 +61,14 @@ class GraphSolution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """Motion from one keyframe to the next: by the odometry and by the poses in the map."""
+    """Motion from one keyframe to the next: by the odometry, by the poses in the map, and by both images if they align.
+
+    Without images, by_images is that of the poses in the map.
+    """
 
     odometry: Float64[ndarray, "4 4"]
     in_map: Float64[ndarray, "4 4"]
+    by_images: Float64[ndarray, "4 4"]
 
 
 def require_graph_solver() -> Any:
@@ -102,11 +109,23 @@ class PoseGraph:
         """Which loops count in the present poses."""
         return self._accepted
 
-    def add(self, T_world_prior: Float64[ndarray, "4 4"], T_world_keyframe: Float64[ndarray, "4 4"]) -> None:
-        """Add the next keyframe, with its pose before refinement, as earlier loops correct it, and its refined pose."""
+    def add(
+        self,
+        T_world_prior: Float64[ndarray, "4 4"],
+        T_world_keyframe: Float64[ndarray, "4 4"],
+        T_last_keyframe: Float64[ndarray, "4 4"] | None = None,
+    ) -> None:
+        """Add the next keyframe, with its pose before refinement, as earlier loops correct it, and its refined pose.
+
+        T_last_keyframe: its pose in the last keyframe's camera by both images; None if they do not align. It is not
+        used if the odometry contradicts it, or if the camera's defects disturb it more than the map's poses.
+        """
         if self._T_world_keyframe:
             odometry = inverse(self._T_world_prior) @ T_world_prior
-            self._steps.append(_Step(odometry, inverse(self._T_world_keyframe[-1]) @ T_world_keyframe))
+            in_map = inverse(self._T_world_keyframe[-1]) @ T_world_keyframe
+            if T_last_keyframe is None or not self._is_useful(T_last_keyframe, odometry):
+                T_last_keyframe = in_map
+            self._steps.append(_Step(odometry, in_map, T_last_keyframe))
         self._T_world_prior = T_world_prior
         self._T_world_keyframe.append(T_world_keyframe)
 
@@ -123,6 +142,34 @@ class PoseGraph:
         """Return by how much the present poses contradict a loop, in metres and degrees."""
         T = inverse(self._T_world_keyframe[loop.earlier]) @ self._T_world_keyframe[loop.later]
         return translation_m(T, loop.T_earlier_later), rotation_angle_deg(T, loop.T_earlier_later)
+
+    @property
+    def newest_step(self) -> Loop | None:
+        """The motion to the newest keyframe by images; None if loops do not show that images err less than odometry."""
+        if not self._steps or not self._images_err_less():
+            return None
+        return Loop(len(self) - 2, len(self) - 1, self._steps[-1].by_images)
+
+    def _images_err_less(self) -> bool:
+        """True if the accepted loops agree better with the motions by images than with the odometry."""
+        chains = [
+            list(itertools.accumulate([getattr(step, name) for step in self._steps], np.matmul, initial=np.eye(4)))
+            for name in ("odometry", "by_images")
+        ]
+        errors = np.zeros(2)
+        for loop in itertools.compress(self._loops, self._accepted):
+            for i, chain in enumerate(chains):
+                T = inverse(chain[loop.earlier]) @ chain[loop.later]
+                turned_rad = np.radians(rotation_angle_deg(T, loop.T_earlier_later))
+                errors[i] += translation_m(T, loop.T_earlier_later) + turned_rad
+        return bool(errors[1] < errors[0])
+
+    def _is_useful(self, T: Float64[ndarray, "4 4"], odometry: Float64[ndarray, "4 4"]) -> bool:
+        """Return True for a motion by images within three standard deviations of the odometry's, if they err less."""
+        noise = _odometry_noise(odometry)
+        max_rad, max_m = (_MAX_STDS * float(std) for std in noise[[0, 3]])
+        is_likely = translation_m(T, odometry) < max_m and bool(np.radians(rotation_angle_deg(T, odometry)) < max_rad)
+        return is_likely and bool((self._image_noise < _MAP_SHARE * noise).all())
 
     def solve(self) -> GraphSolution:
         """Return the poses that agree best with all factors. The newest 2000 keyframes may move."""
@@ -166,9 +213,13 @@ class PoseGraph:
             values.insert(number, gtsam.Pose3(self._T_world_keyframe[number]))
         start = gtsam.noiseModel.Isotropic.Sigma(6, _START_STD)
         graph.add(gtsam.PriorFactorPose3(first, values.atPose3(first), start))
+        use_images = self._images_err_less()
         for number, step in enumerate(self._steps[first:], first):
             odometry_noise = _odometry_noise(step.odometry)
-            for T, noise in ((step.odometry, odometry_noise), (step.in_map, _MAP_SHARE * odometry_noise)):
+            measured = step.in_map, _MAP_SHARE * odometry_noise
+            if use_images and not np.array_equal(step.by_images, step.in_map):
+                measured = step.by_images, self._image_noise
+            for T, noise in ((step.odometry, odometry_noise), measured):
                 graph.add(_between(gtsam, (number, number + 1), T, noise))
         return graph, values
 
@@ -179,6 +230,7 @@ class PoseGraph:
             "T_world_prior": self._T_world_prior,
             "odometry_steps": np.array([step.odometry for step in self._steps]).reshape(-1, 4, 4),
             "map_steps": np.array([step.in_map for step in self._steps]).reshape(-1, 4, 4),
+            "image_steps": np.array([step.by_images for step in self._steps]).reshape(-1, 4, 4),
             "loops": np.array([(loop.earlier, loop.later) for loop in self._loops], np.int64).reshape(-1, 2),
             "T_earlier_later": np.array([loop.T_earlier_later for loop in self._loops]).reshape(-1, 4, 4),
             "accepted": self._accepted,
@@ -189,14 +241,14 @@ class PoseGraph:
         poses = _rigid(state, "T_world_keyframe", None)
         self._T_world_prior = get_array(state, "T_world_prior", (4, 4), np.float64).copy()
         count = max(len(poses) - 1, 0)
-        odometry, in_map = (_rigid(state, name, count) for name in ("odometry_steps", "map_steps"))
+        steps = (_rigid(state, name, count) for name in ("odometry_steps", "map_steps", "image_steps"))
         loops = get_array(state, "loops", (None, 2), np.int64)
         if not ((loops >= 0) & (loops < len(poses))).all():
             raise MapFileError(f"state loops: expected keyframes from 0 to {len(poses) - 1}, got others")
         measured = _rigid(state, "T_earlier_later", len(loops))
         self._accepted = get_array(state, "accepted", (len(loops),), np.bool_).copy()
         self._T_world_keyframe = poses
-        self._steps = [_Step(*step) for step in zip(odometry, in_map, strict=True)]
+        self._steps = [_Step(*step) for step in zip(*steps, strict=True)]
         self._loops = [Loop(int(i), int(j), T) for (i, j), T in zip(loops, measured, strict=True)]
 
 

@@ -294,6 +294,14 @@ class Trainer:
         if self._iterations % self._settings.optimization.iterations == 0:
             self._update_ema()
 
+    def retrain(self, views: Sequence[WindowView], extent_m: float, scheduler: StageScheduler) -> int:
+        """Run an iteration for each of these views while the scheduler has time; return how many."""
+        done = 0
+        while done < len(views) and scheduler.has_time_for(Stage.WARM_UP):
+            self.idle_step(views, extent_m)
+            done += 1
+        return done
+
     def _turns(self, views: Sequence[WindowView]) -> dict[Stage, Iterator[WindowView]]:
         """Return the views of each phase in the order of training (MVO), without end.
 

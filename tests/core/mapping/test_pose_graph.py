@@ -27,12 +27,14 @@ def circle() -> list[np.ndarray]:
     return poses
 
 
-def drifting_graph(true: list[np.ndarray]) -> PoseGraph:
+def drifting_graph(true: list[np.ndarray], by_images: np.ndarray | None = None) -> PoseGraph:
+    """Return a graph of drifting poses; by_images: error of the motions by images, or None without them."""
     graph, T = PoseGraph(PoseExposurePrior()), true[0]
     graph.add(T, T)
     for before, after in itertools.pairwise(true):
-        T = T @ inverse(before) @ after @ DRIFT
-        graph.add(T, T)
+        step = inverse(before) @ after
+        T = T @ step @ DRIFT
+        graph.add(T, T, None if by_images is None else step @ by_images)
     return graph
 
 
@@ -54,6 +56,20 @@ def test_loops_remove_half_of_the_drift() -> None:
     assert graph.accepted.all()
     assert error_m(graph, true) < 0.5 * before
     np.testing.assert_allclose(motions[0], np.eye(4), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("by_images", "share"), [(np.eye(4), 0.05), (DRIFT @ DRIFT, 1.0)], ids=["better", "worse than odometry"]
+)
+def test_motions_by_images_count_once_loops_show_that_they_err_less(by_images: np.ndarray, share: float) -> None:
+    true = circle()
+    plain, graph = drifting_graph(true), drifting_graph(true, by_images)
+    assert graph.newest_step is None, "no loop has shown anything"
+    for with_loop in (plain, graph):
+        with_loop.add_loop(true_loop(true, 0, 20))
+        with_loop.apply(with_loop.solve())
+    assert error_m(graph, true) <= share * error_m(plain, true)
+    assert (graph.newest_step is not None) == (share < 1.0)
 
 
 def test_a_false_loop_does_not_count() -> None:
