@@ -19,12 +19,13 @@ from gausslite.cli.source_options import (
     selected_regions,
     stated_values,
 )
-from gausslite.codec.ply import read_ply
+from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
 from gausslite.config.program import Program
 from gausslite.config.values import NONE, read_correction, read_registration_or_auto
+from gausslite.datasets.open import default_world_frame
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
@@ -101,6 +102,7 @@ def run(options: argparse.Namespace) -> int:
     viewer = view_map(read_ply(options.map, print_message), threads=options.threads)
     conditions = _Conditions.of(options)
     recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)
+    _report_other_world(options, recorded)
     source = calibrate_with_messages(options.source, recorded, conditions.stated).source
     test_every = _test_every(options)
     positions = _selected_positions(options.frames, test_every, source)
@@ -216,6 +218,16 @@ class _SelectedFrames:
                 self.corrupt(self.source.indices()[position], error)
             else:
                 yield position, frame
+
+
+def _report_other_world(options: argparse.Namespace, recorded: Source) -> None:
+    """Print a message if the map is that of another sequence, and its poses' frame has another name."""
+    of_map, of_views = read_world_frame(options.map), default_world_frame(recorded)
+    if of_map not in ("", of_views) and read_report(options.map.parent).get("source") != options.source:
+        print_message(
+            f"{options.map} is in the world frame {of_map!r}, the poses of {options.source} in {of_views!r}; the "
+            "scores hold only if both are one frame"
+        )
 
 
 def _test_every(options: argparse.Namespace) -> int | None:

@@ -91,3 +91,15 @@ def test_a_map_has_a_preview_next_to_recorded_images(kitchen: Path, tmp_path: Pa
     # two keyframes in ten frames: one row each of recorded image, map, and the region in both
     assert preview.shape[1] > 4 * 320
     assert preview.shape[0] > 2 * 320 * HEIGHT / 16
+
+
+def test_views_of_another_world_are_scored_with_a_message(
+    kitchen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    map_path = mapped(kitchen, tmp_path / "out", "--set", "register-depth=none", "--set", "pose-prior=none")
+    other = write_seven_scenes(tmp_path / "office", (0, 4))
+    for source, is_other in ((kitchen, False), (other, True)):
+        capsys.readouterr()
+        assert main(["eval", str(map_path), str(source), "--set", "threads=1"]) == 0
+        expected = f"is in the world frame 'kitchen', the poses of {source} in 'office'; the scores hold only if"
+        assert (expected in capsys.readouterr().err) is is_other
