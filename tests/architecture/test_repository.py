@@ -6,7 +6,7 @@ import ast
 import re
 import subprocess
 import tomllib
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -24,11 +24,11 @@ def _tracked(*patterns: str) -> list[Path]:
     return [ROOT / line for line in done.stdout.splitlines() if (ROOT / line).is_file()]
 
 
-def _production() -> Iterator[tuple[str, ast.Module]]:
-    """Yield the path and the syntax tree of each module that is not generated."""
-    for path in _tracked("src/*.py", "services/*.py", "ros2/*.py"):
-        if "v1" not in path.parts:
-            yield str(path.relative_to(ROOT)), ast.parse(path.read_text())
+@cache
+def _production() -> list[tuple[str, ast.Module]]:
+    """Return the path and the syntax tree of each module that is not generated."""
+    paths = [path for path in _tracked("src/*.py", "services/*.py", "ros2/*.py") if "v1" not in path.parts]
+    return [(str(path.relative_to(ROOT)), ast.parse(path.read_text())) for path in paths]
 
 
 def test_readme_has_exactly_the_two_commands() -> None:
