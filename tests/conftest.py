@@ -8,16 +8,11 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-from jaxtyping import install_import_hook
+from support import shape_checks
 from support.postgres_running import PostgresServer, postgres_server
 
-# The packages whose annotations have shapes: checks of the others would triple the time of their tests.
-_WITH_SHAPES = "api calibration codec datasets domain evaluation export fusion mapping mission perception render wire"
-install_import_hook(
-    (*(f"gausslite.{name}" for name in _WITH_SHAPES.split()), "gausslite_sim", "gausslite_bench"),
-    # accept an int for a float, as the type checker does
-    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
-)
+WITH_SHAPES = "api calibration codec datasets domain evaluation export fusion mapping mission perception render wire"
+shape_checks.install([*(f"gausslite.{name}" for name in WITH_SHAPES.split()), "gausslite_sim", "gausslite_bench"])
 
 # a busy machine is no failure: no test depends on a time
 hypothesis.settings.register_profile("untimed", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
