@@ -38,8 +38,8 @@ def trial_source_files() -> list[Path]:
     sources = [path for package in _PACKAGES for path in (_SOURCES / package).rglob("*.py") if _is_imported(path)]
     sources.sort(key=lambda path: path.relative_to(_SOURCES).as_posix())
     # an editable installation stores the kernels apart from the sources
-    kernels = find_spec("gausslite.render._kernels")
-    return sources if kernels is None or kernels.origin is None else [*sources, Path(kernels.origin)]
+    kernels = [find_spec(name) for name in ("gausslite.render._kernels", "gausslite.codec._unpack")]
+    return [*sources, *(Path(spec.origin) for spec in kernels if spec is not None and spec.origin is not None)]
 
 
 def _is_imported(path: Path) -> bool:
