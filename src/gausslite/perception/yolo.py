@@ -13,9 +13,9 @@ from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch, is_generic, same_kind
 from gausslite.domain.relevance import DetectedBox, Detection, Rival
+from gausslite.perception.class_match import ClassMatchSettings, TextEmbeddings, match_noun
 from gausslite.perception.detector import BoxSizeLimits, box_iou
 from gausslite.perception.model_file import OpenModel
-from gausslite.perception.text_features import ClassMatchSettings, TextEmbeddings, match_noun
 from gausslite.perception.yolo_network import Candidates, YoloNetwork, suppress
 
 

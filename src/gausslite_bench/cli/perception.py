@@ -201,7 +201,7 @@ def _task_queries(texts: Sequence[str], regions: Mapping[str, Region]) -> list[T
 def _absent_queries(options: argparse.Namespace, detector: Detector, regions: Mapping[str, Region]) -> list[TaskQuery]:
     """Return a search for each noun of --absent, or for as many nouns of the detector's vocabulary."""
     if isinstance(options.absent, int):
-        from gausslite.perception.text_features import TextEmbeddings
+        from gausslite.perception.class_match import TextEmbeddings
 
         embeddings = TextEmbeddings.from_model_folder(options.detector)
         vocabulary = () if embeddings is None else tuple(embeddings.noun_index)

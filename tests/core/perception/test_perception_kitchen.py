@@ -11,10 +11,10 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import load_voxel_regions
 from gausslite.datasets.source import Source
 from gausslite.domain.objects import MatchBasis
+from gausslite.perception.class_match import ClassMatchSettings, TextEmbeddings, match_noun
 from gausslite.perception.model_file import open_model
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import RelevanceTrackerSettings
-from gausslite.perception.text_features import ClassMatchSettings, TextEmbeddings, match_noun
 from gausslite.perception.yolo import YoloDetector, load_yolo
 from gausslite.task.rules import RuleParser
 

@@ -13,10 +13,11 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis
+from gausslite.perception.class_match import NOUN_NAMES_FILE, NOUN_VECTORS_FILE
 from gausslite.perception.model_file import open_model
 from gausslite.perception.models import ModelFamily, ModelRegistry, identify_family
 from gausslite.perception.open_vocabulary import PromptedYolo
-from gausslite.perception.text_features import NOUN_NAMES_FILE, NOUN_VECTORS_FILE, ClipTextEncoder, NounVectorTable
+from gausslite.perception.text_features import ClipTextEncoder, NounVectorTable
 
 pytest.importorskip("tokenizers", reason="the text encoder needs the extra grounding")
 
