@@ -86,9 +86,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         # a character that the terminal cannot encode must not end hours of work
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        return _dispatch(arguments)
+        code = _dispatch(arguments)
+        sys.stdout.flush()
+        return code
     except GaussLiteError as error:
         return _fail(str(error))
+    except BrokenPipeError:
+        # the reader has read enough, as `head` does; what is still buffered goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except OSError as error:
         return _fail(_describe(error))
     except Terminated as signal:
@@ -121,6 +127,4 @@ def _describe(error: OSError) -> str:
     where = f"{error.filename}: " if error.filename else ""
     if error.errno == errno.ENOSPC:
         return f"{where}the disk is full; free some space or choose another --out"
-    if error.errno == errno.EPIPE:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return f"{where}{error.strerror or error}"
