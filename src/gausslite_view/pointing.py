@@ -181,7 +181,7 @@ def ask_on_image(
         )
     )
 
-    answer.on_update(lambda _: chosen(*_chosen(str(answer.value), width_px, height_px)))
+    answer.on_update(lambda _: chosen(*read_answer(str(answer.value), width_px, height_px)))
 
     def end() -> None:
         dialog.remove()
@@ -190,12 +190,20 @@ def ask_on_image(
     return end
 
 
-def _chosen(message: str, width_px: int, height_px: int) -> tuple[Prompt, str]:
-    """Return the prompt, from shares to pixels of the image, and the noun of a browser's message."""
-    answer = json.loads(message)
-    last_px = np.nextafter((width_px, height_px), 0)
-    prompt = np.clip(np.array(answer["prompt"]).reshape(-1, 2) * (width_px, height_px), 0, last_px)
-    return tuple((x, y) for x, y in prompt.tolist()), str(answer["noun"])
+def read_answer(message: str, width_px: int, height_px: int) -> tuple[Prompt, str]:
+    """Return the prompt, from shares to pixels of the image, and the noun of a browser's message.
+
+    A message that this page's script does not send is read as an image that was closed.
+    """
+    try:
+        answer = json.loads(message)
+        shares, noun = np.array(answer["prompt"], np.float64).reshape(-1, 2), str(answer["noun"])
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return (), ""
+    if len(shares) > 2 or not np.isfinite(shares).all():
+        return (), ""
+    prompt = np.clip(shares * (width_px, height_px), 0, np.nextafter((width_px, height_px), 0))
+    return tuple((x, y) for x, y in prompt.tolist()), noun
 
 
 def _shown_view(shown: viser.CameraHandle) -> tuple[Camera, Float64[ndarray, "4 4"]]:
