@@ -56,8 +56,12 @@ def test_a_killed_process_starts_again_and_every_fit_has_the_bits_of_the_functio
             assert fit.pid is not None
             os.kill(fit.pid, signal.SIGKILL)
         assert fit(_NOTHING, target) is None
-        searched = fit.find(source, target)
-        assert (searched.fit, searched.reason) == (None, find_frame(source, target).reason)
+        searched, own = fit.find(source, target), find_frame(source, target)
+        assert searched.fit is not None
+        assert own.fit is not None
+        assert (searched.fit.as_json(), searched.reason) == (own.fit.as_json(), own.reason)
+        lost = fit.find(corner(2, 0.05), target)
+        assert (lost.fit, lost.reason) == (None, find_frame(corner(2, 0.05), target).reason)
     finally:
         fit.close()
     assert fit.pid is None
