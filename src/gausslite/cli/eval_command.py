@@ -102,7 +102,6 @@ def run(options: argparse.Namespace) -> int:
     viewer = view_map(read_ply(options.map, print_message), threads=options.threads)
     conditions = _Conditions.of(options)
     recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)
-    _report_other_world(options, recorded)
     source = calibrate_with_messages(options.source, recorded, conditions.stated).source
     test_every = _test_every(options)
     positions = _selected_positions(options.frames, test_every, source)
@@ -116,6 +115,7 @@ def run(options: argparse.Namespace) -> int:
         raise frames.corrupt.first_error or DatasetError(
             f"{options.source}: expected at least one frame with depth, got none"
         )
+    _report_other_world(options, recorded)
     result = average(scores)
     extra = {} if corrected is None else corrected.summary()
     figures = {**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count, **extra}
