@@ -150,7 +150,7 @@ def _contradiction(source: Source, force: bool) -> Contradiction | None:
     found = find_contradiction(source)
     if found is None or found.in_places:
         return found
-    way = "state it as scale in cam_params.json, or as depth_unit=Xmm in the address of a bag"
+    way = "state it as scale in the camera file of a folder, or as depth_unit=Xmm in the address of a bag"
     if found.only_unit and not source.depth_unit_stated:
         return replace(found, text=f"{found}; the files do not state the unit of depth: {way}")
     if force:
