@@ -162,7 +162,7 @@ def test_a_wrong_unit_that_the_files_do_not_state_is_noted(recording: Recording)
     recording.depth_unit_stated, recording.depth_factor = False, 0.2
     [note] = calibrate(recording).notes
     assert "depth multiplied by" in note
-    assert note.endswith("state it as scale in the camera file of a folder, or as depth_unit=Xmm in the address of a bag")
+    assert note.endswith("scale in the camera file of a folder, or as depth_unit=Xmm in the address of a bag")
     recording.poses = np.linalg.inv(recording.poses)
     with pytest.raises(DatasetError, match="world-to-camera"):
         calibrate(recording)
