@@ -82,9 +82,11 @@ struct Scene {
   FrameInput input;
 
   Scene(const float* rows, size_t count, const Intrinsics& intrinsics, const Matrix4& T_camera_world,
-        const std::optional<TileMask>& tiles, const std::optional<Ids>& ids, const Motion& motion) {
+        const std::optional<TileMask>& tiles, const std::optional<Ids>& ids, const Motion& motion,
+        float dilation_px2 = Camera{}.dilation_px2) {
     require(count < (size_t{1} << 31), "rows: too many");
     input = {rows, uint32_t(count), nullptr, 0, nullptr, make_camera(intrinsics, T_camera_world, motion)};
+    input.camera.dilation_px2 = dilation_px2;
     if (tiles) {
       const size_t tiles_x = size_t(input.camera.width + kTileSide - 1) / kTileSide,
                    tiles_y = size_t(input.camera.height + kTileSide - 1) / kTileSide;
@@ -167,10 +169,19 @@ struct StepScene {
   std::optional<TileMask> tiles;
   std::optional<Ids> ids;
   Motion motion;
+  float dilation_px2;
 
   StepScene(const TrainingView& view, const Intrinsics& intrinsics, Matrix4 T_camera_world,
-            std::optional<TileMask> tiles, std::optional<Ids> ids, const Motion& motion)
-      : view(view), intrinsics(intrinsics), T_camera_world(T_camera_world), tiles(tiles), ids(ids), motion(motion) {}
+            std::optional<TileMask> tiles, std::optional<Ids> ids, const Motion& motion, float dilation_px2)
+      : view(view),
+        intrinsics(intrinsics),
+        T_camera_world(T_camera_world),
+        tiles(tiles),
+        ids(ids),
+        motion(motion),
+        dilation_px2(dilation_px2) {
+    require(dilation_px2 > 0.0f && dilation_px2 < 1.0f, "dilation_px2: expected more than 0 and less than 1");
+  }
 };
 
 // Tables, settings and masks of a step.
@@ -222,7 +233,7 @@ struct StepTraining {
 
 double step(Rasterizer& self, const StepScene& view_scene, const StepTraining& training) {
   const Scene scene(training.rows.data(), training.rows.shape(0), view_scene.intrinsics, view_scene.T_camera_world,
-                    view_scene.tiles, view_scene.ids, view_scene.motion);
+                    view_scene.tiles, view_scene.ids, view_scene.motion, view_scene.dilation_px2);
   const Camera& camera = scene.input.camera;
   require(view_scene.view.width() == camera.width && view_scene.view.height() == camera.height, "view: wrong size");
   const OptimizerState state = training.state();
@@ -257,9 +268,10 @@ NB_MODULE(_kernels, m) {
 
   nb::class_<StepScene>(m, "StepScene", "View, camera, tiles and ids of a step; references the arrays.")
       .def(nb::init<const TrainingView&, const Intrinsics&, Matrix4, std::optional<TileMask>, std::optional<Ids>,
-                    const Motion&>(),
+                    const Motion&, float>(),
            nb::keep_alive<1, 2>(), nb::arg("view"), nb::arg("intrinsics"), nb::arg("T_camera_world").noconvert(),
-           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(), nb::arg("motion").none());
+           nb::arg("tiles").noconvert().none(), nb::arg("ids").noconvert().none(), nb::arg("motion").none(),
+           nb::arg("dilation_px2"));
 
   nb::class_<StepTraining>(m, "StepTraining", "Tables, settings and masks of a step; references the arrays.")
       .def(nb::init<std::tuple<RowTable, RowTable, RowTable>, std::tuple<float, float, float, bool>,

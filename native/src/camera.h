@@ -15,12 +15,12 @@ struct Camera {
   float t_camera_world[3];
   float fx, fy, cx, cy;  // pixels; pixel (u, v) has its centre at (u + 0.5, v + 0.5)
   int width, height;
-  bool moves = false;  // whether the image model includes `motion`
+  float dilation_px2 = 0.3f;  // added to the diagonal of the 2D covariance
+  bool moves = false;         // whether the image model includes `motion`
   CameraMotion motion;
 };
 
 constexpr float kNearPlaneM = 0.05f;  // splats with a mean at smaller depth are culled
-constexpr float kDilationPx2 = 0.3f;  // added to the diagonal of the 2D covariance
 // Tangents x/z and y/z in the Jacobian are clamped to this factor times the tangent of half the field of view.
 constexpr float kTangentLimitFactor = 1.3f;
 // The exposure time of a mean outside the image is limited to this share of the readout, before and after its middle.

@@ -48,7 +48,7 @@ GAUSSLITE_INLINE void list_lanes(uint32_t* out, Pack16 numbers, uint32_t lanes) 
 }
 
 // Bounds of a splat in the image, from its mean and largest scale s alone. An isotropic splat of scale s has the image
-// covariance s^2 J J^T + 0.3 I, which bounds that of the real splat in each direction. Alpha exceeds 1/255 within at
+// covariance s^2 J J^T + d I (projection.h), which bounds that of the real splat in each direction. Alpha exceeds 1/255 within at
 // most 3.33 standard deviations. kMotion: whether the camera moves.
 template <bool kMotion>
 class CullingBounds {
@@ -108,8 +108,8 @@ class CullingBounds {
       const Pack16 angle = exp(largest_log_scale) * inverse_z;
       x = fma(u, Pack16(c.fx), Pack16(c.cx));
       y = fma(v, Pack16(c.fy), Pack16(c.cy));
-      reach_x = reach(angle * c.fx, min(abs(u), Pack16(culling.limit_u_)));
-      reach_y = reach(angle * c.fy, min(abs(v), Pack16(culling.limit_v_)));
+      reach_x = reach(angle * c.fx, min(abs(u), Pack16(culling.limit_u_)), c.dilation_px2);
+      reach_y = reach(angle * c.fy, min(abs(v), Pack16(culling.limit_v_)), c.dilation_px2);
     }
 
     // The same at the times of exposure, with shear and blur (projection.h).
@@ -130,8 +130,8 @@ class CullingBounds {
       const Pack16 sheared_x = fma(abs(exposure.time_per_row) * speed_x, sharp_y, sharp_x);
       const Pack16 sheared_y = abs(fma(exposure.time_per_row, speed_y, Pack16(1.0f))) * sharp_y;
       const float blur_s = exposure_deviation_s(c.motion);
-      reach_x = reach_of(sheared_x * sheared_x + speed_x * speed_x * (blur_s * blur_s) + kDilationPx2);
-      reach_y = reach_of(sheared_y * sheared_y + speed_y * speed_y * (blur_s * blur_s) + kDilationPx2);
+      reach_x = reach_of(sheared_x * sheared_x + speed_x * speed_x * (blur_s * blur_s) + c.dilation_px2);
+      reach_y = reach_of(sheared_y * sheared_y + speed_y * speed_y * (blur_s * blur_s) + c.dilation_px2);
       x = fma(u, Pack16(c.fx), Pack16(c.cx));
       y = fma(v, Pack16(c.fy), Pack16(c.cy));
       z = min(z, depth);
@@ -144,8 +144,8 @@ class CullingBounds {
     }
 
     // `size`: the scale in pixels at the image centre. 3.35 exceeds 3.33 to allow for rounding.
-    GAUSSLITE_INLINE static Pack16 reach(Pack16 size, Pack16 tangent) {
-      return reach_of(fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(kDilationPx2)));
+    GAUSSLITE_INLINE static Pack16 reach(Pack16 size, Pack16 tangent, float dilation_px2) {
+      return reach_of(fma(size * size, fma(tangent, tangent, Pack16(1.0f)), Pack16(dilation_px2)));
     }
 
     GAUSSLITE_INLINE static Pack16 reach_of(Pack16 variance) { return variance * rough_inverse_sqrt(variance) * 3.35f; }

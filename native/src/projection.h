@@ -30,11 +30,12 @@ struct Projection {
   Pack16 J00, J02, J11, J12;            // Jacobian of the projection: [[J00 0 J02] [0 J11 J12]]
   Pack16 P0[3], P1[3];                  // rows of P = J R_camera_world
   Pack16 R[3][3], scale[3];             // the splat's rotation and scales
-  Pack16 M0[3], M1[3];                  // rows of M = P R S; the image covariance is M M^T + 0.3 I
+  Pack16 M0[3], M1[3];                  // rows of M = P R S; the image covariance is M M^T + d I
   Pack16 qw, qx, qy, qz, inverse_norm;  // the unit quaternion, and 1 / the length of the raw one
   Pack16 cov_xx, cov_xy, cov_yy;        // image covariance, px^2
   Pack16 conic_xx, conic_xy, conic_yy;  // its inverse
   Pack16 cross[3];                      // M0 x M1
+  float dilation_px2;                   // d
   Pack16 inverse_determinant;           // of the image covariance
   Pack16 mean_x, mean_y;                // px
   Pack16 transparency, log2_opacity;  // 1 - opacity, and log2(opacity), with a moving camera that of the blurred splat
@@ -106,20 +107,20 @@ GAUSSLITE_INLINE void rotate_and_scale(const Pack16* row, Projection& o) {
 template <bool kMotion>
 GAUSSLITE_INLINE void invert_covariance(Projection& o) {
   const Pack16 square0 = dot3(o.M0, o.M0), square1 = dot3(o.M1, o.M1);
-  o.cov_xx = square0 + kDilationPx2;
-  o.cov_yy = square1 + kDilationPx2;
+  o.cov_xx = square0 + o.dilation_px2;
+  o.cov_yy = square1 + o.dilation_px2;
   o.cov_xy = dot3(o.M0, o.M1);
   o.cross[0] = o.M0[1] * o.M1[2] - o.M0[2] * o.M1[1];
   o.cross[1] = o.M0[2] * o.M1[0] - o.M0[0] * o.M1[2];
   o.cross[2] = o.M0[0] * o.M1[1] - o.M0[1] * o.M1[0];
   Pack16 determinant =
-      dot3(o.cross, o.cross) + fma(Pack16(kDilationPx2), square0 + square1, Pack16(kDilationPx2 * kDilationPx2));
+      dot3(o.cross, o.cross) + fma(Pack16(o.dilation_px2), square0 + square1, Pack16(o.dilation_px2 * o.dilation_px2));
   if constexpr (kMotion) {
     ProjectionMotion& m = o.motion;
     m.sharp_inverse_determinant = Pack16(1.0f) / determinant;
     for (int j = 0; j < 3; ++j) m.minor[j] = m.blur_x * o.M1[j] - m.blur_y * o.M0[j];
     const Pack16 square_x = m.blur_x * m.blur_x, square_y = m.blur_y * m.blur_y;
-    determinant = determinant + fma(Pack16(kDilationPx2), square_x + square_y, dot3(m.minor, m.minor));
+    determinant = determinant + fma(Pack16(o.dilation_px2), square_x + square_y, dot3(m.minor, m.minor));
     o.cov_xx = o.cov_xx + square_x;
     o.cov_yy = o.cov_yy + square_y;
     o.cov_xy = fma(m.blur_x, m.blur_y, o.cov_xy);
@@ -161,6 +162,7 @@ GAUSSLITE_INLINE void project16(const Pack16* row, const Camera& camera, Project
     o.M0[j] = dot3(o.P0, axis) * o.scale[j];
     o.M1[j] = dot3(o.P1, axis) * o.scale[j];
   }
+  o.dilation_px2 = camera.dilation_px2;
   invert_covariance<kMotion>(o);
 
   // exp(-logit) / denominator keeps its precision at opacities near 1, unlike 1 - opacity.

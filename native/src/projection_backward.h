@@ -21,8 +21,8 @@ struct ParameterGradients {
 // splats.
 GAUSSLITE_INLINE void scaled_conic_times_axis(const Projection& p, int j, Pack16& x, Pack16& y) {
   const int k = (j + 1) % 3, l = (j + 2) % 3;
-  x = p.M1[k] * p.cross[l] - p.M1[l] * p.cross[k] + p.M0[j] * kDilationPx2;
-  y = p.M0[l] * p.cross[k] - p.M0[k] * p.cross[l] + p.M1[j] * kDilationPx2;
+  x = p.M1[k] * p.cross[l] - p.M1[l] * p.cross[k] + p.M0[j] * p.dilation_px2;
+  y = p.M0[l] * p.cross[k] - p.M0[k] * p.cross[l] + p.M1[j] * p.dilation_px2;
 }
 
 GAUSSLITE_INLINE void conic_times_axis(const Projection& p, int j, Pack16& x, Pack16& y) {
@@ -56,8 +56,8 @@ struct MotionGradients {
     const ProjectionMotion& m = p.motion;
     const Pack16 *moments = image + kGradientMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
     // The conic times b, as in scaled_conic_times_axis.
-    const Pack16 x = fma(m.blur_x, Pack16(kDilationPx2), dot3(p.M1, m.minor)) * p.inverse_determinant;
-    const Pack16 y = (m.blur_y * kDilationPx2 - dot3(p.M0, m.minor)) * p.inverse_determinant;
+    const Pack16 x = fma(m.blur_x, Pack16(p.dilation_px2), dot3(p.M1, m.minor)) * p.inverse_determinant;
+    const Pack16 y = (m.blur_y * p.dilation_px2 - dot3(p.M0, m.minor)) * p.inverse_determinant;
     const Pack16 Sx = S_xx * x + S_xy * y, Sy = S_xy * x + S_yy * y;
     const float deviation_s = exposure_deviation_s(camera.motion);
     const Pack16 d_blur_x = p.conic_xx * Sx + p.conic_xy * Sy - image[0] * x;
@@ -144,7 +144,7 @@ GAUSSLITE_INLINE void backward16(const Pack16* row, const Pack16* image, const C
   const Pack16 half_x = d_mean_x * (0.5f * float(camera.width)), half_y = d_mean_y * (0.5f * float(camera.height));
   out.mean_2d_grad_norm = sqrt(half_x * half_x + half_y * half_y);
 
-  // Covariance = M M^T + 0.3 I with M = P R S. As ln(alpha) = ... - d^T K d / 2, column m of M has the gradient K S K
+  // Covariance = M M^T + d I with M = P R S. As ln(alpha) = ... - d^T K d / 2, column m of M has the gradient K S K
   // m, where S is the matrix of second moments of v.
   const Pack16 *moments = image + kGradientMoments, S_xx = moments[3], S_xy = moments[4], S_yy = moments[5];
   Pack16 d_P0[3] = {0.0f, 0.0f, 0.0f}, d_P1[3] = {0.0f, 0.0f, 0.0f}, d_R[3][3];

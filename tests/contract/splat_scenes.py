@@ -10,9 +10,19 @@ import numpy as np
 import torch
 
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.render.rasterizer import LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, RGB, Rasterizer, Rendering, TrainingView
+from gausslite.render.rasterizer import (
+    DILATION_PX2,
+    LOG_SCALE,
+    MEAN,
+    OPACITY_LOGIT,
+    QUAT,
+    RGB,
+    Rasterizer,
+    Rendering,
+    TrainingView,
+)
 from gausslite.render.reference import MAX_ALPHA, MIN_TRANSMITTANCE
-from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, ImageMotion, project
+from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, ImageModel, project
 
 GROUPS = {
     "means": MEAN,
@@ -44,8 +54,8 @@ class Scene:
     def comparable(self) -> np.ndarray:
         """True for pixels to compare: float32 cannot move any of their alphas across a threshold."""
         rows = torch.from_numpy(self.rows.astype(np.float64))
-        motion = ImageMotion.of(self.camera, self.motion, torch.float64)
-        ellipses = project(rows, self.camera, torch.from_numpy(self.T_camera_world), motion=motion)
+        model = ImageModel.of(self.camera, self.motion)
+        ellipses = project(rows, model, torch.from_numpy(self.T_camera_world))
         comparable = np.ones(self.size, np.bool_)
         transmittance = torch.ones(self.size, dtype=torch.float64)
         for start in range(0, len(ellipses.row_ids), 64):
@@ -216,9 +226,12 @@ class TargetImage:
     rgb: np.ndarray
     depth_m: np.ndarray
     pixel_weights: np.ndarray
+    dilation_px2: float = DILATION_PX2
 
     def view(self, rasterizer: Rasterizer, scene: Scene) -> TrainingView:
-        return rasterizer.prepare_view(self.rgb, self.depth_m, scene.camera, self.pixel_weights)
+        return rasterizer.prepare_view(
+            self.rgb, self.depth_m, scene.camera, self.pixel_weights, None, self.dilation_px2
+        )
 
 
 def target_near(rendering: Rendering, seed: int = 0) -> TargetImage:

@@ -25,7 +25,7 @@ from gausslite.domain.camera import CameraMotion
 from gausslite.domain.pose import Twist
 from gausslite.render.rasterizer import Rasterizer, Rendering, SplatGradients, Subset
 from gausslite.render.reference import render_images
-from gausslite.render.reference_projection import ImageMotion, project
+from gausslite.render.reference_projection import ImageModel, project
 
 _TWIST = Twist(np.array([0.7, -0.4, 0.5]), np.array([-0.8, 1.6, 0.9]))
 MOTIONS = {
@@ -96,9 +96,9 @@ def test_a_camera_at_rest_changes_no_bit(rasterizer: Rasterizer, motion: CameraM
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("motion", ["shutter", "both"])
-def test_a_step_uses_the_motion_of_its_view(
-    rasterizer: Rasterizer, oracle: Rasterizer, motion: str, masked: bool
+@pytest.mark.parametrize(("motion", "dilation_px2"), [("shutter", 0.3), ("both", 0.3), ("both", 0.1375)])
+def test_a_step_uses_the_motion_and_the_dilation_of_its_view(
+    rasterizer: Rasterizer, oracle: Rasterizer, motion: str, dilation_px2: float, masked: bool
 ) -> None:
     scene = moving_scene(rasterizer, "medium splats", MOTIONS[motion])
     target = target_for(scene, oracle)
@@ -106,7 +106,7 @@ def test_a_step_uses_the_motion_of_its_view(
     for backend in (rasterizer, oracle):
         rows, first, second = tables(scene, with_history=False)
         weights = target.pixel_weights * scene.comparable
-        view = backend.prepare_view(target.rgb, target.depth_m, scene.camera, weights, scene.motion)
+        view = backend.prepare_view(target.rgb, target.depth_m, scene.camera, weights, scene.motion, dilation_px2)
         report = backend.step(rows, first, second, view, scene.T_camera_world, LOSS, ADAM, masked)
         moments.append((first, report))
     (result, report), (expected, expected_report) = moments
@@ -140,8 +140,8 @@ def test_bound_steps_cull_for_the_motion_of_each_view(rasterizer: Rasterizer, or
 
 
 def _weighted_sum(scene: Scene, rows: np.ndarray, T_camera_world: np.ndarray, d_images: np.ndarray) -> float:
-    motion = ImageMotion.of(scene.camera, scene.motion, torch.float64)
-    ellipses = project(torch.from_numpy(rows), scene.camera, torch.from_numpy(T_camera_world), motion=motion)
+    model = ImageModel.of(scene.camera, scene.motion)
+    ellipses = project(torch.from_numpy(rows), model, torch.from_numpy(T_camera_world))
     return float((render_images(ellipses, scene.camera, None).numpy() * d_images).sum())
 
 

@@ -75,6 +75,16 @@ def test_step_gradient_matches_oracle_on_other_scenes(rasterizer: Rasterizer, or
         assert error < tolerance, f"{group}: relative error {error:.2e}"
 
 
+@pytest.mark.parametrize("dilation_px2", [0.1375, 0.9])
+def test_a_step_uses_the_dilation_of_its_view(rasterizer: Rasterizer, oracle: Rasterizer, dilation_px2: float) -> None:
+    scene = named_scene("small splats")
+    target = replace(target_for(scene, oracle), dilation_px2=dilation_px2)
+    result, expected = train(rasterizer, scene, target), train(oracle, scene, target)
+    assert result.report.loss == pytest.approx(expected.report.loss, rel=1e-4)
+    assert expected.report.loss != train(oracle, scene, target_for(scene, oracle)).report.loss
+    assert relative_error(applied_gradient(result), applied_gradient(expected)) < TOLERANCE
+
+
 @pytest.mark.parametrize("corner", [(0, 0), (30, 44), (59, 84)])
 def test_small_region_step_matches_oracle(rasterizer: Rasterizer, oracle: Rasterizer, corner: tuple[int, int]) -> None:
     scene = named_scene("many")

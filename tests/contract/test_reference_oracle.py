@@ -9,14 +9,14 @@ from splat_scenes import CAMERA, GROUPS, Scene, named_scene, random_image_gradie
 
 from gausslite.render.rasterizer import LossWeights, Rasterizer
 from gausslite.render.reference import ReferenceView, render_images, ssim_map, training_loss
-from gausslite.render.reference_projection import project
+from gausslite.render.reference_projection import ImageModel, project
 
 STEP = 5e-8
 """Step of finite differences: small enough that no alpha crosses a threshold, large against float64 rounding."""
 
 
 def weighted_sum(scene: Scene, rows: np.ndarray, T_camera_world: np.ndarray, d_images: np.ndarray) -> float:
-    ellipses = project(torch.from_numpy(rows), scene.camera, torch.from_numpy(T_camera_world))
+    ellipses = project(torch.from_numpy(rows), ImageModel.of(scene.camera), torch.from_numpy(T_camera_world))
     return float((render_images(ellipses, scene.camera, None).numpy() * d_images).sum())
 
 
@@ -74,7 +74,7 @@ def test_mean_2d_grad_norm_is_the_gradient_of_an_image_shift(oracle: Rasterizer)
 
     def shifted(dx: float, dy: float) -> float:
         camera = type(CAMERA)(52.0, 50.0, CAMERA.cx_px + dx, CAMERA.cy_px + dy, 64, 48)
-        ellipses = project(torch.from_numpy(rows.astype(np.float64)), camera, torch.eye(4).double())
+        ellipses = project(torch.from_numpy(rows.astype(np.float64)), ImageModel.of(camera), torch.eye(4).double())
         rendering = render_images(ellipses, camera, None)
         return float((rendering.numpy() * np.dstack([d_rgb, d_depth_m, d_alpha])).sum())
 

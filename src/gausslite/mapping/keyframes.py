@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -19,7 +19,7 @@ from gausslite.domain.pose import Twist, inverse, orthonormal
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.mapping.settings import KeyframeSettings
-from gausslite.render.rasterizer import TILE_PX, Rasterizer, Subset, TrainingView
+from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, Rasterizer, Subset, TrainingView
 
 
 def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
@@ -92,6 +92,9 @@ def relevance_from_state(state: State, frame: Frame) -> RelevanceMap:
 
 _SSIM_WINDOW_PX = 11
 _DEPTH_STEP_PX = 8
+_ALL_MEASURED = 0.999
+_HALF_SIZE_DILATION_PX2 = (DILATION_PX2 + 0.25) / 4.0
+"""Splats look as in the full image averaged over 2x2 pixels, which adds 1/4 px² to their variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,10 +166,14 @@ def motion_blur_px(frame: Frame) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowView:
-    """A keyframe prepared for training. roi: the 16x16 tiles that touch the ROI or its margin."""
+    """A keyframe prepared for training. roi: the 16x16 tiles that touch the ROI or its margin.
+
+    half_view: the image in half size, with which iterations on whole images train; None: they use the training_view.
+    """
 
     keyframe: Keyframe
     training_view: TrainingView
+    half_view: TrainingView | None
     T_camera_world: Float64[ndarray, "4 4"]
     roi: Subset
 
@@ -192,9 +199,22 @@ def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSe
     return WindowView(
         keyframe=keyframe,
         training_view=rasterizer.prepare_view(frame.rgb, depth_m, frame.camera, pixel_weights, frame.motion),
+        half_view=_half_view(frame, depth_m, rasterizer) if depth_m.size >= settings.half_size_from_px else None,
         T_camera_world=inverse(frame.T_world_camera),
         roi=Subset(tiles),
     )
+
+
+def _half_view(frame: Frame, depth_m: Float32[ndarray, "h w"], rasterizer: Rasterizer) -> TrainingView:
+    """Prepare the image in half size: colours averaged over 2x2 pixels, depths too where all four are measured."""
+    width, height = frame.camera.width_px // 2, frame.camera.height_px // 2
+    rgb, halved_m, measured = (
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        for image in (frame.rgb, depth_m, (depth_m > 0).astype(np.float32))
+    )
+    halved_m = np.where(measured > _ALL_MEASURED, halved_m, np.float32(0.0))
+    camera = frame.camera.resized(width, height)
+    return rasterizer.prepare_view(rgb, halved_m, camera, None, frame.motion, _HALF_SIZE_DILATION_PX2)
 
 
 def tiles_touching(mask: Bool[ndarray, "h w"], margin_px: int) -> Bool[ndarray, "th tw"]:

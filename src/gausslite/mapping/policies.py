@@ -148,6 +148,7 @@ _PARTS: dict[str, tuple[str, float | bool]] = {
     "motion-mask": ("leaves_out_moving", False),
     "view-rotation": ("keyframes.rotates", False),
     "active-views": ("optimization.active_views", 1),
+    "half-size": ("keyframes.half_size_from_px", math.inf),
 }
 """The field of `MapperSettings` that each part of the task policy has, and the field's value without the part."""
 

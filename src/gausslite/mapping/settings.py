@@ -124,8 +124,10 @@ class KeyframeSettings:
     pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame if
     `MapperSettings.pose_prior` allows an error. depth_edge_px: depth within this distance of a depth jump is not
     trained; 0 trains all depth, as the paper. rotates: views train in turn (`ViewRotation`); False draws them
-    uniformly, as the paper. max_pixels: cap on the pixels of all keyframes together, reached with images larger than
-    about 1280x720; a pixel needs 13 bytes, or 20 with refined poses.
+    uniformly, as the paper. half_size_from_px: an iteration on whole images of at least this many pixels trains four of
+    them in half size, with the pixels of one; inf trains one in full size, as the paper. max_pixels: cap on the pixels
+    of all keyframes together, reached with images larger than about 1280x720; a pixel needs 13 bytes, or 20 with
+    refined poses.
     """
 
     every: int = 5
@@ -137,6 +139,7 @@ class KeyframeSettings:
     pose_updates_per_frame: int = 2
     depth_edge_px: int = 2
     rotates: bool = True
+    half_size_from_px: float = 150_000
     max_pixels: int = 160_000_000
 
     def __post_init__(self) -> None:
@@ -144,6 +147,8 @@ class KeyframeSettings:
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
         for name in ("long_term_keyframes", "roi_margin_px", "pose_updates_per_frame", "depth_edge_px"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
+        pixels = self.half_size_from_px
+        _require(pixels >= 1, "keyframes half_size_from_px", "at least 1", pixels)
         weight = self.roi_context_weight
         _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)
 
@@ -165,9 +170,10 @@ _BALANCED_LOSS = LossWeights(normalise_by_image=True)
 class OptimizationSettings:
     """Training of the map with one frame (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
 
-    active_views: views that an active iteration trains in turn, if the tiles of their regions are together no more than
-    one image; 1 is the paper's. loss: weights of Eq. (1). By default they are normalised by the image size. Adam's
-    steps with the small masks of the active phase are then comparable to those with full images. adam: learning rates.
+    active_views: views that an active iteration trains in
+    turn, if the tiles of their regions are together no more than one image; 1 is the paper's. loss: weights of Eq. (1).
+    By default they are normalised by the image size. Adam's steps with the small masks of the active phase are then
+    comparable to those with full images. adam: learning rates.
     decay_after_updates: updates of a Gaussian after which its learning rates decay, if `MapperSettings.pose_prior`
     allows an error; inf disables the decay. With constant rates, Gaussians would oscillate between views that
     contradict each other. isotropic: make Gaussians spheres after every frame. ema_updates: time constant, in updates,
@@ -177,7 +183,7 @@ class OptimizationSettings:
 
     warmup_iterations: int = 2
     active_iterations: int = 6
-    active_views: int = 4
+    active_views: int = 8
     active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS
     loss: LossWeights = _BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES

@@ -195,6 +195,7 @@ class CountedScheduler:
 _COLOUR_RANGE = (-0.25, 1.25)
 """Wider than [0, 1], so that blended colours still reach black and white."""
 _RANDOM_BLOCK = 16
+_HALF_SIZE_VIEWS = 4
 _Rows: TypeAlias = Float32[ndarray, "n 16"]
 _Tables: TypeAlias = tuple[_Rows, _Rows, _Rows]
 
@@ -345,12 +346,13 @@ class Trainer:
         return done, True
 
     def _iterate(self, binding: _Binding, stage: Stage, turns: Iterator[WindowView]) -> None:
-        """Run one iteration: on a whole image, or on the region in as many views as fit in the tiles of one image."""
+        """Run one iteration: on whole images, or on the region in as many views as fit in the tiles of one image."""
+        optimization = self._settings.optimization
         if stage is Stage.WARM_UP:
-            self._train_full_image(binding, next(turns))
+            self._train_full_images(binding, turns)
         else:
             images = 0.0
-            for _ in range(self._settings.optimization.active_views):
+            for _ in range(optimization.active_views):
                 view = next(turns)
                 self._train_roi(binding, view)
                 images += view.roi_share
@@ -360,8 +362,14 @@ class Trainer:
         self._since_prune += 1
         self._since_densify += 1
 
-    def _train_full_image(self, binding: _Binding, view: WindowView) -> None:
-        self._rasterizer.step(*binding.tables, view.training_view, view.T_camera_world, self._loss, self._adam)
+    def _train_full_images(self, binding: _Binding, turns: Iterator[WindowView]) -> None:
+        """Train a view in full size, or four in half size: as many pixels."""
+        for _ in range(_HALF_SIZE_VIEWS):
+            view = next(turns)
+            image = view.half_view or view.training_view
+            self._rasterizer.step(*binding.tables, image, view.T_camera_world, self._loss, self._adam)
+            if view.half_view is None:
+                break
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
         report = self._rasterizer.step(

@@ -36,6 +36,7 @@ class StepScene:
         tiles: Bool[ndarray, "th tw"] | None,
         ids: UInt32[ndarray, " m"] | None,
         motion: list[float] | None,
+        dilation_px2: float,
     ) -> None: ...
 
 class StepTraining:

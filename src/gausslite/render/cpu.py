@@ -21,6 +21,7 @@ from numpy import ndarray
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
 from gausslite.render.rasterizer import (
+    DILATION_PX2,
     FULL_FRAME,
     AdamSettings,
     LossWeights,
@@ -129,6 +130,7 @@ class CpuView:
     camera: Camera
     intrinsics: tuple[float, float, float, float, int, int]
     motion: list[float] | None
+    dilation_px2: float
     native: _kernels.View
     scenes: dict[bool, _CachedArguments[_kernels.StepScene]] = field(default_factory=dict, repr=False)
 
@@ -142,7 +144,9 @@ class CpuView:
         require_scene(n, self.camera, T_camera_world, subset)
         arrays = T_camera_world, subset.tiles, subset.ids
         passed = contiguous(T_camera_world), contiguous(subset.tiles), contiguous(subset.ids)
-        native: _kernels.StepScene = load_kernels().StepScene(self.native, self.intrinsics, *passed, self.motion)
+        native: _kernels.StepScene = load_kernels().StepScene(
+            self.native, self.intrinsics, *passed, self.motion, self.dilation_px2
+        )
         # a copy would not follow later changes of its array; the check of ids depends on n
         if subset.ids is None and all(map(is_, arrays, passed)):
             self.scenes[masked] = _CachedArguments(arguments, native)
@@ -354,6 +358,7 @@ class CpuRasterizer:
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> TrainingView:
         """Return the image in the kernels' layout.
 
@@ -363,7 +368,7 @@ class CpuRasterizer:
         native = load_kernels().View(
             np.ascontiguousarray(rgb), np.ascontiguousarray(depth_m), contiguous(pixel_weights)
         )
-        return CpuView(camera, intrinsics(camera), native_motion(motion), native)
+        return CpuView(camera, intrinsics(camera), native_motion(motion), dilation_px2, native)
 
     def step(
         self,

@@ -8,7 +8,7 @@ since the last densification. Column 14: norms of the gradient with respect to t
 heights (as in 3DGS). Column 15: number of steps in which the splat was visible.
 
 Image model (EWA splatting; 3DGS, Kerbl et al. 2023; Sec. III-A):
-    - The diagonal of the 2D covariance gets 0.3 px².
+    - The diagonal of the 2D covariance gets 0.3 px² (`DILATION_PX2`), or what a training view states.
     - Contributions with alpha < 1/255 are dropped. Alpha is clamped to 0.99, without a gradient through the clamp.
     - Splats nearer than 0.05 m are culled. The others are blended in ascending order of z.
     - The tangent x/z, y/z in the Jacobian is clamped to 1.3 times half the field of view.
@@ -22,7 +22,7 @@ the velocity -(v + w x p). Its image crosses rows at s px/s, and is recorded whe
       at the middle of the readout.
     - The readout shears the ellipse: its covariance is A C Aᵀ with A = I + V (0, 1) readout / (height · d). V is the
       velocity of the image in px/s: the Jacobian times that of the point.
-    - The exposure stretches it: V Vᵀ exposure² / 12 is added to the covariance after its 0.3 px². The opacity is
+    - The exposure stretches it: V Vᵀ exposure² / 12 is added to the covariance after the dilation. The opacity is
       multiplied by the root of the ratio of the determinants before and after, which keeps the splat's integral.
 
 A backend does not render invalid rows: those with a non-finite value in columns 0-13, a quaternion of length zero, or
@@ -60,7 +60,7 @@ MAX_UPDATE_COUNT = 20_000
 """Adam's factors no longer change after this many updates of a row: float32 rounds both bias corrections to 1."""
 
 TILE_PX = 16
-NEAR_M = 0.05
+NEAR_M, DILATION_PX2 = 0.05, 0.3
 TANGENT_MARGIN = 1.3
 """Limit of the tangents in the Jacobian, as a factor of half the field of view."""
 MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
@@ -130,8 +130,7 @@ class LossWeights:
     + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
 
     normalise_by_image multiplies the loss by W / (number of pixels). A pixel of weight 1 then has the same gradient
-    with any mask. Adam normalises by recent gradient magnitudes: without this factor, steps masked to a small region
-    have large gradients, and the steps on the full image hardly move the Gaussians that both train.
+    with any mask. Without it, Adam, which normalises by recent gradients, hardly moves a region in whole images.
     """
 
     colour: float = 0.8
@@ -272,11 +271,12 @@ class Rasterizer(Protocol):
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> TrainingView:
         """Return the image in the backend's layout. Steps render it with a moving camera if motion is given.
 
         depth_m: 0 means no measurement. pixel_weights: the weight of each pixel, in [0, 1], in the loss of steps with
-        `masked=True`; default 1.
+        `masked=True`; default 1. dilation_px2: of the steps' renderings, in (0, 1).
         Raises ShapeError, InvalidInputError if a weight is outside [0, 1].
         """
         ...

@@ -16,6 +16,7 @@ from torch.nn.functional import conv2d
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import (
+    DILATION_PX2,
     FULL_FRAME,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
@@ -38,7 +39,7 @@ from gausslite.render.rasterizer import (
     require_tables,
     require_view,
 )
-from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, ImageMotion, apply_twist, project, tile_grid
+from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, ImageModel, apply_twist, project, tile_grid
 
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
@@ -148,6 +149,7 @@ class ReferenceView:
     depth_m: Float64[Tensor, "h w"]
     pixel_weights: Float64[Tensor, "h w"]
     motion: CameraMotion | None = None
+    dilation_px2: float = DILATION_PX2
 
 
 def training_loss(
@@ -221,7 +223,7 @@ class ReferenceRasterizer:
         motion: CameraMotion | None = None,
     ) -> Rendering:
         """Render the splats. Raises ShapeError, InvalidInputError if the ids are not ascending row numbers."""
-        graph = _render(rows, camera, T_camera_world, subset, motion)
+        graph = _render(rows, ImageModel.of(camera, motion), T_camera_world, subset)
         images = graph.images.numpy().astype(np.float32)
         return Rendering(
             np.ascontiguousarray(images[..., :3]),
@@ -251,6 +253,7 @@ class ReferenceRasterizer:
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> TrainingView:
         """Return the image as float64 tensors. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
         require_view(rgb, depth_m, camera, pixel_weights)
@@ -262,6 +265,7 @@ class ReferenceRasterizer:
             torch.from_numpy(depth_m.astype(np.float64)),
             torch.from_numpy(pixel_weights.astype(np.float64)),
             motion,
+            dilation_px2,
         )
 
     def step(
@@ -283,7 +287,7 @@ class ReferenceRasterizer:
             raise ShapeError(f"view: expected one that this backend prepared, got {type(view).__name__}")
         require_tables(rows, first_moment, second_moment)
         require_row_masks(len(rows), trainable, update_counter)
-        graph = _render(rows, view.camera, T_camera_world, subset, view.motion)
+        graph = _render(rows, ImageModel.of(view.camera, view.motion, view.dilation_px2), T_camera_world, subset)
         images = graph.images.requires_grad_()
         value = training_loss(images, view, loss, masked)
         (d_images,) = torch.autograd.grad(value, images)
@@ -319,18 +323,18 @@ class ReferenceRasterizer:
 
 def _render(
     rows: Float32[ndarray, "n 16"],
-    camera: Camera,
+    model: ImageModel,
     T_camera_world: Float64[ndarray, "4 4"],
     subset: Subset,
-    motion: CameraMotion | None,
 ) -> _RenderGraph:
+    camera = model.camera
     require_table("rows", rows)
     require_scene(len(rows), camera, T_camera_world, subset)
     ids = None if subset.ids is None else torch.from_numpy(subset.ids.astype(np.int64))
     leaves = torch.from_numpy(rows.astype(np.float64)).requires_grad_()
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     pose = apply_twist(torch.from_numpy(T_camera_world), twist)
-    ellipses = project(leaves, camera, pose, ids, subset.tiles, ImageMotion.of(camera, motion, torch.float64))
+    ellipses = project(leaves, model, pose, ids, subset.tiles)
     with torch.no_grad():
         images = render_images(ellipses, camera, subset.tiles)
     return _RenderGraph(leaves, twist, camera, subset.tiles, ellipses, images)

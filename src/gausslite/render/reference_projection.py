@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.render.rasterizer import (
+    DILATION_PX2,
     LOG_SCALE,
     MAX_READOUT_SHARE,
     MEAN,
@@ -115,7 +116,6 @@ def determinants(covariances: Covariances) -> Float[Tensor, " m"]:
     return variance_x * variance_y - covariance * covariance
 
 
-LOW_PASS_PX2 = 0.3
 MIN_ALPHA = 1.0 / 255.0
 
 
@@ -166,49 +166,62 @@ class Ellipses:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageModel:
+    """What an image depends on besides the pose."""
+
+    camera: Camera
+    motion: ImageMotion | None
+    dilation_px2: float
+
+    @classmethod
+    def of(cls, camera: Camera, motion: CameraMotion | None = None, dilation_px2: float = DILATION_PX2) -> ImageModel:
+        """Return the model in double precision."""
+        return cls(camera, ImageMotion.of(camera, motion, torch.float64), dilation_px2)
+
+
 def project(
     rows: Float64[Tensor, "n 16"],
-    camera: Camera,
+    model: ImageModel,
     T_camera_world: Float64[Tensor, "4 4"],
     ids: Int64[Tensor, " k"] | None = None,
     tiles: Bool[ndarray, "th tw"] | None = None,
-    motion: ImageMotion | None = None,
 ) -> Ellipses:
     """Return the ellipses of the rows (of `ids`, if given) that can touch a pixel of `tiles`, nearest first."""
     with torch.no_grad():
         is_valid = torch.isfinite(rows[:, :14]).all(dim=1) & (rows[:, QUAT].abs().sum(dim=1) > 0)
         row_ids = torch.nonzero(is_valid)[:, 0] if ids is None else ids[is_valid[ids]]
         z_m = rows[row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
-        ellipses = _ellipses(rows, row_ids[z_m >= NEAR_M], camera, T_camera_world, motion)
+        ellipses = _ellipses(rows, row_ids[z_m >= NEAR_M], model, T_camera_world)
         ellipses = ellipses.take(ellipses.z_m >= NEAR_M)
         finite = torch.isfinite(ellipses.half_box_px).all(dim=1) & torch.isfinite(ellipses.means_px).all(dim=1)
         ellipses = ellipses.take(finite & (ellipses.opacities > MIN_ALPHA))
-        ellipses = ellipses.take(_touches_tiles(ellipses, camera, tiles))
+        ellipses = ellipses.take(_touches_tiles(ellipses, model.camera, tiles))
         # with a moving camera too, the order is that of the middle of the readout
         middle_z_m = rows[ellipses.row_ids, MEAN] @ T_camera_world[2, :3] + T_camera_world[2, 3]
         row_ids = ellipses.row_ids[torch.argsort(middle_z_m, stable=True)]
     # project again with gradients, only the rows that are not culled
-    return _ellipses(rows, row_ids, camera, T_camera_world, motion)
+    return _ellipses(rows, row_ids, model, T_camera_world)
 
 
 def _ellipses(
     rows: Float64[Tensor, "n 16"],
     row_ids: Int64[Tensor, " m"],
-    camera: Camera,
+    model: ImageModel,
     T_camera_world: Float64[Tensor, "4 4"],
-    motion: ImageMotion | None,
 ) -> Ellipses:
+    camera, motion = model.camera, model.motion
     kept = rows[row_ids]
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     points = kept[:, MEAN] @ R.T + t
     opacities = torch.sigmoid(kept[:, OPACITY_LOGIT])
     if motion is None:
-        variance_x, covariance, variance_y = _low_passed(_covariances_px2(kept, points, R, camera))
+        variance_x, covariance, variance_y = _dilated(_covariances_px2(kept, points, R, camera), model.dilation_px2)
     else:
         points, s_per_row = motion.expose(points)
         velocity = motion.image_velocity(points)
         covariances = motion.shear(_covariances_px2(kept, points, R, camera), velocity, s_per_row)
-        (variance_x, covariance, variance_y), peak = motion.blur(_low_passed(covariances), velocity)
+        (variance_x, covariance, variance_y), peak = motion.blur(_dilated(covariances, model.dilation_px2), velocity)
         opacities = opacities * peak
     z = points[:, 2]
     means_px = torch.stack(
@@ -230,9 +243,9 @@ def _ellipses(
     )
 
 
-def _low_passed(covariances: Covariances) -> Covariances:
+def _dilated(covariances: Covariances, dilation_px2: float) -> Covariances:
     variance_x, covariance, variance_y = covariances
-    return variance_x + LOW_PASS_PX2, covariance, variance_y + LOW_PASS_PX2
+    return variance_x + dilation_px2, covariance, variance_y + dilation_px2
 
 
 def _covariances_px2(

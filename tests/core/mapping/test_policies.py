@@ -122,5 +122,7 @@ def test_a_mission_maps_with_the_parts_disabled(name: str, iterations: int | Non
 def test_with_all_flags_disabled_no_component_is_left() -> None:
     bare = disable(policy(TASK), ABLATION_FLAGS)
     assert bare.components == Components(sb=False, mvo=False, roi=False, sis=False, gfd=False)
-    keyframes = KeyframeSettings(long_term_keyframes=0, roi_context_weight=0.0, depth_edge_px=0, rotates=False)
+    keyframes = KeyframeSettings(
+        long_term_keyframes=0, roi_context_weight=0.0, depth_edge_px=0, rotates=False, half_size_from_px=math.inf
+    )
     assert disable(policy(TASK), EXTENSION_FLAGS).keyframes == keyframes

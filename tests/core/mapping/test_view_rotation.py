@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from gausslite.mapping.keyframes import Keyframe, WindowView, window_view
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
 from gausslite.mapping.view_rotation import ViewRotation
-from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.cpu import CpuRasterizer, CpuView
+from gausslite.render.rasterizer import StepReport
 
 
 def prepared(index: int) -> WindowView:
@@ -53,6 +55,33 @@ def test_a_restored_rotation_continues_alike_and_refuses_a_damaged_state() -> No
     assert visited(restored, VIEWS, 9) == visited(rotation, VIEWS, 9)
     with pytest.raises(MapFileError, match="views"):
         restored.restore({"views": np.array([7, 7], np.int64)})
+
+
+class StepRecorder(CpuRasterizer):
+    """Records the width and the dilation of the image of each step."""
+
+    def __init__(self) -> None:
+        super().__init__(threads=1)
+        self.steps: list[tuple[int, float]] = []
+
+    def step(self, *arguments: Any, **options: Any) -> StepReport:
+        view: CpuView = arguments[3]
+        self.steps.append((view.camera.width_px, view.dilation_px2))
+        return super().step(*arguments, **options)
+
+
+def test_an_iteration_on_large_whole_images_trains_four_in_half_size() -> None:
+    rasterizer = StepRecorder()
+    settings = MapperSettings(
+        500,
+        keyframes=KeyframeSettings(half_size_from_px=161 * 120),
+        optimization=OptimizationSettings(warmup_iterations=2, active_iterations=0),
+    )
+    for size in ((161, 120), (160, 120)):
+        frame = wall_frame(size=size)
+        GaussianMapper(settings, rasterizer, seed=0).map_frame(frame, middle_relevance(frame))
+    # 0.3 px², and 1/4 px² of the mean over 2x2 pixels, in pixels of twice the side
+    assert rasterizer.steps == [(80, pytest.approx(0.1375))] * 8 + [(160, 0.3)] * 2
 
 
 @pytest.mark.parametrize(("share", "steps"), [(0.15, 4), (0.4, 2), (0.9, 1)])

@@ -33,7 +33,7 @@ from gausslite.render.rasterizer import (
     UPDATE_COUNT,
 )
 from gausslite.render.reference import Limits, render_images, render_images_backward
-from gausslite.render.reference_projection import LOW_PASS_PX2, MIN_ALPHA, Ellipses, determinants
+from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, determinants
 
 GSPLAT_LIMITS = Limits(max_alpha=0.999, blends_last_splat=False)
 """gsplat clamps alpha at 0.999 and skips the splat that would take the transmittance to 1e-4."""
@@ -248,7 +248,8 @@ def project(
 ) -> Footprints:
     """Return the footprints of these rows in the whole image, in the same order."""
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    points_m, motion = _rotate(rows[:, MEAN], R) + t, device_camera.motion
+    points_m = _rotate(rows[:, MEAN], R) + t
+    motion, dilation_px2 = device_camera.motion, device_camera.dilation_px2
     order_m = points_m[:, 2].detach()
     if motion is not None:
         points_m, s_per_row = motion.expose(points_m)
@@ -261,11 +262,11 @@ def project(
     # a sigmoid whose derivative is precise near 1
     opacities = logsigmoid(rows[:, OPACITY_LOGIT]).exp()
     if motion is None:
-        variance_x, variance_y = variance_x + LOW_PASS_PX2, variance_y + LOW_PASS_PX2
+        variance_x, variance_y = variance_x + dilation_px2, variance_y + dilation_px2
     else:
         velocity = motion.image_velocity(points_m)
         variance_x, covariance, variance_y = motion.shear((variance_x, covariance, variance_y), velocity, s_per_row)
-        sharp = variance_x + LOW_PASS_PX2, covariance, variance_y + LOW_PASS_PX2
+        sharp = variance_x + dilation_px2, covariance, variance_y + dilation_px2
         (variance_x, covariance, variance_y), peak = motion.blur(sharp, velocity)
         opacities = opacities * peak
     determinant = determinants((variance_x, covariance, variance_y))

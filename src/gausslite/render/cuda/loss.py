@@ -14,7 +14,7 @@ from torch.nn.functional import conv2d
 
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.render.cuda.tables import DeviceCamera, to_device
-from gausslite.render.rasterizer import TILE_PX, LossWeights
+from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, LossWeights
 
 MIN_DEPTH_ALPHA = 0.5
 _REACH_PX, _SIGMA_PX = 5, 1.5
@@ -103,6 +103,7 @@ class CudaView:
         pixel_weights: Float32[ndarray, "h w"] | None,
         device: torch.device,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> CudaView:
         """Copy the images to the device, colours in [0, 1], and compute the constant SSIM terms."""
         colours = to_device(rgb, device).float() / 255.0
@@ -120,7 +121,7 @@ class CudaView:
             weight_sum=float(depth_m.size),
             share=1.0,
         )
-        device_camera = DeviceCamera.of(camera, device, motion)
+        device_camera = DeviceCamera.of(camera, device, motion, dilation_px2)
         if pixel_weights is None:
             return cls(camera, device_camera, unmasked, unmasked)
         window = Window.around(pixel_weights, camera)

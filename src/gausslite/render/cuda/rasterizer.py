@@ -26,6 +26,7 @@ from gausslite.render.cuda.kernels import (
 from gausslite.render.cuda.loss import CudaView, Window, training_loss
 from gausslite.render.cuda.tables import DeviceCamera, DeviceTables, HostTables, to_device
 from gausslite.render.rasterizer import (
+    DILATION_PX2,
     FULL_FRAME,
     AdamSettings,
     LossWeights,
@@ -174,10 +175,11 @@ class CudaRasterizer:
         camera: Camera,
         pixel_weights: Float32[ndarray, "h w"] | None = None,
         motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
     ) -> CudaView:
         """Copy an image to the device. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
         require_view(rgb, depth_m, camera, pixel_weights)
-        return CudaView.of(rgb, depth_m, camera, pixel_weights, self._kernels.device, motion)
+        return CudaView.of(rgb, depth_m, camera, pixel_weights, self._kernels.device, motion, dilation_px2)
 
     def step(
         self,

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.render.rasterizer import (
+    DILATION_PX2,
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
     MAX_UPDATE_COUNT,
@@ -127,9 +128,16 @@ class DeviceCamera:
     shift_px: Float32[Tensor, "2"]
     half_size_px: Float32[Tensor, "2"]
     motion: ImageMotion | None
+    dilation_px2: float
 
     @classmethod
-    def of(cls, camera: Camera, device: torch.device, motion: CameraMotion | None = None) -> DeviceCamera:
+    def of(
+        cls,
+        camera: Camera,
+        device: torch.device,
+        motion: CameraMotion | None = None,
+        dilation_px2: float = DILATION_PX2,
+    ) -> DeviceCamera:
         """Return the device form of this camera and its motion."""
         middle_px = np.array([camera.width_px, camera.height_px]) / 2.0
         intrinsics = [[camera.fx_px, 0.0, middle_px[0]], [0.0, camera.fy_px, middle_px[1]], [0.0, 0.0, 1.0]]
@@ -140,4 +148,5 @@ class DeviceCamera:
             torch.tensor(shift_px, dtype=torch.float32, device=device),
             torch.tensor(middle_px, dtype=torch.float32, device=device),
             ImageMotion.of(camera, motion, torch.float32, device),
+            dilation_px2,
         )
