@@ -15,46 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gausslite.api import (
-        AgentClient,
-        AgentLink,
-        Answer,
-        BallRegion,
-        CalibratedSequence,
-        Camera,
-        CameraMotion,
-        DepthRegistration,
-        Export,
-        Frame,
-        FrameOutcome,
-        FusionClient,
-        Gaussians,
-        Lens,
-        LensModel,
-        MapResult,
-        MissionSettings,
-        ParserClient,
-        PerceptionSettings,
-        PointedObject,
-        PoseExposurePrior,
-        PoseMode,
-        RenderedImage,
-        SceneInfo,
-        Source,
-        Tls,
-        Twist,
-        ask,
-        create_mapper,
-        empty_batch,
-        load_ply,
-        map_sequence,
-        open_calibrated,
-        open_sequence,
-        region_at,
-        region_on_image,
-        render_view,
-        save_ply,
-    )
+    from gausslite.api import *
     from gausslite.domain import errors
     from gausslite.domain.errors import GaussLiteError
 
