@@ -154,8 +154,7 @@ class Program:
             parser.error(f"{flag}: was removed; {self.removed[key]}")
         if key.removeprefix("no-") in self.options:
             parser.error(f"{flag}: write --set {key.removeprefix('no-')}=false")
-        similar = "" if flag is None else suggestion(flag, parser.flags)
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}{similar}")
+        parser.refuse_unknown(unknown)
 
     def name(self, key: str) -> str:
         """Return how messages name an option: as a flag, or as a key of the file."""

@@ -97,7 +97,7 @@ def _unit_image(image: Shaped[ndarray, "h w 3"]) -> Float64[ndarray, "h w 3"]:
     raise ShapeError(f"image: expected uint8 or floating values, got {image.dtype}")
 
 
-def _checked_mask(mask: Bool[ndarray, "h w"], image: Float64[ndarray, "h w 3"]) -> Bool[ndarray, "h w"]:
+def _checked_mask(mask: Bool[ndarray, "h w"], image: Shaped[ndarray, "h w 3"]) -> Bool[ndarray, "h w"]:
     require_array("mask", mask, image.shape[:2], np.bool_)
     if not mask.any():
         raise InvalidInputError("mask: expected at least one pixel inside, got none")
@@ -169,10 +169,7 @@ def _luminance(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
 def _inside(mask: Bool[ndarray, "h w"] | None, image: Shaped[ndarray, "h w 3"]) -> Bool[ndarray, "h w"]:
     if mask is None:
         return np.ones(image.shape[:2], np.bool_)
-    require_array("mask", mask, image.shape[:2], np.bool_)
-    if not mask.any():
-        raise InvalidInputError("mask: expected at least one pixel inside, got none")
-    return mask
+    return _checked_mask(mask, image)
 
 
 _MAX_TIME_GAP_S = 1e-3

@@ -300,9 +300,8 @@ class KeyframeStore:
 
     def replace_view(self, view: WindowView) -> None:
         """Replace the view of the same recorded frame, if it is in the window."""
-        self._set_long_term([view if is_same_frame(old.keyframe, view.keyframe) else old for old in self._long_term])
-        self._recent = [view if is_same_frame(old.keyframe, view.keyframe) else old for old in self._recent]
-        self._buffer = [view.keyframe if is_same_frame(old, view.keyframe) else old for old in self._buffer]
+        self._replace(view.keyframe, view.keyframe, lambda _: view)
+        self._set_long_term(self._long_term)
 
     def reset_roi(self) -> None:
         """Mark all keyframes as not evaluated for the new task; their relevance is empty until then."""
@@ -336,19 +335,11 @@ class KeyframeStore:
 
     def replace_keyframe(self, keyframe: Keyframe) -> None:
         """Replace a keyframe by a version whose relevance has the same pixels."""
-        self._recent, self._long_term = (
-            [replace(view, keyframe=keyframe) if is_same_frame(view.keyframe, keyframe) else view for view in views]
-            for views in (self._recent, self._long_term)
-        )
-        self._buffer = [keyframe if is_same_frame(old, keyframe) else old for old in self._buffer]
+        self._replace(keyframe, keyframe, lambda view: replace(view, keyframe=keyframe))
 
     def exchange(self, old: Keyframe, new: Keyframe, prepare: PrepareView) -> None:
         """Replace a keyframe by one whose image has other pixels."""
-        self._buffer = [new if is_same_frame(keyframe, old) else keyframe for keyframe in self._buffer]
-        self._recent, self._long_term = (
-            [prepare(new) if is_same_frame(view.keyframe, old) else view for view in views]
-            for views in (self._recent, self._long_term)
-        )
+        self._replace(old, new, lambda _: prepare(new))
 
     def set_evaluated(self, keyframe: Keyframe, prepare: PrepareView) -> None:
         """Replace a keyframe by its evaluated version; one that shows the ROI joins the window again."""
@@ -405,6 +396,14 @@ class KeyframeStore:
         for keyframe in keyframes.values():
             self._limit_for(keyframe)
         self._mapped_frames, self._count = get_counts(state, "counts", 2)
+
+    def _replace(self, old: Keyframe, new: Keyframe, update: Callable[[WindowView], WindowView]) -> None:
+        """Replace the keyframe of one recorded frame, and update its views."""
+        self._buffer = [new if is_same_frame(keyframe, old) else keyframe for keyframe in self._buffer]
+        self._recent, self._long_term = (
+            [update(view) if is_same_frame(view.keyframe, old) else view for view in views]
+            for views in (self._recent, self._long_term)
+        )
 
     def _limit_for(self, keyframe: Keyframe) -> None:
         """Reduce the limits if this image is the largest so far."""

@@ -208,9 +208,9 @@ def _count_around(mask: Bool[ndarray, "h w"]) -> Float32[ndarray, "bh bw"]:
 
 
 _REFERENCE_PIXELS = 640 * 480
+"""Image size of the seed counts in SeedingSettings."""
 _MIN_ROI_ROOM = 0.05
 """Lowest density of ROI seeds relative to that of an empty map."""
-"""Image size of the seed counts in SeedingSettings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,9 +8,8 @@ decides.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
@@ -22,7 +21,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, transform_points, translation_m
 from gausslite.places.descriptors import PlaceDescriptor, PlaceIndex, describe
 from gausslite.places.registration import Surface, can_match_without_guess, depth_points, matched_motion, register
-from gausslite.places.verification import RenderMap, Verification, verify
+from gausslite.places.verification import RenderMap, Verification, reduced, verify
 
 _CANDIDATES = 10
 _WIDTH_PX = 320
@@ -51,14 +50,9 @@ class View:
     @classmethod
     def of(cls, frame: Frame) -> View:
         """Return the view of a frame; larger images than 320 pixels are reduced first."""
-        width = min(_WIDTH_PX, frame.camera.width_px)
-        height = max(round(frame.camera.height_px * width / frame.camera.width_px), 1)
-        rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
-        depth_m = cv2.resize(frame.depth_m, (width, height), interpolation=cv2.INTER_NEAREST)
-        camera = frame.camera.resized(width, height)
-        small = replace(frame, rgb=rgb, depth_m=depth_m, camera=camera, motion=None, recorded_rgb=None)
-        surface = Surface.sampled(depth_points(depth_m, camera))
-        return cls(camera, describe(rgb, depth_m), detect_features(small), surface)
+        small = reduced(frame, _WIDTH_PX)
+        surface = Surface.sampled(depth_points(small.depth_m, small.camera))
+        return cls(small.camera, describe(small.rgb, small.depth_m), detect_features(small), surface)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

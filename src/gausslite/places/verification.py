@@ -150,9 +150,9 @@ def verify(render: RenderMap, frame: Frame, T_world_camera: Float64[ndarray, "4 
     return replace(verification, sigmas=sigmas)
 
 
-def reduced(frame: Frame) -> Frame:
-    """Return the frame at the size of the comparison."""
-    width = min(_WIDTH_PX, frame.camera.width_px)
+def reduced(frame: Frame, width_px: int = _WIDTH_PX) -> Frame:
+    """Return the frame at most this wide, with the camera at rest."""
+    width = min(width_px, frame.camera.width_px)
     height = max(round(frame.camera.height_px * width / frame.camera.width_px), 1)
     rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
     depth_m = cv2.resize(frame.depth_m, (width, height), interpolation=cv2.INTER_NEAREST)
