@@ -91,10 +91,7 @@ def _visible_triangles(
 ) -> Int64[ndarray, "n k"]:
     """Return the triangles visible from each vertex in random directions, or -1."""
     directions = _cosine_directions(normals, rng)
-    seen: Int64[ndarray, "n k"] = caster.first_triangle(np.repeat(origins, _SKY_RAYS, axis=0), directions).reshape(
-        -1, _SKY_RAYS
-    )
-    return seen
+    return caster.first_triangle(np.repeat(origins, _SKY_RAYS, axis=0), directions).reshape(-1, _SKY_RAYS)
 
 
 def _indirect_light(

@@ -19,8 +19,7 @@ _BEST_RANGE_M = 0.4
 
 def colour_image(rgb: Float32[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
     """Return the colours rounded to 8 bits."""
-    image: UInt8[ndarray, "h w 3"] = np.clip(rgb + np.float32(0.5), 0, 255).astype(np.uint8)
-    return image
+    return np.clip(rgb + np.float32(0.5), 0, 255).astype(np.uint8)
 
 
 def noisy_colour(view: View, noise: SensorNoise, strength: float, rng: np.random.Generator) -> UInt8[ndarray, "h w 3"]:

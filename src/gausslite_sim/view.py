@@ -76,8 +76,7 @@ def render_instances(
 
 
 def _depth(hits: Hits) -> Float32[ndarray, " n"]:
-    depth_m: Float32[ndarray, " n"] = np.where(hits.triangle == NO_HIT, np.float32(0), hits.distance)
-    return depth_m
+    return np.where(hits.triangle == NO_HIT, np.float32(0), hits.distance)
 
 
 def _shade(

@@ -92,8 +92,7 @@ def decode_kappa_sums(
     raw: list[NDArray[Any]], kappa: NDArray[np.uint32], offsets: Int64[ndarray, " v1"]
 ) -> NDArray[np.uint64]:
     """Return Σkappa of each voxel."""
-    sums: NDArray[np.uint64] = raw[1].astype(np.uint64) + _sums(kappa, offsets)
-    return sums
+    return raw[1].astype(np.uint64) + _sums(kappa, offsets)
 
 
 def encode_labels(gaussians: Gaussians, layout: BodyLayout) -> list[NDArray[Any]]:
@@ -116,8 +115,7 @@ def encode_differences(values: NDArray[Any]) -> NDArray[Any]:
 
 def decode_differences(differences: NDArray[Any]) -> NDArray[Any]:
     """Return the values of these differences."""
-    values: NDArray[Any] = np.cumsum(differences, axis=0, dtype=differences.dtype)
-    return values
+    return np.cumsum(differences, axis=0, dtype=differences.dtype)
 
 
 def require_encodable(gaussians: Gaussians) -> None:

@@ -265,8 +265,7 @@ def cells_of(
     counts = (np.int64(1) << bits)[:, None]
     # rounding to even makes the code stable where float32 has only the faces of the cell
     cells = np.rint((exact - voxel * grid.size_m) * (counts / grid.size_m) - 0.5)
-    clipped: Int64[ndarray, "n 3"] = np.clip(cells, 0, counts - 1).astype(np.int64)
-    return clipped
+    return np.clip(cells, 0, counts - 1).astype(np.int64)
 
 
 def points_of(

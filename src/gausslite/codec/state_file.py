@@ -93,8 +93,7 @@ def read_png(path: Path) -> UInt8[ndarray, "h w 3"]:
     image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
         raise MapFileError(f"{path}: expected a PNG file, got an unreadable one")
-    rgb: UInt8[ndarray, "h w 3"] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-    return rgb
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
 FORMAT = "gausslite-state"

@@ -99,8 +99,7 @@ def _top(rows: Int64[ndarray, " k"], importance: Float32[ndarray, " n"], count: 
         return rows
     if count <= 0:
         return rows[:0]
-    chosen: Int64[ndarray, " c"] = rows[np.argpartition(importance[rows], -count)[-count:]]
-    return chosen
+    return rows[np.argpartition(importance[rows], -count)[-count:]]
 
 
 def move_gaussians(gaussians: Gaussians, T: Float64[ndarray, "4 4"]) -> Gaussians:
@@ -130,5 +129,4 @@ def _quaternion(R: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:
         ]
     )
     _, vectors = np.linalg.eigh(K)
-    quaternion: Float64[ndarray, "4"] = vectors[:, -1]
-    return quaternion
+    return vectors[:, -1]

@@ -234,8 +234,7 @@ class VoxelIndex:
         """Return the sum of the points' values in each voxel."""
         if len(self.starts) == 0:
             return np.zeros(0, np.uint64)
-        sums: UInt64[ndarray, " v"] = np.add.reduceat(values[self.rows], self.starts, dtype=np.uint64)
-        return sums
+        return np.add.reduceat(values[self.rows], self.starts, dtype=np.uint64)
 
     def rows_in(self, selected: Bool[ndarray, " v"]) -> Int64[ndarray, " m"]:
         """Return the indices of the points in the selected voxels, voxel by voxel."""

@@ -108,8 +108,7 @@ def _blur(image: Float64[ndarray, "h w 3"]) -> Float64[ndarray, "h w 3"]:
     import cv2
 
     window = cv2.getGaussianKernel(SSIM_WINDOW_PX, SSIM_SIGMA_PX, cv2.CV_64F)
-    blurred: Float64[ndarray, "h w 3"] = cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
-    return blurred
+    return cv2.sepFilter2D(image, -1, window, window, borderType=cv2.BORDER_CONSTANT)
 
 
 _RED, _GREEN, _BLUE = (np.float32(weight) for weight in (0.299, 0.587, 0.114))

@@ -80,8 +80,7 @@ def outline_roi(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UI
 
 def dim_outside(image: UInt8[ndarray, "h w 3"], roi: Bool[ndarray, "h w"]) -> UInt8[ndarray, "h w 3"]:
     """Return the image with the pixels outside the region dimmed."""
-    dimmed: UInt8[ndarray, "h w 3"] = np.where(roi[..., None], image, image // 4)
-    return dimmed
+    return np.where(roi[..., None], image, image // 4)
 
 
 def components_to_show(roi: Bool[ndarray, "h w"]) -> list[Bool[ndarray, "h w"]]:
@@ -112,10 +111,7 @@ def crop_component(image: UInt8[ndarray, "h w 3"], component: Bool[ndarray, "h w
     crop_height, crop_width = max(1, round(share * height)), max(1, round(share * width))
     y = int(np.clip((top + bottom - crop_height) // 2, 0, height - crop_height))
     x = int(np.clip((left + right - crop_width) // 2, 0, width - crop_width))
-    enlarged: UInt8[ndarray, "h w 3"] = cv2.resize(
-        image[y : y + crop_height, x : x + crop_width], (width, height), interpolation=cv2.INTER_CUBIC
-    )
-    return enlarged
+    return cv2.resize(image[y : y + crop_height, x : x + crop_width], (width, height), interpolation=cv2.INTER_CUBIC)
 
 
 def labelled_image(image: UInt8[ndarray, "h w 3"], label: str) -> UInt8[ndarray, "H W 3"]:

@@ -103,8 +103,7 @@ def seen_through(
 ) -> Bool[ndarray, " n"]:
     """Return the points that these views contradict: enough see through them, and few show a surface there."""
     through, shown = view_counts(points_m, views)
-    contradicted: Bool[ndarray, " n"] = (through >= min_views) & (through >= _MIN_RATIO * shown)
-    return contradicted
+    return (through >= min_views) & (through >= _MIN_RATIO * shown)
 
 
 def guessed_far(points_m: Float32[ndarray, "n 3"], frames: Iterable[Frame]) -> Bool[ndarray, " n"]:

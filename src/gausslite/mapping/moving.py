@@ -62,5 +62,4 @@ def moving_pixels(
     parts, labels, sizes, _ = cv2.connectedComponentsWithStats(opened)
     large = [label for label in range(1, parts) if sizes[label, cv2.CC_STAT_AREA] >= settings.min_part]
     shown = cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((2 * settings.grown + 1,) * 2, np.uint8))
-    moving: Bool[ndarray, "h w"] = np.repeat(np.repeat(shown > 0, step, axis=0), step, axis=1)[:height, :width]
-    return moving
+    return np.repeat(np.repeat(shown > 0, step, axis=0), step, axis=1)[:height, :width]

@@ -86,8 +86,7 @@ def _feature_counts(rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "256"]:
 
 def _colour_thumbnail(rgb: UInt8[ndarray, "h w 3"]) -> UInt8[ndarray, "6 8 3"]:
     small = cv2.resize(rgb, (_COLUMNS, _ROWS), interpolation=cv2.INTER_AREA)
-    lab: UInt8[ndarray, "6 8 3"] = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-    return lab
+    return cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
 
 
 def _depth_thumbnail(depth_m: Float32[ndarray, "h w"]) -> UInt8[ndarray, "6 8"]:
@@ -115,8 +114,7 @@ def _unit_vector(descriptor: PlaceDescriptor) -> Float32[ndarray, "448"]:
         for part, weight in zip((features, lab.ravel(), relative), _WEIGHTS.values(), strict=True)
     ]
     vector = np.concatenate(weighted)
-    unit: Float32[ndarray, "448"] = vector / max(float(np.linalg.norm(vector)), 1e-6)
-    return unit
+    return vector / max(float(np.linalg.norm(vector)), 1e-6)
 
 
 class PlaceIndex(Generic[Key]):

@@ -229,5 +229,4 @@ def _sigmas(found: _Residuals, displaced: _Residuals) -> float:
 
 def _cell_sums(image: Float32[ndarray, "h w"]) -> Float64[ndarray, "ch cw"]:
     rows, columns = (np.arange(0, side, _CELL_PX) for side in image.shape)
-    sums: Float64[ndarray, "ch cw"] = np.add.reduceat(np.add.reduceat(image.astype(np.float64), rows, 0), columns, 1)
-    return sums
+    return np.add.reduceat(np.add.reduceat(image.astype(np.float64), rows, 0), columns, 1)

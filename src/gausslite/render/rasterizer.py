@@ -435,8 +435,7 @@ def rows_to_gaussians(
 def decode_opacities(rows: Float32[ndarray, "n 16"]) -> Float32[ndarray, " n"]:
     """Return the opacities in (0, 1): the sigmoid of the logits."""
     # tanh, unlike exp, cannot overflow
-    opacities: Float32[ndarray, " n"] = 0.5 * (np.tanh(0.5 * rows[:, OPACITY_LOGIT]) + 1.0)
-    return opacities
+    return 0.5 * (np.tanh(0.5 * rows[:, OPACITY_LOGIT]) + 1.0)
 
 
 def allocate_rows(capacity: int) -> Float32[ndarray, "capacity 16"]:

@@ -141,5 +141,4 @@ def _tile_mask(indices: Int[ndarray, "n"], rows: int, columns: int) -> Bool[ndar
 
 def _pixel_mask(tiles: Bool[ndarray, "th tw"], view: BenchView) -> Bool[ndarray, "h w"]:
     height, width = view.depth_m.shape
-    pixels: Bool[ndarray, "h w"] = tiles.repeat(TILE_PX, 0).repeat(TILE_PX, 1)[:height, :width]
-    return pixels
+    return tiles.repeat(TILE_PX, 0).repeat(TILE_PX, 1)[:height, :width]
