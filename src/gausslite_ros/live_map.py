@@ -13,7 +13,7 @@ from numpy import ndarray
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.export.free_space import narrower, points_before_surface
+from gausslite.export.free_space import points_before_surface
 from gausslite.export.occupancy import OccupancySettings, occupied_voxels, planar_grid
 from gausslite.wire.map_follower import FollowedMap
 
@@ -80,7 +80,7 @@ class LiveMap:
         if seen is None:
             return
         frame, T_map_camera = seen
-        camera = narrower(frame.camera, _WIDTH_PX)
+        camera = frame.camera.narrower(_WIDTH_PX)
         size = camera.width_px, camera.height_px
         depth_m = np.minimum(cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST), np.float32(_RANGE_M))
         rays = points_before_surface(camera, depth_m, T_map_camera, self._settings.voxel_m)

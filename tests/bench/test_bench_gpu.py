@@ -22,9 +22,9 @@ import gsplat
 import torch
 
 from gausslite.render.cuda import CudaRasterizer
-from gausslite.render.cuda.gsplat_baseline import GsplatBaseline
 from gausslite.render.cuda.kernels import TorchKernels, project
 from gausslite.render.cuda.tables import DeviceCamera
+from gausslite_bench.raster.gsplat_baseline import GsplatBaseline
 
 torch.set_num_threads(1)
 SIZE = (48, 32)

@@ -179,8 +179,8 @@ async def _serve(settings: AgentSettings) -> int:
         if saved is not None:
             await asyncio.wrap_future(worker.restore(saved))
             resumed, saved = saved.checkpoint, None
-        # only the task of the command line waits for the parser to start
-        cancel = parser.close if isinstance(parser, ParserClient) else _do_nothing
+        # only the task of the command line waits for the parser to start; one of this process answers at once
+        cancel = parser.close if isinstance(parser, ParserClient) else lambda: None
         first_parser = WaitingParser(parser, cancel=cancel)
         # on the page a person can point
         can_find = stream is not None or settings.perception.model is not None or settings.view is not None
@@ -256,10 +256,6 @@ async def _run_mission(mission: _Mission, settings: AgentSettings) -> None:
         mission.stop(settings.link.grace_s)
         await work
         await asyncio.to_thread(mission.mission.finish)
-
-
-def _do_nothing() -> None:
-    """Cancel nothing: a parser of this process answers at once."""
 
 
 def _open_parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:

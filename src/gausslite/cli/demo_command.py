@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
-from types import FrameType
 
 from gausslite.cli.demo_services import (
     HOME_SIZE,
@@ -176,7 +175,7 @@ def configure(parser: CommandParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the services, score the maps, write and print the report. Returns the exit code."""
-    signal.signal(signal.SIGHUP, _raise_interrupt)
+    signal.signal(signal.SIGHUP, signal.default_int_handler)
     _require_valid(options)
     require_name("world-frame", options.world_frame or "")
     if not options.overwrite:
@@ -232,22 +231,17 @@ def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> di
     settings = replace(settings, threads=threads, pose_prior=scenario.pose_prior)
     width, height = scenario.size
     registration, correction = scenario.depth_registration, scenario.camera_correction
+    stated = options.world_frame
     return {
         "size": f"{width}x{height}",
         "voxel-size": options.voxel_size.size_m,
-        "world-frame": _world_frame(options, scenario),
+        "world-frame": default_world_frame(scenario.held_out[0].source) if stated is None else str(stated),
         "test-every": scenario.test_every,
         "register-depth": None if registration is None else str(registration),
         "camera-correction": None if correction.is_identity else str(correction),
         **plain_options(settings),
         **plain_options(build(PerceptionSettings, options).absolute()),
     }
-
-
-def _world_frame(options: argparse.Namespace, scenario: Scenario) -> str:
-    if options.world_frame is not None:
-        return str(options.world_frame)
-    return default_world_frame(scenario.held_out[0].source)
 
 
 def _score(
@@ -267,7 +261,3 @@ def _write_pictures(folder: Path, scores: TeamScores) -> None:
     prepare_folder(folder)
     for name, sheet in scores.sheets.items():
         write_png(folder / f"{name}.png", sheet)
-
-
-def _raise_interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

@@ -40,7 +40,7 @@ from gausslite.evaluation.pictures import render_preview
 from gausslite.evaluation.views import view_map
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
-from gausslite.mission.checkpoint import SavedRun, save_run
+from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.map_diff import Change
 from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import (
@@ -215,8 +215,7 @@ def _map(options: argparse.Namespace) -> int:
         if result.processed > 0 or result.stopped_by is None:
             mapping.write_results(result)
     # an early end keeps the map so far; the exit code reports it
-    mapping.raise_if_stopped(result)
-    mapping.raise_if_unsaved()
+    mapping.raise_if_failed(result)
     if interrupt.pending_exception is not None:
         raise type(interrupt.pending_exception)(f"all frames are mapped, and all files are in {options.out}")
     mapping.print_results(result)
@@ -316,14 +315,11 @@ class _Run:
         if viewer is not None:
             write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
 
-    def raise_if_stopped(self, result: MissionResult) -> None:
-        """Raise the error that ended the run early, or the interrupt with a text on what is kept."""
+    def raise_if_failed(self, result: MissionResult) -> None:
+        """Raise the error that ended the run early, the interrupt with a text on what is kept, or that of saving."""
         if isinstance(result.stopped_by, KeyboardInterrupt):
             raise type(result.stopped_by)(_interrupted_text(self._options, result))
         result.raise_if_stopped()
-
-    def raise_if_unsaved(self) -> None:
-        """Raise the error of saving the state, after the other results were written."""
         if self._save_error is not None:
             raise self._save_error
 
@@ -382,9 +378,9 @@ class _Run:
             extra = {**extra, **self._prior.state()}
         if self._scheduled.graph is not None and self._scheduled.graph.pointed:
             extra = {**extra, _POINTED: encode_text("\n".join(self._scheduled.graph.pointed))}
-        config = replace(self._recorded, schedule=self._scheduled.schedule).resume_config(last_index)
+        fixed = replace(self._recorded, schedule=self._scheduled.schedule).fixed_settings(last_index)
         try:
-            save_run(self._options.save_state, self._mapper, config, last_index, extra)
+            save_run(self._options.save_state, self._mapper, ResumeConfig.of(*fixed), last_index, extra)
         except StorageError as error:
             self._save_error = error  # the map is worth writing nevertheless
 

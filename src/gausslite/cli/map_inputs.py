@@ -8,7 +8,7 @@ from dataclasses import MISSING, dataclass, replace
 from typing import Any
 
 from gausslite.calibration.calibrate import StatedValues
-from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
+from gausslite.cli.source_options import calibrate_with_messages, open_recorded, stated_values
 from gausslite.codec.json import graph_as_json
 from gausslite.config.option import build, option
 from gausslite.config.values import AUTO, NONE
@@ -16,10 +16,9 @@ from gausslite.datasets.open import default_world_frame, open_source
 from gausslite.datasets.source import Source, frame_step
 from gausslite.domain.errors import DatasetError, GaussLiteError, InvalidInputError, PoseError
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
-from gausslite.domain.relevance import Region
 from gausslite.domain.state import get_text
 from gausslite.domain.task import TaskGraph
-from gausslite.mission.checkpoint import ResumeConfig, SavedRun
+from gausslite.mission.checkpoint import SavedRun
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.schedule import TaskSchedule, TaskSwitch
 from gausslite.mission.settings import (
@@ -72,7 +71,8 @@ class MapInputs:
         )
         stream = FrameStream.select(recorded, source)
         source = replace(source, size=f"{stream.size[0]}x{stream.size[1]}")
-        _report_uniform_map(options)
+        if options.policy is None and options.task is None and not has_regions(options):
+            print_message("no --task and no region: mapping everything equally (--policy uniform)")
         perception = build(PerceptionSettings, options).at_rate(mission)
         return cls(mission, perception, source, task, stream, schedule)
 
@@ -112,15 +112,12 @@ class MapInputs:
         if pose_prior == AUTO:
             pose_prior = saved.value(MissionSettings, "pose_prior")
         inputs = self.calibrated(replace(stated_values(registration, correction, pose_prior), checked=True))
-        saved.require(*inputs._fixed_settings(saved.last_index))
+        saved.require(*inputs.fixed_settings(saved.last_index))
         _report_other_step(saved, self.source.frames)
         return inputs
 
-    def resume_config(self, last_index: int) -> ResumeConfig:
+    def fixed_settings(self, last_index: int) -> tuple[Any, ...]:
         """Return the settings that a run must have to continue after this frame."""
-        return ResumeConfig.of(*self._fixed_settings(last_index))
-
-    def _fixed_settings(self, last_index: int) -> tuple[Any, ...]:
         graph = self.schedule.at(last_index)
         task = replace(self.task, task=None if graph is None else graph.text)
         sequence = _Sequence(self.stream.source.world_frame)
@@ -128,9 +125,8 @@ class MapInputs:
 
     def world_frame(self, options: argparse.Namespace) -> str:
         """Return the name of the world frame: that of the options, else the sequence's."""
-        if options.world_frame is not None:
-            return str(options.world_frame)
-        return default_world_frame(self.stream.source)
+        stated = options.world_frame
+        return default_world_frame(self.stream.source) if stated is None else str(stated)
 
     def report(self) -> dict[str, object]:
         """Return the inputs as part of the report."""
@@ -224,12 +220,6 @@ def has_regions(options: argparse.Namespace) -> bool:
     return bool(options.roi is not None or options.objects or options.target_at)
 
 
-def choose_roi(options: argparse.Namespace, source: Source) -> TaskGraph | list[Region]:
-    """Return the task of the options, or the selected regions; no regions for a uniform map."""
-    graph = parse_task(options)
-    return selected_regions(options, source) if graph is None else graph
-
-
 def _report_other_step(saved: SavedRun, frames: str) -> None:
     """Print a message if the saved run took frames with another step."""
     if FRAMES_KEY not in saved.extra:
@@ -242,12 +232,6 @@ def _report_other_step(saved: SavedRun, frames: str) -> None:
 def policy_of(options: argparse.Namespace) -> str:
     """Return the policy that is used without --policy: "task" with a task or a region, else "uniform"."""
     return default_policy(options.task is not None or has_regions(options))
-
-
-def _report_uniform_map(options: argparse.Namespace) -> None:
-    """Print a message if neither a task nor a region nor --policy is given."""
-    if options.policy is None and options.task is None and not has_regions(options):
-        print_message("no --task and no region: mapping everything equally (--policy uniform)")
 
 
 def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSchedule:

@@ -169,7 +169,7 @@ def oriented_box(
     import cv2
 
     means_m, box = gaussians.means_m.astype(np.float64), landmark.extent_m
-    inside = np.all((means_m >= box.min_m) & (means_m <= box.max_m), axis=1)
+    inside = box.contains(means_m)
     points_m = (
         means_m[inside & gaussians.active] if (inside & gaussians.active).sum() >= _MIN_GAUSSIANS else means_m[inside]
     )

@@ -90,6 +90,11 @@ class Camera:
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return Camera(self.fx_px * sx, self.fy_px * sy, self.cx_px * sx, self.cy_px * sy, width_px, height_px)
 
+    def narrower(self, width_px: int) -> Camera:
+        """Return the camera of the same image in a width of at most width_px."""
+        width_px = min(width_px, self.width_px)
+        return self.resized(width_px, max(round(self.height_px * width_px / self.width_px), 1))
+
     def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> Camera:
         """Return the camera for the part of the image of this size that begins at this column and row."""
         return Camera(self.fx_px, self.fy_px, self.cx_px - left_px, self.cy_px - top_px, width_px, height_px)

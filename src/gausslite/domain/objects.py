@@ -11,7 +11,6 @@ from enum import StrEnum
 from importlib import resources
 from typing import Any
 
-import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
@@ -320,7 +319,9 @@ def found_text(
 
     region_means_m: the region's Gaussians; an object without any was seen, but is not what the task means.
     """
-    meant = [found for found in objects if found.role is ObjectRole.TARGET and _holds_any(found, region_means_m)]
+    meant = [
+        found for found in objects if found.role is ObjectRole.TARGET and found.extent_m.contains(region_means_m).any()
+    ]
     parts = []
     for noun in targets:
         centres_m = [found.centroid_m for found in meant if found.noun in (noun, noun_of(noun))]
@@ -328,8 +329,3 @@ def found_text(
         places = f"{', '.join(others)} and {last} m" if others else last and f"{last} m"
         parts.append(f"{noun} at {places}" if places else f"no {noun}")
     return ", ".join(parts)
-
-
-def _holds_any(landmark: ObjectLandmark, points_m: Float32[ndarray, "n 3"]) -> bool:
-    box = landmark.extent_m
-    return bool(np.any(np.all((points_m >= box.min_m) & (points_m <= box.max_m), axis=1)))

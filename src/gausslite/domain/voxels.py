@@ -172,7 +172,7 @@ class AxisAlignedBox:
         if not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
             raise InvalidInputError(f"box: expected finite min <= max, got {self.min_m} and {self.max_m}")
 
-    def contains(self, points_m: Float32[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+    def contains(self, points_m: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Return True for each point in the box or on its faces."""
         low, high = np.array(self.min_m), np.array(self.max_m)
         inside: Bool[ndarray, " n"] = np.logical_and(points_m >= low, points_m <= high).min(axis=1)

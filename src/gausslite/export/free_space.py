@@ -53,18 +53,12 @@ def _carve(
     free: Bool[ndarray, "x y z"], first: Int64[ndarray, "3"], view: KeyframeView, render: Render, voxel_m: float
 ) -> None:
     """Mark the voxels before the surface of one view."""
-    camera = narrower(view.camera, _WIDTH_PX)
+    camera = view.camera.narrower(_WIDTH_PX)
     depth_m = render(camera, view.T_world_camera).expected_depth_m()
     for points_m in points_before_surface(camera, depth_m, view.T_world_camera, voxel_m):
         cells = np.floor(points_m / voxel_m).astype(np.int64) - first
         cells = cells[((cells >= 0) & (cells < free.shape)).all(axis=1)]
         free[tuple(cells.T)] = True
-
-
-def narrower(camera: Camera, width_px: int) -> Camera:
-    """Return the camera of the same image in a width of at most width_px."""
-    width_px = min(width_px, camera.width_px)
-    return camera.resized(width_px, max(1, round(camera.height_px * width_px / camera.width_px)))
 
 
 def points_before_surface(

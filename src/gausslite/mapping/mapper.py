@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
@@ -271,7 +271,7 @@ class GaussianMapper:
 
     def hide(self, moved: Bool[ndarray, "h w"], keyframe: Keyframe, others: Sequence[Frame]) -> None:
         """Take pixels of a keyframe out of training, and remove their Gaussians that the other frames contradict."""
-        self._remove(left_behind(self._table.means_m, keyframe.frame, moved, others))
+        self._table.remove(left_behind(self._table.means_m, keyframe.frame, moved, others))
         recorded = None if keyframe.recorded is None else self.without(moved, keyframe.recorded)
         hidden = replace(
             keyframe,
@@ -422,13 +422,7 @@ class GaussianMapper:
         """Set the active flags of what a keyframe shows, and remove the Gaussians that the keyframes see through."""
         update_roi_evidence(self._table, keyframe.frame, keyframe.relevance)
         frames = (earlier.frame for earlier in self._keyframes.buffer)
-        self._remove(contradicted_rows(self._table.means_m, keyframe.frame, frames))
-
-    def _remove(self, rows: Int64[ndarray, " m"]) -> None:
-        if len(rows):
-            keep = np.ones(self._table.count, np.bool_)
-            keep[rows] = False
-            self._table.keep(keep)
+        self._table.remove(contradicted_rows(self._table.means_m, keyframe.frame, frames))
 
     def _insert(self, seeds: Seeds) -> int:
         """Add seeds within the cap; return how many."""

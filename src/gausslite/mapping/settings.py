@@ -258,11 +258,9 @@ class DensitySettings:
 
     def __post_init__(self) -> None:
         for name in ("densify_every", "prune_every"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"density {name}: expected at least 1 iteration, got {getattr(self, name)}")
+            _require(getattr(self, name) >= 1, f"density {name}", "at least 1 iteration", getattr(self, name))
         for name in ("min_mean_gradient", "percent_dense", "max_growth", "min_opacity"):
-            if not getattr(self, name) >= 0:
-                raise InvalidInputError(f"density {name}: expected at least 0, got {getattr(self, name)}")
+            _require(getattr(self, name) >= 0, f"density {name}", "at least 0", getattr(self, name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,10 +273,8 @@ class TaskChangeSettings:
     keyframes_per_frame: int = 3
 
     def __post_init__(self) -> None:
-        if self.keyframes_per_frame < 1:
-            raise InvalidInputError(
-                f"task change keyframes_per_frame: expected at least 1, got {self.keyframes_per_frame}"
-            )
+        count = self.keyframes_per_frame
+        _require(count >= 1, "task change keyframes_per_frame", "at least 1", count)
 
 
 @dataclass(frozen=True, slots=True)

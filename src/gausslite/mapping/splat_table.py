@@ -229,6 +229,13 @@ class SplatTable:
             column[vacant] = column[moved]
         self._count = kept
 
+    def remove(self, rows: Int[ndarray, " m"]) -> None:
+        """Remove the Gaussians of these rows."""
+        if len(rows):
+            mask = np.ones(self._count, np.bool_)
+            mask[rows] = False
+            self.keep(mask)
+
     def state(self) -> State:
         """Return all columns, as views."""
         return {name: getattr(self, name) for name in _COLUMNS}

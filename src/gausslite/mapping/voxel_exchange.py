@@ -118,10 +118,7 @@ def insert_team_voxels(table: SplatTable, received: VoxelBatch, grid: VoxelGrid)
     chosen = select_voxels(received, wins & _fits(received, wins, local_counts, table.free_slots))
     replaced = np.isin(local.keys, chosen.keys)
     rows = local.rows_in(replaced)
-    if len(rows):
-        keep = np.ones(table.count, np.bool_)
-        keep[rows] = False
-        table.keep(keep)
+    table.remove(rows)
     table.append(chosen.gaussians)
     return InsertedVoxels(chosen, len(rows))
 

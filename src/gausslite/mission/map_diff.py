@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
@@ -101,7 +101,7 @@ class Visit:
     def points_of(self, landmark: ObjectLandmark) -> Float32[ndarray, "n 3"]:
         """Return the means of the task's region in an object's box, or of all Gaussians there if it has none."""
         gaussians = self.opaque
-        inside = _inside(gaussians.means_m, landmark.extent_m)
+        inside = landmark.extent_m.contains(gaussians.means_m)
         of_region = inside & gaussians.active
         chosen = of_region if np.count_nonzero(of_region) >= _MIN_POINTS else inside
         points_m: Float32[ndarray, "n 3"] = gaussians.means_m[chosen]
@@ -194,11 +194,6 @@ def _is_of(change: Change, landmark: ObjectLandmark) -> bool:
     return landmark.noun == change.noun and landmark.centroid_m in (change.before_m, change.after_m)
 
 
-def _inside(points_m: Float32[ndarray, "n 3"], box: AxisAlignedBox) -> Bool[ndarray, " n"]:
-    inside: Bool[ndarray, " n"] = np.all((points_m >= box.min_m) & (points_m <= box.max_m), axis=1)
-    return inside
-
-
 def _empty_share(points_m: Float32[ndarray, "n 3"], views: Sequence[DepthView]) -> float:
     """Return the share of the points that views see through, of those that they tell about; 0 if these are few."""
     through = seen_through(points_m, views)
@@ -246,7 +241,7 @@ def _surfaces(visit: Visit, views: Sequence[DepthView], explained: Sequence[Axis
     points_m, rgb = visit.opaque.means_m, visit.opaque.rgb
     free = seen_through(points_m, views)
     for box in explained:
-        free &= ~_inside(points_m, box)
+        free &= ~box.contains(points_m)
     points_m, rgb = points_m[free], rgb[free]
     for rows in _connected(points_m):
         cluster = _Cluster(points_m[rows], rgb[rows].mean(axis=0).astype(np.float64))

@@ -202,10 +202,6 @@ class MissionResult:
         }
 
 
-def _ignore(outcome: FrameOutcome) -> None:
-    del outcome
-
-
 @dataclass(frozen=True, slots=True)
 class MissionRunner:
     """Pass frames to a processing step, one after the other.
@@ -217,7 +213,7 @@ class MissionRunner:
     """
 
     process: Callable[[Frame], FrameOutcome | None]
-    on_frame: Callable[[FrameOutcome], None] = _ignore
+    on_frame: Callable[[FrameOutcome], None] = lambda _outcome: None
     checkpoint: Callable[[int], None] | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
 

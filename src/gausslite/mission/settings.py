@@ -26,7 +26,6 @@ from gausslite.config.values import (
     write_target_points,
 )
 from gausslite.datasets.source import Source
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import meant_by
 from gausslite.domain.pose import UpAxis, require_up_axis
 from gausslite.domain.recording import TRACKED_PRIOR, CameraCorrection, DepthRegistration, PoseExposurePrior
@@ -75,12 +74,6 @@ _DISABLE_HELP = (
     "optimisation), roi (ROI optimisation), sis (stratified initial scaling), gfd (gradient-focused densification), "
     f"{', '.join(EXTENSION_FLAGS)}"
 )
-
-
-def require_rate(rate_hz: float) -> None:
-    """Raise InvalidInputError if the frame rate is outside 0.01 to 1000 Hz."""
-    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
-        raise InvalidInputError(f"rate: expected {MIN_RATE_HZ} to {MAX_RATE_HZ:g} Hz, got {rate_hz}")
 
 
 def default_policy(has_roi: bool) -> str:

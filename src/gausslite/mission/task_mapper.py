@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -52,10 +52,10 @@ class FrameOutcome:
     gaussians: int
     roi_share: float
     timing: FrameTiming
-    skipped: str | None
-    changed_roi: VoxelBatch | None
-    detection_lag_frames: int | None
-    reevaluation: Reevaluation
+    skipped: str | None = None
+    changed_roi: VoxelBatch | None = None
+    detection_lag_frames: int | None = None
+    reevaluation: Reevaluation = field(default_factory=Reevaluation)
 
 
 class TaskMapper:
@@ -221,7 +221,7 @@ class TaskMapper:
         self._scheduler.begin(waited_s)
         odometry, tracked = frame, self._track(frame)
         if tracked is None:
-            return self._lost(frame)
+            return FrameOutcome(frame.index, 0, self._mapper.count, 0.0, self._scheduler.end(), TRACKING_LOST)
         frame = tracked if self._tracker is not None else self._mapper.corrected(frame)
         frame = self._without_moving(frame)
         view = self._render(frame)
@@ -287,20 +287,6 @@ class TaskMapper:
                 self._mapper.hide(moved, keyframes[chosen], [*frames[:chosen], *later])
         moving = moving_pixels(frame, frames)
         return self._mapper.without(moving, frame) if moving.any() else frame
-
-    def _lost(self, frame: Frame) -> FrameOutcome:
-        """Return the outcome of a frame without a pose."""
-        return FrameOutcome(
-            index=frame.index,
-            iterations=0,
-            gaussians=self._mapper.count,
-            roi_share=0.0,
-            timing=self._scheduler.end(),
-            skipped=TRACKING_LOST,
-            changed_roi=None,
-            detection_lag_frames=None,
-            reevaluation=Reevaluation(0, 0),
-        )
 
     def _render(self, frame: Frame) -> RenderedView | None:
         """Render the map from the frame's pose, for the depth of the relevance estimate and for seeding."""

@@ -158,8 +158,7 @@ class PlaceMap:
 
 def rendered_frame(render: RenderMap, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> Frame:
     """Return what a camera of at most 320 pixels would record of a map; depth 0 where the map is not opaque."""
-    width = min(_WIDTH_PX, camera.width_px)
-    camera = camera.resized(width, max(round(camera.height_px * width / camera.width_px), 1))
+    camera = camera.narrower(_WIDTH_PX)
     rendering = render(camera, T_world_camera, None)
     rgb = np.rint(255.0 * np.clip(rendering.rgb, 0.0, 1.0)).astype(np.uint8)
     return Frame(0, 0, rgb, rendering.expected_depth_m(OPAQUE_ALPHA), camera, T_world_camera)

@@ -152,11 +152,10 @@ def verify(render: RenderMap, frame: Frame, T_world_camera: Float64[ndarray, "4 
 
 def reduced(frame: Frame, width_px: int = _WIDTH_PX) -> Frame:
     """Return the frame at most this wide, with the camera at rest."""
-    width = min(width_px, frame.camera.width_px)
-    height = max(round(frame.camera.height_px * width / frame.camera.width_px), 1)
-    rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
-    depth_m = cv2.resize(frame.depth_m, (width, height), interpolation=cv2.INTER_NEAREST)
-    camera = frame.camera.resized(width, height)
+    camera = frame.camera.narrower(width_px)
+    size = camera.width_px, camera.height_px
+    rgb = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+    depth_m = cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST)
     return replace(frame, rgb=rgb, depth_m=depth_m, camera=camera, motion=None, recorded_rgb=None)
 
 

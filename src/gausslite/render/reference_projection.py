@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -143,27 +143,11 @@ class Ellipses:
     def detached(self) -> Ellipses:
         """Return the same ellipses as leaves of a new graph."""
         means_px, conics, opacities, rgb, z_m = (column.detach().requires_grad_() for column in self.differentiable)
-        return Ellipses(
-            row_ids=self.row_ids,
-            means_px=means_px,
-            conics=conics,
-            opacities=opacities,
-            rgb=rgb,
-            z_m=z_m,
-            half_box_px=self.half_box_px,
-        )
+        return replace(self, means_px=means_px, conics=conics, opacities=opacities, rgb=rgb, z_m=z_m)
 
     def take(self, chosen: Tensor) -> Ellipses:
         """Return the ellipses at these positions, or where this mask is True, in the same order."""
-        return Ellipses(
-            row_ids=self.row_ids[chosen],
-            means_px=self.means_px[chosen],
-            conics=self.conics[chosen],
-            opacities=self.opacities[chosen],
-            rgb=self.rgb[chosen],
-            z_m=self.z_m[chosen],
-            half_box_px=self.half_box_px[chosen],
-        )
+        return Ellipses(*(getattr(self, column.name)[chosen] for column in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

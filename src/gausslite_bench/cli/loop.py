@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from gausslite.cli.map_inputs import choose_roi, mission_settings
+from gausslite.cli.map_inputs import mission_settings, parse_task
 from gausslite.cli.progress import MappingBar
 from gausslite.cli.source_options import (
     RecordingOptions,
@@ -20,7 +20,6 @@ from gausslite.config.option import build, option
 from gausslite.config.program import Program
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
@@ -150,12 +149,12 @@ def _memory_line(memory: MemoryTrend) -> str:
 
 def _estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimator:
     """Return the relevance estimator of the options: for a task, for regions, or for a uniform map."""
-    roi = choose_roi(options, source)
-    if not isinstance(roi, TaskGraph):
-        return region_estimator(roi)
+    graph = parse_task(options)
+    if graph is None:
+        return region_estimator(selected_regions(options, source))
     return EstimatorFactory(
         build(PerceptionSettings, options).at_rate(mission_settings(options)), lambda: SceneInfo.of(source)
-    ).build(roi)
+    ).build(graph)
 
 
 def _run_mapping(

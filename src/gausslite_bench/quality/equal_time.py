@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gausslite.mission.results import write_json
-from gausslite.mission.settings import require_rate
+from gausslite.mission.settings import MAX_RATE_HZ, MIN_RATE_HZ
 from gausslite_bench.quality.scenes import Scene, UnseenRegionError
 from gausslite_bench.quality.study import Study
 from gausslite_bench.quality.trials import BudgetMode, Trial, TrialBudget, Variant, build_map
@@ -45,8 +45,8 @@ def load_rate(path: Path, trials: Sequence[Trial]) -> float | None:
         rate_hz = float(record["rate_hz"]) if record["trial"] in {trial.key for trial in trials} else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    if rate_hz is not None:
-        require_rate(rate_hz)
+    if rate_hz is not None and not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+        raise InvalidInputError(f"rate: expected {MIN_RATE_HZ} to {MAX_RATE_HZ:g} Hz, got {rate_hz}")
     return rate_hz
 
 

@@ -27,8 +27,8 @@ from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, ZERO_LE
 
 if TYPE_CHECKING:
     from gausslite.render.cuda import CudaRasterizer
-    from gausslite.render.cuda.gsplat_baseline import Rasterization
     from gausslite.render.cuda.loss import CudaView
+    from gausslite_bench.raster.gsplat_baseline import Rasterization
 
 GPU_GAUSSIANS = (100_000, 300_000, 1_000_000, 3_000_000)
 FRAME_GAUSSIANS = 1_000_000
@@ -131,7 +131,7 @@ class GpuBench:
         )
 
     def _gsplat_baseline(self, count: int, view: BenchView, own: _OwnSteps) -> Callable[[int], float]:
-        from gausslite.render.cuda.gsplat_baseline import GsplatBaseline, load_gsplat_rasterization
+        from gausslite_bench.raster.gsplat_baseline import GsplatBaseline, load_gsplat_rasterization
 
         rasterization = self.rasterization or load_gsplat_rasterization()
         return GsplatBaseline(seed_rows(count), own.view, view.T_camera_world, _LOSS, rasterization).train
