@@ -186,10 +186,7 @@ class Twist:
 
     def motion(self, seconds: float) -> Float64[ndarray, "4 4"]:
         """Return T_before_after of this motion for a time, to first order in the translation."""
-        T = np.eye(4)
-        T[:3, :3] = cv2.Rodrigues(self.angular_rad_s * seconds)[0]
-        T[:3, 3] = self.linear_m_s * seconds
-        return T
+        return transform_of(seconds * np.concatenate([self.linear_m_s, self.angular_rad_s]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

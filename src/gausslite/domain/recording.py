@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.domain.camera import MAX_EXPOSURE_S, MAX_READOUT_S, Camera, FileIntrinsics, Lens
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.pose import transform_of
 
 _MAX_TIME_OFFSET_S = 1.0
 _NAMES = ("lens", "readout", "offset", "exposure")
@@ -133,10 +133,7 @@ class DepthRegistration:
 
     def extrinsics(self) -> Float64[ndarray, "4 4"]:
         """Return T_colour_depth: p_colour = T_colour_depth @ p_depth."""
-        T = np.eye(4)
-        T[:3, :3] = cv2.Rodrigues(np.radians(self.rotation_deg))[0]
-        T[:3, 3] = self.offset_m
-        return T
+        return transform_of(np.concatenate([self.offset_m, np.radians(self.rotation_deg)]))
 
     def scaled(self, x_factor: float, y_factor: float) -> DepthRegistration:
         """Return the registration for images larger by these factors."""
