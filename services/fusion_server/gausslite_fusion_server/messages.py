@@ -65,7 +65,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     region_from_png(message.region_png, frame.camera)
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
-    engine.add_keyframe(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])
+    engine.add_keyframe(request.session_id, keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])
 
 
 def select_map(engine: FusionEngine, request: pb.ExportFusedMapRequest) -> VoxelBatch:

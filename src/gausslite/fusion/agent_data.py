@@ -103,10 +103,10 @@ class AgentData:
         return True
 
     def _remove(self, name: str) -> None:
-        keys = np.union1d(self._store.remove_agent(name), self._votes.remove_agent(name))
-        self._maps.record(name, keys)
+        # the store last: a part waits for the end of what it writes
         for part in self._parts:
             part.remove_agent(name)
+        self._maps.record(name, np.union1d(self._store.remove_agent(name), self._votes.remove_agent(name)))
 
     def _alignment_of_earlier(self, agent_id: str) -> FrameAlignment:
         own = self._alignments.get(agent_id)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from threading import RLock
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import MismatchError
+from gausslite.domain.errors import MismatchError, SessionUnknownError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
@@ -146,7 +147,7 @@ class FusionEngine:
             session = self._members.open_session(agent_id, token)
             if fresh_map:
                 self._agents.begin_new_map(agent_id)
-                self._members.sessions.save_token(agent_id, token)
+                self._members.sessions.save(session, token)
             self._checks.record_join(agent_id)
             return JoinResult(
                 session,
@@ -259,12 +260,12 @@ class FusionEngine:
         if is_new:
             self._apply_frame(agent_id)
 
-    def add_keyframe(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
+    def add_keyframe(self, session_id: str, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store a keyframe for the refinement; the agent's others that are not `selected` are deleted.
 
-        An empty `selected` deletes none. Raises QuotaError, StorageError.
+        An empty `selected` deletes none. Raises SessionUnknownError, QuotaError, StorageError.
         """
-        self._keyframes.add(keyframe, selected)
+        self._keyframes.add(keyframe, selected, partial(self._require_open, session_id))
 
     def encoded_keyframe(self, agent_id: str, index: int | None = None) -> tuple[bytes, tuple[int, ...]]:
         """Return a keyframe of the agent (see KeyframePool.find) and the indices of all. Raises InvalidInputError."""
@@ -272,8 +273,12 @@ class FusionEngine:
 
     def report_objects(self, session_id: str, report: ObjectReport) -> None:
         """Replace the agent's task graph and objects. Raises SessionUnknownError, MismatchError, StorageError."""
-        with self._lock:
-            self._objects.report(self._members.sessions.get(session_id).agent_id, report)
+        self._objects.report(self.session(session_id).agent_id, report, partial(self._require_open, session_id))
+
+    def _require_open(self, session_id: str) -> None:
+        """Raise SessionUnknownError for a session that has ended; without the lock, which who ended it may hold."""
+        if self.known_session(session_id) is None:
+            raise SessionUnknownError("session: has ended; join again")
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
@@ -312,9 +317,10 @@ class FusionEngine:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
         with self._committer.committing, self._lock:
             agent_id = self._members.sessions.get(session_id).agent_id
+            # first, so that nothing follows what is deleted
+            self._members.sessions.end_agent(agent_id)
             if forget:
                 self._agents.remove(agent_id)
-            self._members.sessions.end_agent(agent_id)
             return self.maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:

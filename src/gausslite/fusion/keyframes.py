@@ -64,20 +64,26 @@ class KeyframePool:
         self._store, self._quotas, self._decode = store, quotas, decode
         # held by changes; they replace an agent's keyframes as a whole
         self._changing = Lock()
+        store.remove_unfinished_keyframes()
         self._stored = _in_order(store.keyframe_sizes(), store.records(ORDER_RECORD))
 
     def __len__(self) -> int:
-        return sum(len(stored) for stored in self._stored.values())
+        return sum(map(len, list(self._stored.values())))
 
-    def add(self, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
+    def add(
+        self, keyframe: EncodedKeyframe, selected: Collection[int] = (), require: Callable[[], object] = lambda: None
+    ) -> None:
         """Store the keyframe; delete the agent's keyframes that are not selected, and its oldest above the limits.
 
-        An empty `selected` deletes none. Raises QuotaError if this keyframe alone exceeds a limit, StorageError.
+        An empty `selected` deletes none. require: raises if the agent has left meanwhile. Raises QuotaError if this
+        keyframe alone exceeds a limit, StorageError.
         """
         self._quotas.require_keyframe(keyframe.index, keyframe.pixels, len(keyframe.data))
         with self._changing:
+            # from here on, `remove_agent` waits
+            stored = dict(self._stored.setdefault(keyframe.agent_id, {}))
+            require()
             self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data)
-            stored = dict(self._stored.get(keyframe.agent_id, {}))
             before = stored.get(keyframe.index)
             if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
                 del stored[keyframe.index]
@@ -113,9 +119,10 @@ class KeyframePool:
         return self._store.keyframe(agent_id, newest if index is None else index)
 
     def remove_agent(self, agent_id: str) -> None:
-        """Delete an agent's keyframes."""
-        with self._changing:
-            self._store.remove_keyframes(agent_id, sorted(self._stored.pop(agent_id, ())))
+        """Delete an agent's keyframes, also the one that is being written."""
+        if agent_id in self._stored:
+            with self._changing:
+                self._store.remove_keyframes(agent_id, sorted(self._stored.pop(agent_id, ())))
 
     def _newest_within_limits(self, stored: dict[int, _Stored]) -> dict[int, _Stored]:
         """Return the keyframes received last that are within the limits together, in their order."""

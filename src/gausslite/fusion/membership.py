@@ -107,8 +107,7 @@ class SessionRegistry:
         self.require_free(agent_id, token)
         is_holder = self._is_holder(agent_id, token)
         session = SessionRecord(secrets.token_hex(16), agent_id)
-        self.save_token(agent_id, token)
-        self._store.save_session(session)
+        self.save(session, token)
         for replaced in self._sessions_of(agent_id):
             del self._sessions[replaced]
             self._replaced.append((replaced, is_holder))
@@ -116,10 +115,11 @@ class SessionRegistry:
         self._renew(agent_id)
         return session
 
-    def save_token(self, agent_id: str, token: str) -> None:
-        """Store the token of an agent's session, also after its other records were deleted. Raises StorageError."""
-        self._store.save_record(agent_id, TOKEN_RECORD, _hash(token))
-        self._token_hashes[agent_id] = _hash(token)
+    def save(self, session: SessionRecord, token: str) -> None:
+        """Store a session and its token, also again after the agent's records were deleted. Raises StorageError."""
+        self._store.save_record(session.agent_id, TOKEN_RECORD, _hash(token))
+        self._store.save_session(session)
+        self._token_hashes[session.agent_id] = _hash(token)
 
     def known(self, session_id: str) -> SessionRecord | None:
         """Return the session if it was opened here, and renew its lease, or if it was found in the store before.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
 
@@ -226,7 +226,7 @@ RECORD = "objects"
 
 
 class TeamObjects:
-    """Keeps each agent's report in the store. FusionEngine holds a lock while a report changes.
+    """Keeps each agent's report in the store. Thread-safe: a change waits for the disk, other questions do not.
 
     Where servers share the store, each of them writes the reports that it receives and reads them when it is asked.
     Raises CodecError if a stored report is damaged.
@@ -234,15 +234,18 @@ class TeamObjects:
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
+        self._changing = Lock()
         self._encoded: dict[str, bytes] = {}
         self._reports: dict[str, ObjectReport] = {}
         self._read()
 
-    def report(self, agent_id: str, report: ObjectReport) -> None:
-        """Replace the agent's report. Raises StorageError."""
+    def report(self, agent_id: str, report: ObjectReport, require: Callable[[], object] = lambda: None) -> None:
+        """Replace the agent's report. require: raises if the agent has left meanwhile. Raises StorageError."""
         encoded = encode_object_report(report)
-        self._store.save_record(agent_id, RECORD, encoded)
-        self._encoded[agent_id], self._reports[agent_id] = encoded, report
+        with self._changing:
+            require()
+            self._store.save_record(agent_id, RECORD, encoded)
+            self._encoded[agent_id], self._reports[agent_id] = encoded, report
 
     def of_task(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
@@ -251,13 +254,15 @@ class TeamObjects:
 
     def remove_agent(self, agent_id: str) -> None:
         """Forget the agent's report; the store deletes it with the agent's updates."""
-        self._encoded.pop(agent_id, None)
-        self._reports.pop(agent_id, None)
+        with self._changing:
+            self._encoded.pop(agent_id, None)
+            self._reports.pop(agent_id, None)
 
     def reports(self) -> dict[str, ObjectReport]:
         """Return the latest report of each agent, the same object as before if it has not changed."""
         if self._store.is_shared:
-            self._read()
+            with self._changing:
+                self._read()
         return dict(self._reports)
 
     def _read(self) -> None:

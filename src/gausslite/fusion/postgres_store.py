@@ -17,30 +17,20 @@ import psycopg
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
 from gausslite.fusion.regions import ALL_SLOTS, OwnedSlots, slots_of
-from gausslite.fusion.store import Execute, FusionStore
+from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.store_rows import SLOT_BITS, LogChange, require_intact
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 LOCK = 0x47534C54  # "GSLT"; the database's other programs use other numbers
-_SCHEMA = """
+_SCHEMA = f"""
 CREATE SCHEMA gausslite;
-CREATE TABLE gausslite.voxel_updates (
+CREATE TABLE voxel_updates (
     slot SMALLINT NOT NULL, number BIGINT NOT NULL, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL,
     voxels BYTEA NOT NULL, PRIMARY KEY (slot, number));
-ALTER TABLE gausslite.voxel_updates ALTER COLUMN voxels SET STORAGE EXTERNAL;
-CREATE TABLE gausslite.servers (pid INTEGER PRIMARY KEY, address TEXT NOT NULL);
-CREATE TABLE gausslite.sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
-CREATE TABLE gausslite.keyframes (
-    agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, part INTEGER NOT NULL, parts INTEGER NOT NULL,
-    checksum BIGINT NOT NULL, data BYTEA NOT NULL, PRIMARY KEY (agent_id, frame_index, part));
-CREATE TABLE gausslite.records (
-    name TEXT NOT NULL, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
-    PRIMARY KEY (name, agent_id));
-CREATE TABLE gausslite.properties (name TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE gausslite.mission_config (
-    number INTEGER PRIMARY KEY CHECK (number = 1),
-    mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m DOUBLE PRECISION NOT NULL);
-ALTER TABLE gausslite.keyframes ALTER COLUMN data SET STORAGE EXTERNAL;
+ALTER TABLE voxel_updates ALTER COLUMN voxels SET STORAGE EXTERNAL;
+CREATE TABLE servers (pid INTEGER PRIMARY KEY, address TEXT NOT NULL);
+{TABLES}
+ALTER TABLE keyframes ALTER COLUMN data SET STORAGE EXTERNAL;
 """
 # one statement a slot, with its rows as arrays: a statement a row takes 1.5 to 2 times as long
 _INSERT = """
@@ -77,8 +67,6 @@ class PostgresStore(FusionStore):
     It raises InvalidInputError for an address that cannot be read, StorageError if the database cannot be reached, is
     in use by another server, is damaged, or has another schema.
     """
-
-    _config_key = "number"
 
     def __init__(self, url: str, owned: OwnedSlots | None = None, write_owned: Write | None = None) -> None:
         """write_owned: for a store of `owned` slots."""
@@ -153,31 +141,28 @@ class PostgresStore(FusionStore):
     def _is_home(self, agent_id: str) -> bool:
         return self._owned is None or self._owned.is_home(agent_id)
 
-    def _write_change(self, change: LogChange) -> None:
-        def write(db: Database) -> None:
-            for slot, numbers in _by_slot(change.deleted):
-                db.execute(_DELETE, (slot, numbers))
-            for slot, rows in itertools.groupby(sorted(change.rows), key=lambda row: row[0] >> SLOT_BITS):
-                db.execute(_INSERT, (slot, *map(list, zip(*rows, strict=True))))
-
-        self._commit(write)
+    def _write_change(self, change: LogChange, execute: Execute) -> None:
+        self._delete_rows(execute, change.deleted)
+        for slot, rows in itertools.groupby(sorted(change.rows), key=lambda row: row[0] >> SLOT_BITS):
+            execute(_INSERT, (slot, *map(list, zip(*rows, strict=True))))
 
     def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
         for slot, own in _by_slot(numbers):
             execute(_DELETE, (slot, own))
 
     def _write(self, work: Callable[[Execute], object]) -> None:
-        self._commit(lambda db: work(lambda query, values: db.execute(_translated(query), values)))
-
-    def _commit(self, work: Callable[[Database], object]) -> None:
         """Do the work in one transaction, without waiting for the answer to each statement. Raises StorageError."""
+
+        def execute_in(db: Database) -> None:
+            work(lambda query, values: db.execute(_translated(query), values))
+
         if self._write_owned is not None:
-            self._write_owned(work)
+            self._write_owned(execute_in)
             return
 
         def commit(db: Database) -> None:
             with db.pipeline(), db.transaction():
-                work(db)
+                execute_in(db)
                 db.execute(_SET_PROPERTY, ("position", _position(self._opening, self._commits + 1)))
             self._commits += 1
 

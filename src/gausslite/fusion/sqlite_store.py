@@ -14,11 +14,11 @@ from threading import Event, RLock, Thread
 from typing import Any
 
 from gausslite.domain.errors import StorageError
-from gausslite.fusion.store import Execute, FusionStore
+from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.store_rows import LogChange, require_intact
 
 _IN_MEMORY = Path(":memory:")
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 PAGE_BYTES = 4096
 RESTORE_ADVICE = (
     "restore a backup (gausslite-fusion-server restore BACKUP STORE), or delete the damaged rows "
@@ -28,20 +28,10 @@ _APPLICATION_ID = 0x47534C54  # "GSLT", to recognise other programs' databases
 _CHECKPOINT_PERIOD_S, _FREE_ROUNDS = 4.0, 3
 # 256 MiB: only where the checkpoints in the background do not keep up
 _CHECKPOINT_PAGES = 65536
-_SCHEMA = """
+_SCHEMA = f"""
 CREATE TABLE voxel_updates (
     number INTEGER PRIMARY KEY, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, voxels BLOB NOT NULL);
-CREATE TABLE sessions (session_id TEXT PRIMARY KEY, agent_id TEXT NOT NULL UNIQUE);
-CREATE TABLE keyframes (
-    agent_id TEXT NOT NULL, frame_index INTEGER NOT NULL, part INTEGER NOT NULL, parts INTEGER NOT NULL,
-    checksum INTEGER NOT NULL, data BLOB NOT NULL, PRIMARY KEY (agent_id, frame_index, part));
-CREATE TABLE records (
-    name TEXT NOT NULL, agent_id TEXT NOT NULL, checksum INTEGER NOT NULL, data BLOB NOT NULL,
-    PRIMARY KEY (name, agent_id));
-CREATE TABLE properties (name TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE mission_config (
-    only INTEGER PRIMARY KEY CHECK (only = 1),
-    mission_id TEXT NOT NULL, world_frame TEXT NOT NULL, voxel_size_m REAL NOT NULL);
+{TABLES}
 """
 
 
@@ -223,8 +213,6 @@ class SqliteStore(FusionStore):
     has another schema.
     """
 
-    _config_key = "only"
-
     def __init__(self, path: Path, max_bytes: int | None = None) -> None:
         super().__init__()
         self._path, self._read_lock = path, RLock()
@@ -266,36 +254,31 @@ class SqliteStore(FusionStore):
     def _damaged(self, what: str) -> StorageError:
         return StorageError(f"store {self._path}: {what} is damaged (its checksum does not match); {RESTORE_ADVICE}")
 
-    def _write_change(self, change: LogChange) -> None:
-        with self._transaction() as db:
-            db.executemany(_DELETE, ((number,) for number in change.deleted))
-            db.executemany(_INSERT, change.rows)
+    def _write_change(self, change: LogChange, execute: Execute) -> None:
+        self._delete_rows(execute, change.deleted)
+        for row in change.rows:
+            execute(_INSERT, row)
 
     def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
         for number in numbers:
             execute(_DELETE, (number,))
 
-    def _write(self, work: Callable[[Execute], object]) -> None:
-        with self._transaction() as db:
-            work(db.execute)
-
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._read_lock, storage_errors(self._path):
             return self._reader.execute(query, values).fetchall()
 
-    @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
+    def _write(self, work: Callable[[Execute], object]) -> None:
         with self._write_lock, storage_errors(self._path):
             self._writer.execute("BEGIN IMMEDIATE")
             try:
-                yield self._writer
+                work(self._writer.execute)
                 self._writer.execute("COMMIT")
-                if self._checkpoints is not None:
-                    self._checkpoints.note_commit()
             except BaseException:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
                 raise
+            if self._checkpoints is not None:
+                self._checkpoints.note_commit()
 
 
 class MemoryStore(SqliteStore):

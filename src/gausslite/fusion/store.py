@@ -8,9 +8,12 @@ still arrive.
 
 from __future__ import annotations
 
+import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import astuple
 from functools import partial
 from threading import RLock
 from typing import Any
@@ -36,12 +39,30 @@ from gausslite.fusion.store_values import (
 
 Execute = Callable[[str, tuple[Any, ...]], object]
 """Executes a statement, with ? for each value, in the transaction that is open."""
-_PART_BYTES = 1 << 19
-_DELETE_KEYFRAME = "DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?"
-_SELECT_SIZES = """
-SELECT agent_id, frame_index, sum(length(data)) FROM keyframes GROUP BY agent_id, frame_index
-HAVING count(*) = max(parts)
+TABLES = """
+CREATE TABLE keyframes (
+    agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, part INTEGER NOT NULL, parts INTEGER NOT NULL,
+    checksum BIGINT NOT NULL, data BYTEA NOT NULL, PRIMARY KEY (agent_id, frame_index, part));
+CREATE TABLE records (
+    name TEXT NOT NULL, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
+    PRIMARY KEY (name, agent_id));
+CREATE TABLE properties (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 """
+"""Those that SQLite and PostgreSQL have in common; SQLite takes any name of a type."""
+_PART_BYTES = 1 << 19
+_INSERT_PART = "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?)"
+_DELETE_KEYFRAME = "DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?"
+_SELECT_SIZES = "SELECT agent_id, frame_index, sum(length(data)) FROM keyframes WHERE part >= 0 GROUP BY 1, 2"
+SELECT_PARTS = "SELECT part, parts, checksum, data, agent_id, frame_index FROM keyframes WHERE part >= 0"
+"""PartRows; while a keyframe is written, its parts are -1, -2, -3 ..."""
+PartRow = tuple[int, int, int, bytes, str, int]
+_SAVE_RECORD = """
+INSERT INTO records VALUES (?, ?, ?, ?)
+ON CONFLICT (name, agent_id) DO UPDATE SET checksum = excluded.checksum, data = excluded.data
+"""
+_SELECT_RECORDS = "SELECT agent_id, data, checksum FROM records WHERE name = ?"
+# no agent can have an empty id
+_MISSION_CONFIG, _SESSION = ("", "mission-config"), "session"
 
 
 class FusionStore(ABC):
@@ -58,8 +79,6 @@ class FusionStore(ABC):
 
     is_shared = False
     """Whether other servers have parts of it."""
-    _config_key: str
-    """The column of mission_config that has the value 1 in its only row."""
 
     def __init__(self, slots_of: SlotsOf = np.zeros_like) -> None:
         self._write_lock, self._index_lock = RLock(), RLock()
@@ -82,7 +101,7 @@ class FusionStore(ABC):
         with self._write_lock:
             change = self._log.plan(updates, self._read_rows)
             if change.rows:
-                self._write_change(change)
+                self._write(partial(self._write_change, change))
                 with self._index_lock:
                     self._log.apply(change)
         return change.outcomes
@@ -139,46 +158,63 @@ class FusionStore(ABC):
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
-        rows = self._read("SELECT mission_id, world_frame, voxel_size_m FROM mission_config")
-        return MissionConfig(*rows[0]) if rows else None
+        data = self.find_record(*_MISSION_CONFIG)
+        return MissionConfig(*json.loads(data)) if data else None
 
     def set_mission_config(self, mission_config: MissionConfig) -> None:
         """Store the mission's configuration."""
-        values = mission_config.mission_id, mission_config.world_frame, mission_config.voxel_size_m
-        columns = "mission_id", "world_frame", "voxel_size_m"
-        self._write_row("mission_config", (self._config_key,), columns, (1, *values))
+        self.save_record(*_MISSION_CONFIG, json.dumps(astuple(mission_config)).encode())
 
     def sessions(self) -> tuple[SessionRecord, ...]:
         """Return the open sessions of the agents whose home is here, sorted by session id."""
-        rows = self._read("SELECT session_id, agent_id FROM sessions")
-        return tuple(SessionRecord(*row) for row in sorted(rows) if self._is_home(row[1]))
+        ids = sorted((data.decode(), agent_id) for agent_id, data in self.records(_SESSION).items())
+        return tuple(SessionRecord(*own) for own in ids if self._is_home(own[1]))
 
     def find_session(self, session_id: str) -> SessionRecord | None:
         """Return the open session of this id, whichever server has opened it."""
-        query = "SELECT session_id, agent_id FROM sessions WHERE session_id = ?"
-        return next((SessionRecord(*row) for row in self._read(query, (session_id,))), None)
+        rows = self._read(f"{_SELECT_RECORDS} AND data = ?", (_SESSION, session_id.encode()))
+        return next((SessionRecord(session_id, agent_id) for agent_id in self._intact(_SESSION, rows)), None)
 
     def save_session(self, session: SessionRecord) -> None:
         """Store a session; it replaces any other session of the same agent."""
-        self._write_row("sessions", ("agent_id",), ("session_id",), (session.agent_id, session.session_id))
+        self.save_record(session.agent_id, _SESSION, session.session_id.encode())
 
     def end_session(self, session_id: str) -> None:
         """Delete a session, if it exists. The agent's updates stay."""
-        self._write(lambda execute: execute("DELETE FROM sessions WHERE session_id = ?", (session_id,)))
+        query = "DELETE FROM records WHERE name = ? AND data = ?"
+        self._write(lambda execute: execute(query, (_SESSION, session_id.encode())))
 
     def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
         """Store an encoded keyframe; it replaces the agent's one of this frame index. One thread for each keyframe.
 
-        A large one takes several transactions, so that others need not wait for all of it, and exists after the last.
+        A large one takes several transactions, so that others need not wait for all of it; the last one replaces the
+        earlier keyframe. If one fails, the parts before it are deleted.
         """
         parts = [data[start : start + _PART_BYTES] for start in range(0, max(len(data), 1), _PART_BYTES)]
-        for part, content in enumerate(parts):
-            row = agent_id, index, part, len(parts), data_checksum(agent_id, index, content), content
-            begin_s = time.monotonic()
-            self._write(partial(_insert_part, row))
-            if part + 1 < len(parts):
-                # the lock is not fair: who waits for it must come first
-                time.sleep(time.monotonic() - begin_s)
+        key = agent_id, index
+
+        def write(part: int, execute: Execute) -> None:
+            is_last = part + 1 == len(parts)
+            if part == 0:
+                execute(f"{_DELETE_KEYFRAME} AND part < 0", key)
+            if is_last:
+                execute(f"{_DELETE_KEYFRAME} AND part >= 0", key)
+                execute("UPDATE keyframes SET part = -1 - part WHERE agent_id = ? AND frame_index = ?", key)
+            checksum = _part_checksum(*key, part, len(parts), parts[part])
+            execute(_INSERT_PART, (*key, part if is_last else -1 - part, len(parts), checksum, parts[part]))
+
+        try:
+            for part in range(len(parts)):
+                begin_s = time.monotonic()
+                self._write(partial(write, part))
+                if part + 1 < len(parts):
+                    # the lock is not fair: who waits for it must come first
+                    time.sleep(time.monotonic() - begin_s)
+        except StorageError:
+            # else they would take the space of other messages
+            with suppress(StorageError):
+                self._write(lambda execute: execute(f"{_DELETE_KEYFRAME} AND part < 0", key))
+            raise
 
     def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
         """Delete these keyframes of an agent, if they exist."""
@@ -196,17 +232,26 @@ class FusionStore(ABC):
             sizes.setdefault(agent_id, {})[index] = int(size)
         return sizes
 
+    def remove_unfinished_keyframes(self) -> None:
+        """Delete the parts of keyframes that a server was writing when it was killed, of agents whose home is here."""
+        rows = self._read("SELECT DISTINCT agent_id FROM keyframes WHERE part < 0")
+        names = [name for (name,) in rows if self._is_home(name)]
+        delete = "DELETE FROM keyframes WHERE agent_id = ? AND part < 0"
+        if names:
+            self._write(lambda execute: [execute(delete, (name,)) for name in names])
+
     def keyframe(self, agent_id: str, index: int) -> bytes:
         """Return an encoded keyframe; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT parts, data, checksum FROM keyframes WHERE agent_id = ? AND frame_index = ? ORDER BY part"
-        rows = self._read(query, (agent_id, index))
-        found = [self._intact(index, [(agent_id, *row)])[agent_id] for _, *row in rows]
-        return b"".join(found) if all(parts == len(found) for parts, *_ in rows) else b""
+        query = f"{SELECT_PARTS} AND agent_id = ? AND frame_index = ? ORDER BY part"
+        data = join_parts(self._read(query, (agent_id, index)))
+        if data is None:
+            raise self._damaged(f"keyframe {index} of agent {agent_id!r}")
+        return data
 
     def save_record(self, agent_id: str, name: str, data: bytes) -> None:
         """Store a named record of an agent; it replaces the earlier one."""
         row = name, agent_id, data_checksum(agent_id, name, data), data
-        self._write_row("records", ("name", "agent_id"), ("checksum", "data"), row)
+        self._write(lambda execute: execute(_SAVE_RECORD, row))
 
     def remove_record(self, agent_id: str, name: str) -> None:
         """Delete a named record of an agent, if it exists."""
@@ -214,20 +259,20 @@ class FusionStore(ABC):
 
     def records(self, name: str) -> dict[str, bytes]:
         """Return the record of this name of every agent that has one. Raises StorageError for a damaged one."""
-        return self._intact(name, self._read("SELECT agent_id, data, checksum FROM records WHERE name = ?", (name,)))
+        return self._intact(name, self._read(_SELECT_RECORDS, (name,)))
 
     def find_record(self, agent_id: str, name: str) -> bytes:
         """Return a named record of an agent; empty if it does not exist. Raises StorageError for a damaged one."""
-        query = "SELECT agent_id, data, checksum FROM records WHERE name = ? AND agent_id = ?"
-        return self._intact(name, self._read(query, (name, agent_id))).get(agent_id, b"")
+        return self._intact(name, self._read(f"{_SELECT_RECORDS} AND agent_id = ?", (name, agent_id))).get(
+            agent_id, b""
+        )
 
-    def _intact(self, name: str | int, rows: Iterable[tuple[str, bytes, int]]) -> dict[str, bytes]:
-        """Return the data of each agent. Raises StorageError for a damaged row."""
+    def _intact(self, name: str, rows: Iterable[tuple[Any, ...]]) -> dict[str, bytes]:
+        """Return the record of each agent. Raises StorageError for a damaged row."""
         found = {}
         for agent_id, data, checksum in rows:
             if data_checksum(agent_id, name, data) != checksum:
-                kind = f"record {name!r}" if isinstance(name, str) else f"keyframe {name}"
-                raise self._damaged(f"{kind} of agent {agent_id!r}")
+                raise self._damaged(f"record {name!r} of agent {agent_id!r}")
             found[agent_id] = bytes(data)
         return found
 
@@ -252,8 +297,8 @@ class FusionStore(ABC):
         """Return the voxels of those of these rows that exist. Raises StorageError, also for damaged ones."""
 
     @abstractmethod
-    def _write_change(self, change: LogChange) -> None:
-        """Delete and insert rows of updates in one transaction. Raises StorageError."""
+    def _write_change(self, change: LogChange, execute: Execute) -> None:
+        """Delete and insert rows of updates."""
 
     @abstractmethod
     def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
@@ -263,23 +308,14 @@ class FusionStore(ABC):
     def _damaged(self, what: str) -> StorageError:
         """Return the error of damaged content."""
 
-    def _write_row(self, table: str, key: Sequence[str], columns: Sequence[str], row: tuple[Any, ...]) -> None:
-        """Insert a row, or replace the columns of the one with its key."""
-        self._write(lambda execute: execute(_upsert(table, key, columns), row))
+
+def join_parts(rows: Sequence[PartRow]) -> bytes | None:
+    """Return a keyframe of its rows, ordered by part; None for a damaged one."""
+    for number, (part, parts, checksum, data, agent_id, index) in enumerate(rows):
+        if (part, parts) != (number, len(rows)) or _part_checksum(agent_id, index, part, parts, data) != checksum:
+            return None
+    return b"".join(row[3] for row in rows)
 
 
-def _insert_part(row: tuple[str, int, int, int, int, bytes], execute: Execute) -> None:
-    """Insert a part of a keyframe; the first one deletes the earlier keyframe of its frame index."""
-    if row[2] == 0:
-        execute(_DELETE_KEYFRAME, row[:2])
-    execute(_upsert("keyframes", ("agent_id", "frame_index", "part"), ("parts", "checksum", "data")), row)
-
-
-def _upsert(table: str, key: Sequence[str], columns: Sequence[str]) -> str:
-    """Return the statement that inserts a row of a key and its columns, or replaces the columns."""
-    names, places = ", ".join((*key, *columns)), ", ".join(["?"] * (len(key) + len(columns)))
-    newer = ", ".join(f"{name} = excluded.{name}" for name in columns)
-    return (
-        f"INSERT INTO {table} ({names}) VALUES ({places}) "  # noqa: S608 - the names are constants
-        f"ON CONFLICT ({', '.join(key)}) DO UPDATE SET {newer}"
-    )
+def _part_checksum(agent_id: str, index: int, part: int, parts: int, data: bytes) -> int:
+    return data_checksum(agent_id, f"{index}/{part}/{parts}", data)

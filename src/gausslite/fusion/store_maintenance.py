@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -18,12 +19,13 @@ from gausslite.fusion.sqlite_store import (
     renew_incarnation,
     storage_errors,
 )
+from gausslite.fusion.store import SELECT_PARTS, join_parts
 from gausslite.fusion.store_rows import UpdateLog, UpdateRow, data_checksum, is_intact
 
 
 @dataclass(frozen=True, slots=True)
 class StoreReport:
-    """What a verification has found; damaged_rows: those whose checksum does not match, in all tables."""
+    """What a verification has found; damaged_rows: with a wrong checksum, in all tables; a keyframe is one."""
 
     agents: int
     voxels: int
@@ -45,8 +47,8 @@ def verify(path: Path, repair: bool = False) -> StoreReport:
             report, damaged = _check(db, path)
             if repair and damaged:
                 db.execute("BEGIN IMMEDIATE")
-                for table, rowid in damaged:
-                    db.execute(f"DELETE FROM {table} WHERE rowid = ?", (rowid,))  # noqa: S608 - constant names
+                for table, columns, key in damaged:
+                    db.execute(f"DELETE FROM {table} WHERE {' = ? AND '.join(columns)} = ?", key)  # noqa: S608
                 renew_incarnation(db)
                 db.execute("COMMIT")
     return report
@@ -80,33 +82,42 @@ def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
     return report, replaced
 
 
-def _check(db: sqlite3.Connection, path: Path) -> tuple[StoreReport, list[tuple[str, int]]]:
-    """Return the report and the (table, rowid) of each damaged row."""
+_Damaged = tuple[str, tuple[str, ...], tuple[str | int, ...]]
+"""A table, and the names and the values of the columns that name a damaged row, or a damaged keyframe."""
+
+
+def _check(db: sqlite3.Connection, path: Path) -> tuple[StoreReport, list[_Damaged]]:
+    """Return the report and what is damaged."""
     found = db.execute("PRAGMA quick_check(1)").fetchone()[0]
     if found != "ok":
         raise StorageError(f"store {path}: expected an undamaged file, got {found!r}; restore a backup")
-    damaged, log = list(_damaged_data(db)), UpdateLog()
+    keyframes = _keyframes(db)
+    damaged: list[_Damaged] = [
+        ("keyframes", ("agent_id", "frame_index"), key) for key, is_whole in keyframes if not is_whole
+    ]
+    for name, agent_id, checksum, data in db.execute("SELECT name, agent_id, checksum, data FROM records"):
+        if data_checksum(agent_id, name, data) != checksum:
+            damaged.append(("records", ("name", "agent_id"), (name, agent_id)))
+    log = UpdateLog()
 
     def intact() -> Iterator[UpdateRow]:
         for row in db.execute(f"{SELECT_UPDATES} ORDER BY number"):
             if is_intact(row):
                 yield row
             else:
-                damaged.append(("voxel_updates", row[0]))
+                damaged.append(("voxel_updates", ("number",), row[:1]))
 
     log.load(intact())
     totals = [log.index.totals(agent_id) for agent_id in log.index.agents]
     voxels, gaussians = (sum(getattr(own, name) for own in totals) for name in ("voxels", "gaussians"))
-    keyframes = db.execute("SELECT count(*) FROM keyframes WHERE part = 0").fetchone()[0]
-    return StoreReport(len(totals), voxels, gaussians, keyframes, len(damaged)), damaged
+    return StoreReport(len(totals), voxels, gaussians, len(keyframes), len(damaged)), damaged
 
 
-def _damaged_data(db: sqlite3.Connection) -> Iterator[tuple[str, int]]:
-    for table, name in (("keyframes", "frame_index"), ("records", "name")):
-        query = f"SELECT rowid, agent_id, {name}, data, checksum FROM {table}"  # noqa: S608 - constant names
-        for rowid, agent_id, key, data, checksum in db.execute(query):
-            if data_checksum(agent_id, key, data) != checksum:
-                yield table, rowid
+def _keyframes(db: sqlite3.Connection) -> list[tuple[tuple[str, int], bool]]:
+    """Return agent and index of each keyframe, and whether it is whole."""
+    rows = db.execute(f"{SELECT_PARTS} ORDER BY agent_id, frame_index, part")
+    groups = itertools.groupby(rows, key=lambda row: row[4:])
+    return [(key, join_parts(list(own)) is not None) for key, own in groups]
 
 
 def _require_intact(path: Path) -> StoreReport:

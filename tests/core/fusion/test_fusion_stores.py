@@ -26,6 +26,8 @@ from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, select_keys
+from gausslite.fusion.keyframes import KeyframePool
+from gausslite.fusion.limits import Quotas
 from gausslite.fusion.sqlite_store import SCHEMA_VERSION, MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import AgentTotals, MissionConfig, SessionRecord
@@ -228,7 +230,7 @@ def test_keyframes_and_records_are_stored_and_leave_with_their_agent(store: Fusi
     assert (store.keyframe_sizes(), store.records("objects")) == ({"bee": {5: 0}}, {"bee": b""})
 
 
-def test_a_large_keyframe_takes_several_transactions_and_exists_after_the_last(
+def test_a_large_keyframe_takes_several_transactions_and_replaces_the_earlier_one_with_the_last(
     store: FusionStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     large, seen = bytes(range(256)) * 5000, []
@@ -240,11 +242,42 @@ def test_a_large_keyframe_takes_several_transactions_and_exists_after_the_last(
     monkeypatch.setattr("gausslite.fusion.store.time", SimpleNamespace(monotonic=time.monotonic, sleep=write_between))
     store.save_keyframe("ant", 1, b"small")
     store.save_keyframe("ant", 1, large)
-    assert seen == [(b"", {})] * 2
+    assert seen == [(b"small", {"ant": {1: 5}})] * 2
     assert store.totals("bee").highest_update_seq == 2
     assert (store.keyframe("ant", 1), store.keyframe_sizes()) == (large, {"ant": {1: len(large)}})
     store.save_keyframe("ant", 1, b"small")
     assert (store.keyframe("ant", 1), store.keyframe_sizes()) == (b"small", {"ant": {1: 5}})
+
+
+def test_a_keyframe_that_was_cut_leaves_the_earlier_one_and_takes_no_space(
+    open_durable: OpenStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(store: FusionStore, stop: BaseException) -> None:
+        def stop_between(_: float) -> None:
+            raise stop
+
+        monkeypatch.setattr(
+            "gausslite.fusion.store.time", SimpleNamespace(monotonic=time.monotonic, sleep=stop_between)
+        )
+        with pytest.raises(type(stop)):
+            store.save_keyframe("ant", 1, bytes(1 << 20))
+
+    store = open_durable()
+    store.save_keyframe("ant", 1, b"small")
+    # a refused part, then a process that ends
+    write(store, StorageError("full"))
+    assert unfinished(store) == 0
+    write(store, KeyboardInterrupt())
+    assert unfinished(store) == 1
+    store.close()
+    again = open_durable()
+    pool = KeyframePool(again, Quotas())
+    assert (unfinished(again), pool.indices("ant"), pool.find("ant")) == (0, (1,), b"small")
+    again.close()
+
+
+def unfinished(store: FusionStore) -> int:
+    return len(store._read("SELECT 1 FROM keyframes WHERE part < 0"))
 
 
 def test_a_reopened_store_has_the_same_content(open_durable: OpenStore) -> None:

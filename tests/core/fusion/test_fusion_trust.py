@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +27,7 @@ from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.keyframes import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.membership import SessionRegistry
 from gausslite.fusion.mission_clock import MissionClock
@@ -155,6 +159,40 @@ def test_an_evicted_agent_leaves_no_data_and_a_banned_one_stays_out_after_a_rest
     assert engine.evict("cat", ban=True) == 0
     assert engine.status().banned_agents == ("cat",)
     store.close()
+
+
+@pytest.mark.parametrize("kind", ["keyframe", "report"])
+def test_what_is_being_written_when_its_agent_is_evicted_is_deleted_too(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, begun, ended = MemoryStore(), Event(), Event()
+    engine = new_engine(store)
+    session, end_session = join(engine, "ant"), store.end_session
+    name = "save_keyframe" if kind == "keyframe" else "save_record"
+    save = getattr(store, name)
+
+    def save_late(*arguments: Any) -> None:
+        begun.set()
+        assert ended.wait(60)
+        save(*arguments)
+
+    def write() -> None:
+        if kind == "keyframe":
+            engine.add_keyframe(session, EncodedKeyframe("ant", 0, 1, 1, b"image"))
+        else:
+            engine.report_objects(session, ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ()))
+
+    monkeypatch.setattr(store, name, save_late)
+    monkeypatch.setattr(store, "end_session", lambda session_id: (end_session(session_id), ended.set()))
+    with ThreadPoolExecutor(1) as threads:
+        writing = threads.submit(write)
+        assert begun.wait(60)
+        assert engine.evict("ant") == 0
+        writing.result(60)
+    assert (store.keyframe_sizes(), store._read("SELECT name FROM records WHERE agent_id = 'ant'")) == ({}, [])
+    assert engine.status().agents == ()
+    with pytest.raises(SessionUnknownError):
+        write()
 
 
 def test_the_name_of_a_live_robot_is_taken_over_only_with_its_token_or_after_its_lease() -> None:

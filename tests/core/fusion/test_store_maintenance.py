@@ -69,6 +69,32 @@ def test_a_damaged_keyframe_or_record_is_not_served(path: Path, table: str, read
     assert verify(path).damaged_rows == 0
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE keyframes SET part = 3 WHERE part = 0",
+        "UPDATE keyframes SET part = part + 9; UPDATE keyframes SET part = 11 - part",
+        "DELETE FROM keyframes WHERE part = 1",
+        "DELETE FROM keyframes WHERE part = 2",
+        "UPDATE keyframes SET frame_index = 3",
+    ],
+)
+def test_a_keyframe_with_parts_that_are_missing_or_not_its_own_is_not_served(path: Path, change: str) -> None:
+    store = SqliteStore(path)
+    store.save_keyframe("ant", 2, bytes(5 << 18))
+    store.remove_keyframes("ant", [1])
+    with sqlite3.connect(path) as db:
+        db.executescript(change)
+    db.close()
+    index = 3 if "frame_index" in change else 2
+    with pytest.raises(StorageError, match=f"keyframe {index} of agent 'ant' is damaged"):
+        store.keyframe("ant", index)
+    store.close()
+    assert verify(path, repair=True).damaged_rows == 1
+    report = verify(path)
+    assert (report.damaged_rows, report.keyframes) == (0, 0)
+
+
 @pytest.mark.parametrize("is_database", [False, True])
 def test_an_emptied_file_is_refused(path: Path, is_database: bool) -> None:
     path.write_bytes(b"")

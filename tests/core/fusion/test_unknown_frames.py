@@ -244,7 +244,8 @@ def test_a_keyframe_that_no_decoder_reads_ends_no_comparison_of_others() -> None
     engine = FusionEngine(MemoryStore(), SETTINGS)  # without a decoder
     send(engine, "ant", scan(0))
     send(engine, "bee", scan(1), unknown=True)
-    engine.add_keyframe(EncodedKeyframe("bee", 0, 1, 1, b"of another version"))
+    session = engine.join("bee", MissionConfig("", "", SETTINGS.grid.size_m)).session
+    engine.add_keyframe(session.session_id, EncodedKeyframe("bee", 0, 1, 1, b"of another version"))
     send(engine, "cat", scan(2))
     engine.align_due()
     assert alignment_of(engine, "cat").fit is not None
