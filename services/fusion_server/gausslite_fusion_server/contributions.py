@@ -8,13 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from gausslite.domain.errors import (
-    GaussLiteError,
-    MismatchError,
-    SessionUnknownError,
-    StorageError,
-    UnavailableError,
-)
+from gausslite.domain.errors import GaussLiteError, MismatchError, SessionUnknownError, StorageError, UnavailableError
 from gausslite.fusion.store_values import PutOutcome, SessionRecord
 from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb

@@ -10,12 +10,7 @@ from typing import Any, NamedTuple
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.traffic import (
-    ACKNOWLEDGEMENT_BOUNDS_S,
-    Acknowledgements,
-    AgentContribution,
-    MissionStatus,
-)
+from gausslite.fusion.traffic import ACKNOWLEDGEMENT_BOUNDS_S, Acknowledgements, AgentContribution, MissionStatus
 from gausslite.wire.channel import host_and_port
 
 _log = logging.getLogger(__name__)

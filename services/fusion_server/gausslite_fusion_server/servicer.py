@@ -13,11 +13,7 @@ from gausslite.codec.ply import ply_bytes
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.checks import require_identifier
-from gausslite.domain.errors import (
-    InvalidInputError,
-    QuotaError,
-    UnavailableError,
-)
+from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.refinement import MapRenderer

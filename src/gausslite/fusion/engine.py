@@ -43,13 +43,7 @@ from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.unknown_frames import Find, UnknownFrames, find_frame
-from gausslite.fusion.updates import (
-    PendingUpdate,
-    UpdateChecks,
-    UpdateCommitter,
-    require_own,
-    require_within_quotas,
-)
+from gausslite.fusion.updates import PendingUpdate, UpdateChecks, UpdateCommitter, require_own, require_within_quotas
 from gausslite.fusion.vote_input import VoteInput
 
 
@@ -150,10 +144,7 @@ class FusionEngine:
                 self._members.sessions.save(session, token)
             self._checks.record_join(agent_id)
             return JoinResult(
-                session,
-                self.highest_update_seq(agent_id),
-                self.maps.revision(),
-                self._keyframes.indices(agent_id),
+                session, self.highest_update_seq(agent_id), self.maps.revision(), self._keyframes.indices(agent_id)
             )
 
     def begin_elsewhere(self, agent_id: str, fresh_map: bool) -> int:

@@ -19,13 +19,7 @@ from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.fusion.alignment import MIN_SAMPLES, Fit, FrameFit, SurfaceSamples, opaque_rows
-from gausslite.fusion.frames import (
-    AlignmentSettings,
-    Comparison,
-    FrameAlignment,
-    FrameAlignments,
-    find_quarantined,
-)
+from gausslite.fusion.frames import AlignmentSettings, Comparison, FrameAlignment, FrameAlignments, find_quarantined
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote_input import SLICE_VOXELS
 

@@ -10,14 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
-from gausslite.domain.voxels import (
-    VoxelBatch,
-    VoxelGrid,
-    group_by_voxel,
-    merge_batches,
-    select_keys,
-    select_voxels,
-)
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.fusion.frames import FrameAlignments
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import SCORES, VoxelScoreTable

@@ -24,10 +24,7 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import gaussians_pb2, geometry_pb2
 
 _MAX_VELOCITY = 100.0
-_LENS_MODELS = {
-    geometry_pb2.LENS_MODEL_RADTAN: LensModel.RADTAN,
-    geometry_pb2.LENS_MODEL_FISHEYE: LensModel.FISHEYE,
-}
+_LENS_MODELS = {geometry_pb2.LENS_MODEL_RADTAN: LensModel.RADTAN, geometry_pb2.LENS_MODEL_FISHEYE: LensModel.FISHEYE}
 _LENS_NUMBERS = {model: number for number, model in _LENS_MODELS.items()}
 _CAMERA = tuple(field.name for field in fields(Camera))
 

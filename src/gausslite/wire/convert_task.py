@@ -31,13 +31,7 @@ from gausslite.domain.task import (
     require_graph,
 )
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2, geometry_pb2, objects_pb2, task_pb2
-from gausslite.wire.convert import (
-    box_from_message,
-    box_to_message,
-    point_from_message,
-    point_to_message,
-    values_of,
-)
+from gausslite.wire.convert import box_from_message, box_to_message, point_from_message, point_to_message, values_of
 
 _Named = TypeVar("_Named", bound=StrEnum)
 _MAX_POINTED: Final = 64
@@ -68,9 +62,7 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
     ]
     attributes = [
         task_pb2.ObjectAttributes(
-            name=attribute.name,
-            colour=attribute.colour or "",
-            superlative=_SUPERLATIVE_NUMBERS[attribute.superlative],
+            name=attribute.name, colour=attribute.colour or "", superlative=_SUPERLATIVE_NUMBERS[attribute.superlative]
         )
         for attribute in graph.attributes
     ]
@@ -123,9 +115,7 @@ class AssignedTask:
 
 
 def assigned_to_message(
-    task: str | TaskGraph | None,
-    pointed: Sequence[PointedObject] = (),
-    excluded_m: Sequence[PointM] = (),
+    task: str | TaskGraph | None, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()
 ) -> agent_service_pb2.AssignTaskRequest:
     """Encode the request of an AssignTask call."""
     request = agent_service_pb2.AssignTaskRequest(

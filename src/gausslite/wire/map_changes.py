@@ -126,10 +126,7 @@ def encode_parts(
     sender: the agent id inside the encoded bytes. provenance: returns the agent of each voxel of a part.
     """
     return tuple(
-        (
-            encode_subset(RoiSubset(sender, "", 0, 0, part), grid),
-            None if provenance is None else provenance(part),
-        )
+        (encode_subset(RoiSubset(sender, "", 0, 0, part), grid), None if provenance is None else provenance(part))
         for part in split_batch(batch, BLOCK_BYTES)
     )
 

@@ -259,11 +259,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
         self._usage, self._watches = usage, watches
         self._rejections = RejectionLog(_log)
 
-    async def intercept_service(
-        self,
-        continuation: Callable[[Any], Awaitable[Any]],
-        handler_call_details: Any,
-    ) -> Any:
+    async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
         """Return a handler that runs the called method and converts its errors; foreign services stay unchanged."""
         handler = await continuation(handler_call_details)
         method = handler_call_details.method

@@ -384,9 +384,6 @@ def _to_batch(purpose: Purpose, rows: list[_Row]) -> SpoolBatch | None:
         return None
     keys, enqueue_counts, sums, counts, blobs, _ = zip(*sorted(rows), strict=True)
     batch = VoxelBatch(
-        np.array(keys, np.int64),
-        np.array(sums, np.uint64),
-        np.array(counts, np.uint32),
-        from_bytes(b"".join(blobs)),
+        np.array(keys, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32), from_bytes(b"".join(blobs))
     )
     return SpoolBatch(purpose, batch, np.array(enqueue_counts, np.int64))

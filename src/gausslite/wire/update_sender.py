@@ -201,10 +201,7 @@ class UpdateSender:
                 continue
             sent[self._message_seq] = SentPart(spooled, len(data), update_seq)
             yield pb.ContributeSubsetsRequest(
-                session_id=session.session_id,
-                sequence=self._message_seq,
-                purpose=_PURPOSES[due.purpose],
-                subset=data,
+                session_id=session.session_id, sequence=self._message_seq, purpose=_PURPOSES[due.purpose], subset=data
             )
 
     def _handle_outcome(self, outcome: pb.SubsetOutcome, sent: SentPart) -> GaussLiteError | None:
