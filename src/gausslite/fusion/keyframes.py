@@ -82,15 +82,13 @@ class KeyframePool:
         with self._changing:
             # from here on, `remove_agent` waits
             stored = dict(self._stored.setdefault(keyframe.agent_id, {}))
-            require()
-            self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data)
+            self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data, require)
             before = stored.get(keyframe.index)
             if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
                 del stored[keyframe.index]
             stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data))
-            kept = self._newest_within_limits(
-                {index: own for index, own in stored.items() if not selected or index in {*selected, keyframe.index}}
-            )
+            wanted = {*(selected or stored), keyframe.index}
+            kept = self._newest_within_limits({index: own for index, own in stored.items() if index in wanted})
             if len(kept) < len(stored):
                 self._store.remove_keyframes(keyframe.agent_id, sorted(stored.keys() - kept.keys()))
             self._stored[keyframe.agent_id] = kept

@@ -9,11 +9,17 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Collection
 
-import psycopg
-
 from gausslite.domain.errors import StorageError, UnavailableError
-from gausslite.fusion.postgres_connection import Database, PostgresConnection, database_name
-from gausslite.fusion.postgres_store import LOCK, PostgresStore, begin_opening, create_or_check, in_use
+from gausslite.fusion.postgres_store import (
+    LOCK,
+    Database,
+    PostgresConnection,
+    PostgresStore,
+    begin_opening,
+    create_or_check,
+    database_name,
+    locking,
+)
 from gausslite.fusion.regions import OwnedSlots, Owners
 
 _SLOT_LOCKS = 0x47534C53  # "GSLS"
@@ -43,21 +49,13 @@ class SharedSlots:
     def __init__(self, url: str, server: str) -> None:
         self._url, self._name, self.server = url, database_name(url), server
         self._holder: Database | None = None
-        self._connections = 0
-        self._held: frozenset[int] = frozenset()
+        self.connection = 0
+        """The number of the connection that holds the locks."""
+        self.held: frozenset[int] = frozenset()
+        """The slots whose locks this server has."""
         self._rows: list[tuple[str, str | None]] = []
         self._owners = Owners()
         self._locks = PostgresConnection(url, self._enter)
-
-    @property
-    def held(self) -> frozenset[int]:
-        """The slots whose locks this server has."""
-        return self._held
-
-    @property
-    def connection(self) -> int:
-        """The number of the connection that holds them."""
-        return self._connections
 
     def owners(self) -> Owners:
         """Return who owns which slot now, the same object as before if nothing has changed.
@@ -72,20 +70,20 @@ class SharedSlots:
 
     def take(self, slots: Collection[int]) -> frozenset[int]:
         """Lock those of these slots that nobody owns; returns them. Raises StorageError."""
-        wanted = sorted(frozenset(slots) - self._held)
+        wanted = sorted(frozenset(slots) - self.held)
         rows = self._locks.run(lambda db: db.execute(_TAKE, (wanted, _SLOT_LOCKS)).fetchall()) if wanted else []
         taken = frozenset(slot for (slot,) in rows)
-        self._held |= taken
+        self.held |= taken
         return taken
 
     def release(self, slots: Collection[int]) -> None:
         """Give these slots up; no store of theirs may be open. Raises StorageError."""
-        self._locks.run(lambda db: db.execute(_RELEASE, (_SLOT_LOCKS, sorted(self._held.intersection(slots)))))
-        self._held -= frozenset(slots)
+        self._locks.run(lambda db: db.execute(_RELEASE, (_SLOT_LOCKS, sorted(self.held.intersection(slots)))))
+        self.held -= frozenset(slots)
 
     def open_store(self) -> PostgresStore:
         """Return the store of the slots that are held now. Raises StorageError."""
-        return PostgresStore(self._url, OwnedSlots(self._held), functools.partial(self._write, self._holder))
+        return PostgresStore(self._url, OwnedSlots(self.held), functools.partial(self._write, self._holder))
 
     def close(self) -> None:
         """Close the connection; the locks end."""
@@ -93,24 +91,19 @@ class SharedSlots:
 
     def _enter(self, db: Database) -> None:
         """Become one of the servers; the slots of an earlier connection are lost. Raises StorageError."""
-        self._held = frozenset()
-        try:
-            with db.transaction():
-                # the connection of a server that was killed may take a moment to end
-                db.execute("SET LOCAL lock_timeout = '2s'")
-                db.execute("SELECT pg_advisory_lock_shared(%s)", (LOCK,))
-                # one after the other
-                db.execute("SELECT pg_advisory_xact_lock(%s, -1)", (_SLOT_LOCKS,))
-                create_or_check(db, self._name)
-                db.execute(_DELETE_ENDED)
-                if any(address == self.server for address, _ in db.execute(_OWNERS, (LOCK, _SLOT_LOCKS))):
-                    raise StorageError(f"store {self._name}: another server has the peer-address {self.server}")
-                db.execute(_REGISTER, (self.server,))
-                begin_opening(db)
-        except psycopg.errors.LockNotAvailable as error:
-            raise in_use(self._name) from error
+        self.held = frozenset()
+        with locking(db, self._name):
+            db.execute("SELECT pg_advisory_lock_shared(%s)", (LOCK,))
+            # one after the other
+            db.execute("SELECT pg_advisory_xact_lock(%s, -1)", (_SLOT_LOCKS,))
+            create_or_check(db, self._name)
+            db.execute(_DELETE_ENDED)
+            if any(address == self.server for address, _ in db.execute(_OWNERS, (LOCK, _SLOT_LOCKS))):
+                raise StorageError(f"store {self._name}: another server has the peer-address {self.server}")
+            db.execute(_REGISTER, (self.server,))
+            begin_opening(db)
         self._holder = db
-        self._connections += 1
+        self.connection += 1
 
     def _write(self, holder: Database | None, work: Callable[[Database], object]) -> None:
         """Do the work in one transaction of the holder. Raises StorageError, UnavailableError if it was replaced."""

@@ -65,26 +65,23 @@ def open_existing(path: Path) -> sqlite3.Connection:
     """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError."""
     if not path.is_file():
         raise StorageError(f"store {path}: expected a GaussLite store, got no file")
-    db = connect(path)
-    try:
-        with storage_errors(path):
-            if db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
-                raise StorageError(
-                    f"store {path}: expected a GaussLite store, got an empty file; restore a backup, or remove the "
-                    "file to begin with an empty store"
-                )
-            if db.execute("PRAGMA application_id").fetchone()[0] != _APPLICATION_ID:
-                raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
-            version = db.execute("PRAGMA user_version").fetchone()[0]
-            if version != SCHEMA_VERSION:
-                raise StorageError(
-                    f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; "
-                    "use that release, or another file, and the agents send their updates again"
-                )
-    except BaseException:
-        db.close()
-        raise
-    return db
+    with ExitStack() as opened, storage_errors(path):
+        db = opened.enter_context(contextlib.closing(connect(path)))
+        if db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+            raise StorageError(
+                f"store {path}: expected a GaussLite store, got an empty file; restore a backup, or remove the file to "
+                "begin with an empty store"
+            )
+        if db.execute("PRAGMA application_id").fetchone()[0] != _APPLICATION_ID:
+            raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
+        version = db.execute("PRAGMA user_version").fetchone()[0]
+        if version != SCHEMA_VERSION:
+            raise StorageError(
+                f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use that "
+                "release, or another file, and the agents send their updates again"
+            )
+        opened.pop_all()
+        return db
 
 
 def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
@@ -170,13 +167,9 @@ class _Checkpoints:
     def __init__(self, path: Path, write_lock: RLock) -> None:
         """write_lock: held by each commit."""
         self._path, self._write_lock = path, write_lock
-        self._is_closed, self._has_commits = Event(), False
+        self._is_closed, self.has_commits = Event(), False
         self._thread = Thread(target=self._run, name="checkpoints", daemon=True)
         self._thread.start()
-
-    def note_commit(self) -> None:
-        """Say that the log has grown."""
-        self._has_commits = True
 
     def close(self) -> None:
         """Wait until the thread has ended."""
@@ -187,8 +180,8 @@ class _Checkpoints:
         with contextlib.closing(connect(self._path)) as db:
             db.execute("PRAGMA synchronous = FULL")
             while not self._is_closed.wait(_CHECKPOINT_PERIOD_S):
-                if self._has_commits:
-                    self._has_commits = False
+                if self.has_commits:
+                    self.has_commits = False
                     # what fails here fails in the next commit too, which says so
                     with contextlib.suppress(sqlite3.Error):
                         self._copy(db)
@@ -226,7 +219,7 @@ class SqliteStore(FusionStore):
             if max_bytes is not None:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
-            self._incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
+            self.incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
             self._checkpoints = None if path == _IN_MEMORY else _Checkpoints(path, self._write_lock)
             self._opened = opened.pop_all()
 
@@ -278,7 +271,7 @@ class SqliteStore(FusionStore):
                     self._writer.execute("ROLLBACK")
                 raise
             if self._checkpoints is not None:
-                self._checkpoints.note_commit()
+                self._checkpoints.has_commits = True
 
 
 class MemoryStore(SqliteStore):

@@ -23,7 +23,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.errors import StorageError
+from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.store_rows import LogChange, SlotsOf, UpdateLog, data_checksum, read_batches
@@ -41,8 +41,9 @@ Execute = Callable[[str, tuple[Any, ...]], object]
 """Executes a statement, with ? for each value, in the transaction that is open."""
 TABLES = """
 CREATE TABLE keyframes (
-    agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, part INTEGER NOT NULL, parts INTEGER NOT NULL,
-    checksum BIGINT NOT NULL, data BYTEA NOT NULL, PRIMARY KEY (agent_id, frame_index, part));
+    agent_id TEXT NOT NULL, frame_index BIGINT NOT NULL, version INTEGER NOT NULL, part INTEGER NOT NULL,
+    parts INTEGER NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
+    PRIMARY KEY (agent_id, frame_index, version, part));
 CREATE TABLE records (
     name TEXT NOT NULL, agent_id TEXT NOT NULL, checksum BIGINT NOT NULL, data BYTEA NOT NULL,
     PRIMARY KEY (name, agent_id));
@@ -50,11 +51,21 @@ CREATE TABLE properties (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 """
 """Those that SQLite and PostgreSQL have in common; SQLite takes any name of a type."""
 _PART_BYTES = 1 << 19
-_INSERT_PART = "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?)"
+# nothing, if a connection was lost after the commit and the work is done again
+_INSERT_PART = "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING"
 _DELETE_KEYFRAME = "DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?"
-_SELECT_SIZES = "SELECT agent_id, frame_index, sum(length(data)) FROM keyframes WHERE part >= 0 GROUP BY 1, 2"
-SELECT_PARTS = "SELECT part, parts, checksum, data, agent_id, frame_index FROM keyframes WHERE part >= 0"
-"""PartRows; while a keyframe is written, its parts are -1, -2, -3 ..."""
+_CURRENT = """
+coalesce((SELECT max(version) FROM keyframes AS last
+    WHERE last.agent_id = own.agent_id AND last.frame_index = own.frame_index AND last.part = last.parts - 1), 0)
+"""
+"""The version of a keyframe that has its last part; later ones are being written, earlier ones are being deleted."""
+_SELECT_SIZES = f"""
+SELECT agent_id, frame_index, sum(length(data)) FROM keyframes AS own WHERE version = {_CURRENT} GROUP BY 1, 2
+"""  # noqa: S608 - constants of this file
+SELECT_PARTS = f"""
+SELECT part, parts, checksum, data, agent_id, frame_index FROM keyframes AS own WHERE version = {_CURRENT}
+"""  # noqa: S608
+"""PartRows."""
 PartRow = tuple[int, int, int, bytes, str, int]
 _SAVE_RECORD = """
 INSERT INTO records VALUES (?, ?, ?, ?)
@@ -83,12 +94,7 @@ class FusionStore(ABC):
     def __init__(self, slots_of: SlotsOf = np.zeros_like) -> None:
         self._write_lock, self._index_lock = RLock(), RLock()
         self._log = UpdateLog(slots_of)
-        self._incarnation_id = ""
-
-    @property
-    def incarnation_id(self) -> str:
-        """The id of this content; see the class."""
-        return self._incarnation_id
+        self.incarnation_id = ""
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
@@ -184,37 +190,50 @@ class FusionStore(ABC):
         query = "DELETE FROM records WHERE name = ? AND data = ?"
         self._write(lambda execute: execute(query, (_SESSION, session_id.encode())))
 
-    def save_keyframe(self, agent_id: str, index: int, data: bytes) -> None:
+    def save_keyframe(
+        self, agent_id: str, index: int, data: bytes, require: Callable[[], object] = lambda: None
+    ) -> None:
         """Store an encoded keyframe; it replaces the agent's one of this frame index. One thread for each keyframe.
 
-        A large one takes several transactions, so that others need not wait for all of it; the last one replaces the
-        earlier keyframe. If one fails, the parts before it are deleted.
+        A large one takes several transactions, so that others need not wait for all of it. It exists, in place of the
+        earlier one, after the last part. If one fails, or `require` raises before it, the parts are deleted.
         """
         parts = [data[start : start + _PART_BYTES] for start in range(0, max(len(data), 1), _PART_BYTES)]
         key = agent_id, index
+        before = self._read("SELECT version, part FROM keyframes WHERE agent_id = ? AND frame_index = ?", key)
+        version = 1 + max((own for own, _ in before), default=0)
 
-        def write(part: int, execute: Execute) -> None:
-            is_last = part + 1 == len(parts)
-            if part == 0:
-                execute(f"{_DELETE_KEYFRAME} AND part < 0", key)
-            if is_last:
-                execute(f"{_DELETE_KEYFRAME} AND part >= 0", key)
-                execute("UPDATE keyframes SET part = -1 - part WHERE agent_id = ? AND frame_index = ?", key)
+        def delete(part: int, execute: Execute) -> None:
+            execute(f"{_DELETE_KEYFRAME} AND version < ? AND part = ?", (*key, version, part))
+
+        def insert(part: int, execute: Execute) -> None:
+            if part + 1 == len(parts):
+                delete(0, execute)
             checksum = _part_checksum(*key, part, len(parts), parts[part])
-            execute(_INSERT_PART, (*key, part if is_last else -1 - part, len(parts), checksum, parts[part]))
+            execute(_INSERT_PART, (*key, version, part, len(parts), checksum, parts[part]))
 
         try:
-            for part in range(len(parts)):
-                begin_s = time.monotonic()
-                self._write(partial(write, part))
-                if part + 1 < len(parts):
-                    # the lock is not fair: who waits for it must come first
-                    time.sleep(time.monotonic() - begin_s)
-        except StorageError:
+            self._write_slowly([partial(insert, part) for part in range(len(parts))], require)
+        except GaussLiteError:
             # else they would take the space of other messages
-            with suppress(StorageError):
-                self._write(lambda execute: execute(f"{_DELETE_KEYFRAME} AND part < 0", key))
+            with suppress(GaussLiteError):
+                self._write(lambda execute: execute(f"{_DELETE_KEYFRAME} AND version = ?", (*key, version)))
             raise
+        with suppress(GaussLiteError):
+            # else the next start deletes them
+            self._write_slowly([partial(delete, part) for part in sorted({part for _, part in before} - {0})])
+
+    def _write_slowly(
+        self, steps: Sequence[Callable[[Execute], None]], require: Callable[[], object] = lambda: None
+    ) -> None:
+        """Do each step in a transaction of its own, after `require`, with pauses for others."""
+        for number, step in enumerate(steps):
+            require()
+            begin_s = time.monotonic()
+            self._write(step)
+            if number + 1 < len(steps):
+                # the lock is not fair: who waits for it must come first
+                time.sleep(time.monotonic() - begin_s)
 
     def remove_keyframes(self, agent_id: str, indices: Iterable[int]) -> None:
         """Delete these keyframes of an agent, if they exist."""
@@ -233,10 +252,10 @@ class FusionStore(ABC):
         return sizes
 
     def remove_unfinished_keyframes(self) -> None:
-        """Delete the parts of keyframes that a server was writing when it was killed, of agents whose home is here."""
-        rows = self._read("SELECT DISTINCT agent_id FROM keyframes WHERE part < 0")
+        """Delete what a killed server was writing or deleting of keyframes, of agents whose home is here."""
+        rows = self._read(f"SELECT DISTINCT agent_id FROM keyframes AS own WHERE version != {_CURRENT}")  # noqa: S608
         names = [name for (name,) in rows if self._is_home(name)]
-        delete = "DELETE FROM keyframes WHERE agent_id = ? AND part < 0"
+        delete = f"DELETE FROM keyframes AS own WHERE agent_id = ? AND version != {_CURRENT}"  # noqa: S608
         if names:
             self._write(lambda execute: [execute(delete, (name,)) for name in names])
 

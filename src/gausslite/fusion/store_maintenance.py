@@ -11,14 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.domain.errors import StorageError
-from gausslite.fusion.sqlite_store import (
-    RESTORE_ADVICE,
-    SELECT_UPDATES,
-    locked,
-    open_existing,
-    renew_incarnation,
-    storage_errors,
-)
+from gausslite.fusion import sqlite_store
 from gausslite.fusion.store import SELECT_PARTS, join_parts
 from gausslite.fusion.store_rows import UpdateLog, UpdateRow, data_checksum, is_intact
 
@@ -41,15 +34,15 @@ def verify(path: Path, repair: bool = False) -> StoreReport:
     """
     with contextlib.ExitStack() as held:
         if repair:
-            held.enter_context(locked(path))
-        db = held.enter_context(contextlib.closing(open_existing(path)))
-        with storage_errors(path):
+            held.enter_context(sqlite_store.locked(path))
+        db = held.enter_context(contextlib.closing(sqlite_store.open_existing(path)))
+        with sqlite_store.storage_errors(path):
             report, damaged = _check(db, path)
             if repair and damaged:
                 db.execute("BEGIN IMMEDIATE")
                 for table, columns, key in damaged:
                     db.execute(f"DELETE FROM {table} WHERE {' = ? AND '.join(columns)} = ?", key)  # noqa: S608
-                renew_incarnation(db)
+                sqlite_store.renew_incarnation(db)
                 db.execute("COMMIT")
     return report
 
@@ -58,7 +51,7 @@ def back_up(store: Path, target: Path) -> StoreReport:
     """Copy a store to a new file, also while a server uses it, and verify the copy. Raises StorageError."""
     if target.exists():
         raise StorageError(f"backup {target}: the file exists; choose another name")
-    with contextlib.closing(open_existing(store)) as source:
+    with contextlib.closing(sqlite_store.open_existing(store)) as source:
         _copy(source, store, target)
     return _require_intact(target)
 
@@ -68,14 +61,14 @@ def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
 
     Returns the report and the new name of the file that was there before. Raises StorageError.
     """
-    with locked(store):
+    with sqlite_store.locked(store):
         report = _require_intact(backup)
         copy = store.with_name(store.name + ".restoring")
         copy.unlink(missing_ok=True)
-        with contextlib.closing(open_existing(backup)) as source:
+        with contextlib.closing(sqlite_store.open_existing(backup)) as source:
             _copy(source, backup, copy)
-        with contextlib.closing(open_existing(copy)) as db, storage_errors(copy):
-            renew_incarnation(db)
+        with contextlib.closing(sqlite_store.open_existing(copy)) as db, sqlite_store.storage_errors(copy):
+            sqlite_store.renew_incarnation(db)
         replaced = _move_away(store)
         copy.replace(store)
         _synchronise_folder(store.parent)
@@ -101,7 +94,7 @@ def _check(db: sqlite3.Connection, path: Path) -> tuple[StoreReport, list[_Damag
     log = UpdateLog()
 
     def intact() -> Iterator[UpdateRow]:
-        for row in db.execute(f"{SELECT_UPDATES} ORDER BY number"):
+        for row in db.execute(f"{sqlite_store.SELECT_UPDATES} ORDER BY number"):
             if is_intact(row):
                 yield row
             else:
@@ -124,13 +117,13 @@ def _require_intact(path: Path) -> StoreReport:
     report = verify(path)
     if report.damaged_rows:
         raise StorageError(
-            f"store {path}: expected intact rows, got {report.damaged_rows} damaged ones; {RESTORE_ADVICE}"
+            f"store {path}: expected intact rows, got {report.damaged_rows} damaged ones; {sqlite_store.RESTORE_ADVICE}"
         )
     return report
 
 
 def _copy(source: sqlite3.Connection, path: Path, target: Path) -> None:
-    with storage_errors(path):
+    with sqlite_store.storage_errors(path):
         copy = sqlite3.connect(target, isolation_level=None)
         with contextlib.closing(copy):
             source.backup(copy)

@@ -249,6 +249,17 @@ def test_a_large_keyframe_takes_several_transactions_and_replaces_the_earlier_on
     assert (store.keyframe("ant", 1), store.keyframe_sizes()) == (b"small", {"ant": {1: 5}})
 
 
+def test_a_keyframe_whose_transactions_are_done_twice_is_the_same(
+    store: FusionStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = store._write
+    # as after a connection that was lost during the commit
+    monkeypatch.setattr(store, "_write", lambda work: (write(work), write(work)))
+    for data in (b"small", bytes(range(256)) * 5000, bytes(range(255)) * 3000, b"last"):
+        store.save_keyframe("ant", 1, data)
+        assert (store.keyframe("ant", 1), store.keyframe_sizes()) == (data, {"ant": {1: len(data)}})
+
+
 def test_a_keyframe_that_was_cut_leaves_the_earlier_one_and_takes_no_space(
     open_durable: OpenStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -277,7 +288,7 @@ def test_a_keyframe_that_was_cut_leaves_the_earlier_one_and_takes_no_space(
 
 
 def unfinished(store: FusionStore) -> int:
-    return len(store._read("SELECT 1 FROM keyframes WHERE part < 0"))
+    return len(store._read("SELECT 1 FROM keyframes WHERE parts > 1"))
 
 
 def test_a_reopened_store_has_the_same_content(open_durable: OpenStore) -> None:
