@@ -37,15 +37,14 @@ def host_and_port(name: str, address: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def require_callable(name: str, address: str) -> None:
-    """Raise InvalidInputError unless a service can listen there; gRPC would use port 443 for a missing port."""
+def require_callable(name: str, address: str) -> str:
+    """Return the address. Raises InvalidInputError unless a service can listen there; gRPC would add port 443."""
     if not isinstance(address, str):
         raise InvalidInputError(f"{name}: expected HOST:PORT or unix:PATH as text, got {type(address).__name__}")
-    if address.startswith(UNIX) and address != UNIX:
-        return
-    _, port = host_and_port(name, address)
-    if port == 0:
+    is_socket = address.startswith(UNIX) and address != UNIX
+    if not is_socket and host_and_port(name, address)[1] == 0:
         raise InvalidInputError(f"{name}: expected the port that the service listens on, got {address!r}")
+    return address
 
 
 _PROXY_VARIABLES = ("grpc_proxy", "https_proxy", "http_proxy")

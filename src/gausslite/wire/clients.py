@@ -24,15 +24,11 @@ from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
-from gausslite.v1 import (
-    agent_service_pb2,
-    agent_service_pb2_grpc,
-    fusion_service_pb2,
-    fusion_service_pb2_grpc,
-    geometry_pb2,
-    parser_service_pb2,
-    parser_service_pb2_grpc,
-)
+from gausslite.v1 import agent_service_pb2 as agent_pb
+from gausslite.v1 import agent_service_pb2_grpc as agent_pb_grpc
+from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
+from gausslite.v1 import geometry_pb2, parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire import convert, convert_task
 from gausslite.wire.channel import DEADLINE_S, MAX_MESSAGE_BYTES, ServiceChannel, require_serving
 from gausslite.wire.convert import decode_colour, decode_depth, digests_from_messages
@@ -47,11 +43,11 @@ _FOLLOW_INTERVAL_S, _UNREACHABLE_S = 5.0, 60.0
 # larger than the default, because a server may send larger blocks
 _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, max_gaussians=2_000_000)
 
-FrameOutcome = agent_service_pb2.FrameOutcome
+FrameOutcome = agent_pb.FrameOutcome
 """Names the outcomes of `AgentClient.ingest`: `FrameOutcome.Name(result.outcome)`."""
 
 
-Session = fusion_service_pb2.JoinSessionResponse
+Session = pb.JoinSessionResponse
 """The fusion server's answer to a joining agent."""
 
 
@@ -100,7 +96,7 @@ class AgentClient(ServiceChannel):
 
     def __init__(self, address: str, deadline_s: float = DEADLINE_S, tls: Tls | None = None) -> None:
         super().__init__(address, deadline_s, tls)
-        self._stub = agent_service_pb2_grpc.AgentServiceStub(self._channel)
+        self._stub = agent_pb_grpc.AgentServiceStub(self._channel)
 
     def assign_task(
         self,
@@ -118,50 +114,47 @@ class AgentClient(ServiceChannel):
 
     def ingest(
         self, frames: Iterable[Frame], lossless: bool = False, lens: Lens | None = None
-    ) -> Iterator[agent_service_pb2.IngestFramesResponse]:
+    ) -> Iterator[agent_pb.IngestFramesResponse]:
         """Send frames; yields one outcome for each, in order.
 
         lens: distortion of the frames' images, which the agent corrects together with the rolling shutter that
         `Frame.motion` states.
         """
         requests = (
-            agent_service_pb2.IngestFramesRequest(frame=convert.live_frame_to_message(frame, lens, lossless))
-            for frame in frames
+            agent_pb.IngestFramesRequest(frame=convert.live_frame_to_message(frame, lens, lossless)) for frame in frames
         )
         return self._exchange(self._stub.IngestFrames, requests)
 
-    def end_mission(
-        self, handover: bool | None = None, drain_s: float | None = None
-    ) -> agent_service_pb2.EndMissionResponse:
+    def end_mission(self, handover: bool | None = None, drain_s: float | None = None) -> agent_pb.EndMissionResponse:
         """End the mission and return what was sent and left; None: as the agent's options.
 
         Raises MismatchError before the first task, UnavailableError.
         """
-        request = agent_service_pb2.EndMissionRequest(handover=handover, drain_seconds=drain_s)
+        request = agent_pb.EndMissionRequest(handover=handover, drain_seconds=drain_s)
         # after sending, the agent also writes its results
         deadline_s = MAX_END_S if drain_s is None else drain_s + 10 * self._deadline_s
         return self._call(self._stub.EndMission, request, deadline_s)
 
-    def status(self) -> agent_service_pb2.GetAgentStatusResponse:
+    def status(self) -> agent_pb.GetAgentStatusResponse:
         """Return the agent's status and counters."""
-        return self._call(self._stub.GetAgentStatus, agent_service_pb2.GetAgentStatusRequest())
+        return self._call(self._stub.GetAgentStatus, agent_pb.GetAgentStatusRequest())
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> _View:
         """Return colour and depth in metres of the agent's map, rendered from this pose."""
-        request = agent_service_pb2.RenderViewRequest(
+        request = agent_pb.RenderViewRequest(
             camera=convert.camera_to_message(camera), t_world_camera=convert.transform_to_message(T_world_camera)
         )
         return _decode_view(self._call(self._stub.RenderView, request), camera)
 
     def camera_view(self) -> CameraView | None:
         """Return the newest keyframe with its region and the camera's path; None before the first keyframe."""
-        return camera_view_from_message(self._call(self._stub.GetCameraView, agent_service_pb2.GetCameraViewRequest()))
+        return camera_view_from_message(self._call(self._stub.GetCameraView, agent_pb.GetCameraViewRequest()))
 
     def watch_map(
         self, since_revision: int = 0, region: AxisAlignedBox | None = None, roi_only: bool = False
     ) -> Iterator[convert.MapUpdate]:
         """Yield the map and its later changes, without end. Raises RevisionGoneError if since_revision is too old."""
-        request = agent_service_pb2.WatchMapRequest(
+        request = agent_pb.WatchMapRequest(
             since_revision=since_revision,
             region=None if region is None else convert.box_to_message(region),
             roi_only=roi_only,
@@ -169,9 +162,9 @@ class AgentClient(ServiceChannel):
         yield from _decode_updates(self._stream(self._stub.WatchMap, request))
 
 
-def is_done(status: agent_service_pb2.GetAgentStatusResponse) -> bool:
+def is_done(status: agent_pb.GetAgentStatusResponse) -> bool:
     """True after the agent has ended its mission and written its results."""
-    return status.state == agent_service_pb2.AGENT_STATE_ENDED
+    return status.state == agent_pb.AGENT_STATE_ENDED
 
 
 UNKNOWN: Final = "unknown"
@@ -194,7 +187,7 @@ class FusionClient(ServiceChannel):
         super().__init__(address, deadline_s, tls)
         self.mission_id = mission_id
         self._token = secrets.token_hex(16) if token is None else token
-        self._stub = fusion_service_pb2_grpc.FusionServiceStub(self._channel)
+        self._stub = pb_grpc.FusionServiceStub(self._channel)
         self._owner: FusionClient | None = None
         self._next_owner, self._next_follow_s = "", 0.0
 
@@ -214,7 +207,7 @@ class FusionClient(ServiceChannel):
         Raises MismatchError if the grid, the world frame or the mission differ, NameInUseError while another robot
         holds the name's lease, NotPermittedError for a banned agent.
         """
-        request = fusion_service_pb2.JoinSessionRequest(
+        request = pb.JoinSessionRequest(
             agent_id=agent_id,
             mission_id=self.mission_id,
             grid=convert.grid_to_message(grid),
@@ -227,7 +220,7 @@ class FusionClient(ServiceChannel):
         )
         return self._call(self._stub.JoinSession, request)
 
-    def keep_session(self, session_id: str) -> fusion_service_pb2.KeepSessionResponse:
+    def keep_session(self, session_id: str) -> pb.KeepSessionResponse:
         """Renew the lease; returns what identifies the updates that the server has. Raises SessionUnknownError."""
         if self._owner is not None:
             try:
@@ -235,16 +228,16 @@ class FusionClient(ServiceChannel):
                 return self._owner.keep_session(session_id)
             except UnavailableError:
                 self._leave_owner()
-        return self._call(self._stub.KeepSession, fusion_service_pb2.KeepSessionRequest(session_id=session_id))
+        return self._call(self._stub.KeepSession, pb.KeepSessionRequest(session_id=session_id))
 
     def stored_digests(self, session_id: str) -> TileDigests:
         """Return the digests of the updates that the server has of the session's agent."""
-        request = fusion_service_pb2.GetUpdateDigestsRequest(session_id=session_id)
+        request = pb.GetUpdateDigestsRequest(session_id=session_id)
         return digests_from_messages(self._stream(self._stub.GetUpdateDigests, request, self._deadline_s))
 
     def contribute(
-        self, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
-    ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
+        self, requests: Sequence[pb.ContributeSubsetsRequest], deadline_s: float
+    ) -> Iterator[pb.ContributeSubsetsResponse]:
         """Send these subsets; yields the acknowledgements until all have arrived or `deadline_s` has passed.
 
         Where several servers share the mission, later subsets go to the owner of these, if it can be reached.
@@ -264,8 +257,8 @@ class FusionClient(ServiceChannel):
         yield from self._send(self, requests, deadline_s)
 
     def _send(
-        self, server: FusionClient, requests: Sequence[fusion_service_pb2.ContributeSubsetsRequest], deadline_s: float
-    ) -> Iterator[fusion_service_pb2.ContributeSubsetsResponse]:
+        self, server: FusionClient, requests: Sequence[pb.ContributeSubsetsRequest], deadline_s: float
+    ) -> Iterator[pb.ContributeSubsetsResponse]:
         for response in server._exchange(server._stub.ContributeSubsets, requests, deadline_s):
             self._next_owner = response.outcomes[-1].owner if response.outcomes else self._next_owner
             yield response
@@ -303,13 +296,13 @@ class FusionClient(ServiceChannel):
         keyframes: Iterable[geometry_pb2.EncodedFrame],
         selected: Sequence[int] = (),
         deadline_s: float | None = None,
-    ) -> fusion_service_pb2.ContributeKeyframesResponse:
+    ) -> pb.ContributeKeyframesResponse:
         """Send encoded keyframes; the server deletes this agent's others that are not `selected`, if it is not empty.
 
         Raises QuotaError, SessionUnknownError.
         """
         requests = (
-            fusion_service_pb2.ContributeKeyframesRequest(session_id=session_id, keyframe=keyframe, selected=selected)
+            pb.ContributeKeyframesRequest(session_id=session_id, keyframe=keyframe, selected=selected)
             for keyframe in keyframes
         )
         return self._call(self._stub.ContributeKeyframes, requests, deadline_s or 10 * self._deadline_s)
@@ -325,29 +318,27 @@ class FusionClient(ServiceChannel):
 
         Raises RevisionGoneError if since_revision is gone.
         """
-        request = fusion_service_pb2.WatchFusedMapRequest(
+        request = pb.WatchFusedMapRequest(
             mission_id=self.mission_id,
             since_revision=since_revision,
             region=None if region is None else convert.box_to_message(region),
-            layer=fusion_service_pb2.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
+            layer=pb.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
             exclude_agent_id=exclude_agent,
         )
         yield from _decode_updates(self._stream(self._stub.WatchFusedMap, request))
 
-    def refine(
-        self, iterations: int = 0, max_gaussians: int = 0, seed: int = 0
-    ) -> Iterator[fusion_service_pb2.RefineFusedMapResponse]:
+    def refine(self, iterations: int = 0, max_gaussians: int = 0, seed: int = 0) -> Iterator[pb.RefineFusedMapResponse]:
         """Refine the fused map on all agents' keyframes; yields progress; closing the iterator cancels."""
-        request = fusion_service_pb2.RefineFusedMapRequest(
+        request = pb.RefineFusedMapRequest(
             mission_id=self.mission_id, iterations=iterations, max_gaussians=max_gaussians, seed=seed
         )
         return self._stream(self._stub.RefineFusedMap, request)
 
     def export(self, export: Export) -> bytes:
         """Return a map as the bytes of a PLY file. Raises MismatchError before the first refinement, ChecksumError."""
-        request = fusion_service_pb2.ExportFusedMapRequest(
+        request = pb.ExportFusedMapRequest(
             mission_id=self.mission_id,
-            strategy=fusion_service_pb2.FusionStrategy.Value(f"FUSION_STRATEGY_{export.strategy.upper()}"),
+            strategy=pb.FusionStrategy.Value(f"FUSION_STRATEGY_{export.strategy.upper()}"),
             agent_id=export.agent_id,
         )
         data, last = bytearray(), None
@@ -363,11 +354,11 @@ class FusionClient(ServiceChannel):
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: str = "vote") -> _View:
         """Return colour and depth in metres of a layer of the map (vote, refined), rendered from this pose."""
-        request = fusion_service_pb2.RenderFusedViewRequest(
+        request = pb.RenderFusedViewRequest(
             mission_id=self.mission_id,
             camera=convert.camera_to_message(camera),
             t_world_camera=convert.transform_to_message(T_world_camera),
-            layer=fusion_service_pb2.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
+            layer=pb.MapLayer.Value(f"MAP_LAYER_{layer.upper()}"),
         )
         return _decode_view(self._call(self._stub.RenderView, request), camera)
 
@@ -379,7 +370,7 @@ class FusionClient(ServiceChannel):
 
     def query_objects(self, noun: str = "") -> tuple[TeamObject, ...]:
         """Return the team's objects that a noun names, or all, the most confident first."""
-        request = fusion_service_pb2.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
+        request = pb.QueryObjectsRequest(mission_id=self.mission_id, noun=noun)
         return tuple(map(team_object_from_message, self._call(self._stub.QueryObjects, request).objects))
 
     def keyframe(self, agent_id: str, index: int | None = None) -> StoredKeyframe | None:
@@ -387,17 +378,17 @@ class FusionClient(ServiceChannel):
 
         Raises InvalidInputError if it has others only.
         """
-        request = fusion_service_pb2.GetKeyframeRequest(mission_id=self.mission_id, agent_id=agent_id, index=index)
+        request = pb.GetKeyframeRequest(mission_id=self.mission_id, agent_id=agent_id, index=index)
         return stored_keyframe_from_message(self._call(self._stub.GetKeyframe, request))
 
-    def status(self) -> fusion_service_pb2.GetSessionStatusResponse:
+    def status(self) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
-        request = fusion_service_pb2.GetSessionStatusRequest(mission_id=self.mission_id)
+        request = pb.GetSessionStatusRequest(mission_id=self.mission_id)
         return self._call(self._stub.GetSessionStatus, request)
 
     def unlocalised(self) -> dict[str, str]:
         """Return the agents whose frame nobody knows, with what the server says of it; their objects are left out."""
-        state = fusion_service_pb2.ALIGNMENT_STATE_UNLOCALISED
+        state = pb.ALIGNMENT_STATE_UNLOCALISED
         return {
             agent.agent_id: agent.alignment.message for agent in self.status().agents if agent.alignment.state == state
         }
@@ -407,15 +398,15 @@ class FusionClient(ServiceChannel):
 
         Raises NotPermittedError unless the caller is an operator, InvalidInputError for an unknown agent.
         """
-        request = fusion_service_pb2.EvictAgentRequest(mission_id=self.mission_id, agent_id=agent_id, ban=ban)
+        request = pb.EvictAgentRequest(mission_id=self.mission_id, agent_id=agent_id, ban=ban)
         return self._call(self._stub.EvictAgent, request).voxels
 
     def unban(self, agent_id: str) -> None:
         """Let a banned agent join again. Raises NotPermittedError, InvalidInputError if it is not banned."""
-        request = fusion_service_pb2.UnbanAgentRequest(mission_id=self.mission_id, agent_id=agent_id)
+        request = pb.UnbanAgentRequest(mission_id=self.mission_id, agent_id=agent_id)
         self._call(self._stub.UnbanAgent, request)
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """Leave the mission; with `forget` the server deletes the agent's updates. Returns the fused revision."""
-        request = fusion_service_pb2.LeaveSessionRequest(session_id=session_id, forget=forget)
+        request = pb.LeaveSessionRequest(session_id=session_id, forget=forget)
         return self._call(self._stub.LeaveSession, request).fused_revision

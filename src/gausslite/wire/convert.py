@@ -45,21 +45,6 @@ def point_from_message(message: geometry_pb2.Point) -> PointM:
     return message.x, message.y, message.z
 
 
-def _lens_from_message(message: geometry_pb2.EncodedFrame) -> Lens | None:
-    """Return the lens of a frame, None for a pinhole. Raises InvalidInputError."""
-    if not message.HasField("lens"):
-        return None
-    if message.lens.model not in _LENS_MODELS:
-        raise InvalidInputError(f"frame lens: expected the model RADTAN or FISHEYE, got number {message.lens.model}")
-    return Lens(_LENS_MODELS[message.lens.model], tuple(message.lens.coefficients))
-
-
-def _twist_to_message(twist: Twist) -> geometry_pb2.Twist:
-    return geometry_pb2.Twist(
-        linear_m_s=point_to_message(twist.linear_m_s), angular_rad_s=point_to_message(twist.angular_rad_s)
-    )
-
-
 def _motion_from_message(message: geometry_pb2.EncodedFrame) -> CameraMotion | None:
     """Return the motion of a frame, None if it states no twist. Raises InvalidInputError."""
     if not message.HasField("twist"):
@@ -245,7 +230,11 @@ def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False
 
     compact: a third smaller, but encoding takes three times longer; for keyframes, which share a robot's bandwidth.
     """
-    motion = frame.motion
+    motion, moved = frame.motion, dict[str, Any]()
+    if motion is not None:
+        linear, angular = (point_to_message(xyz) for xyz in (motion.twist.linear_m_s, motion.twist.angular_rad_s))
+        twist = geometry_pb2.Twist(linear_m_s=linear, angular_rad_s=angular)
+        moved = {"readout_seconds": motion.readout_s, "exposure_seconds": motion.exposure_s, "twist": twist}
     return geometry_pb2.EncodedFrame(
         index=frame.index,
         capture_time_ns=frame.capture_time_ns,
@@ -253,9 +242,7 @@ def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False
         depth_png=encode_depth(frame.depth_m, KEYFRAME_PNG_COMPRESSION if compact else PNG_COMPRESSION),
         camera=camera_to_message(frame.camera),
         t_world_camera=transform_to_message(frame.T_world_camera),
-        readout_seconds=0.0 if motion is None else motion.readout_s,
-        exposure_seconds=0.0 if motion is None else motion.exposure_s,
-        twist=None if motion is None else _twist_to_message(motion.twist),
+        **moved,
     )
 
 
@@ -279,7 +266,12 @@ def live_frame_to_message(frame: Frame, lens: Lens | None, lossless: bool = Fals
 
 def live_frame_from_message(message: geometry_pb2.EncodedFrame) -> tuple[Frame, Lens | None]:
     """Decode a frame of a live camera as recorded, and its lens. Raises InvalidInputError and subclasses."""
-    lens = _lens_from_message(message)
+    lens = None
+    if message.HasField("lens"):
+        model, coefficients = message.lens.model, tuple(message.lens.coefficients)
+        if model not in _LENS_MODELS:
+            raise InvalidInputError(f"frame lens: expected the model RADTAN or FISHEYE, got number {model}")
+        lens = Lens(_LENS_MODELS[model], coefficients)
     return _decode_images(message), lens
 
 
@@ -339,15 +331,8 @@ def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits
     if len(winner) not in (0, 0 if batch is None else len(batch)) or any(i >= len(names) for i in winner):
         raise InvalidInputError("map block provenance: expected one known agent for each voxel")
     winners = tuple(names[i] for i in winner)
-    return MapUpdate(
-        revision=message.revision,
-        snapshot=message.snapshot,
-        first=first,
-        last=message.last,
-        batch=batch,
-        grid=grid,
-        winners=winners,
-    )
+    of_block = values_of(message, ("revision", "snapshot", "last"))
+    return MapUpdate(**of_block, first=first, batch=batch, grid=grid, winners=winners)
 
 
 def message_to_values(message: Message) -> dict[str, Any]:

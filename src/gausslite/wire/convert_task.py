@@ -188,16 +188,15 @@ def _require_known_numbers(message: task_pb2.TaskGraph) -> None:
 def _relation_from_message(message: task_pb2.Relation) -> Relation:
     return Relation(
         _PREDICATE_BY_NUMBER[message.predicate],
-        message.target,
-        message.anchor,
-        message.negated,
-        message.min_m if message.HasField("min_m") else None,
-        message.max_m if message.HasField("max_m") else None,
+        **values_of(message, ("target", "anchor", "negated")),
+        min_m=message.min_m if message.HasField("min_m") else None,
+        max_m=message.max_m if message.HasField("max_m") else None,
     )
 
 
 _ROLES = {ObjectRole.TARGET: objects_pb2.OBJECT_ROLE_TARGET, ObjectRole.ANCHOR: objects_pb2.OBJECT_ROLE_ANCHOR}
 _OBJECT_ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}
+_LANDMARK = ("noun", "confidence", "first_seen_ns", "last_seen_ns")
 _OBSERVER = tuple(field.name for field in fields(ObjectObserver))
 
 
@@ -205,13 +204,10 @@ def object_to_message(landmark: ObjectLandmark, observers: Sequence[ObjectObserv
     """Encode an object; without observers, as one agent reports it."""
     return objects_pb2.ObjectLandmark(
         id=landmark.object_id,
-        noun=landmark.noun,
+        **values_of(landmark, _LANDMARK),
         role=_ROLES[landmark.role],
         centroid_m=point_to_message(landmark.centroid_m),
         extent_m=box_to_message(landmark.extent_m),
-        confidence=landmark.confidence,
-        first_seen_ns=landmark.first_seen_ns,
-        last_seen_ns=landmark.last_seen_ns,
         observers=[objects_pb2.ObjectObserver(**values_of(observer, _OBSERVER)) for observer in observers],
     )
 
@@ -223,13 +219,10 @@ def object_from_message(message: objects_pb2.ObjectLandmark) -> ObjectLandmark:
         raise InvalidInputError(f"object role: expected TARGET or ANCHOR, got {message.role}")
     return ObjectLandmark(
         object_id=message.id,
-        noun=message.noun,
         role=role,
         centroid_m=point_from_message(message.centroid_m),
         extent_m=box_from_message(message.extent_m),
-        confidence=message.confidence,
-        first_seen_ns=message.first_seen_ns,
-        last_seen_ns=message.last_seen_ns,
+        **values_of(message, _LANDMARK),
     )
 
 

@@ -6,9 +6,10 @@ import asyncio
 import json
 import logging
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from datetime import UTC, datetime
 from enum import StrEnum
+from typing import Any
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.process import print_message, printable
@@ -59,15 +60,11 @@ def log_to_stderr(program: str, log_format: LogFormat = LogFormat.TEXT) -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=log_format is LogFormat.JSON)
 
 
-def run_service(program: str, serve: Callable[[], Awaitable[int]]) -> int:
+def run_service(program: str, serve: Callable[[], Coroutine[Any, Any, int]]) -> int:
     """Run the service and return its exit code; 2 with one line on stderr after a GaussLiteError."""
     log_to_stderr(program)
-
-    async def body() -> int:
-        return await serve()
-
     try:
-        return asyncio.run(body())
+        return asyncio.run(serve())
     except GaussLiteError as error:
         print_message(f"{program}: {error}")
         return 2

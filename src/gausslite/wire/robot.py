@@ -73,12 +73,7 @@ class AgentSnapshot:
 
 
 _FIRST_RETRY_S = 0.5
-_OUTCOMES = {
-    pb.FRAME_OUTCOME_MAPPED: "mapped",
-    pb.FRAME_OUTCOME_SKIPPED: "skipped",
-    pb.FRAME_OUTCOME_DROPPED: "dropped",
-    pb.FRAME_OUTCOME_REJECTED: "rejected",
-}
+_OUTCOMES = {number: name.removeprefix("FRAME_OUTCOME_").lower() for name, number in pb.FrameOutcome.items() if number}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,19 +102,12 @@ class FrameSender:
         self._changed = threading.Condition()
         self._closing, self._stopped = False, threading.Event()
         self._stream_number = 0
-        self._counters, self._problem = SentFrames(), ""
+        self.counters = SentFrames()
+        """Frames by outcome so far."""
+        self.problem = ""
+        """Why the latest stream ended, or why a frame was rejected; empty after a frame that was mapped."""
         self._thread = threading.Thread(target=self._run, name="frame sender", daemon=True)
         self._thread.start()
-
-    @property
-    def counters(self) -> SentFrames:
-        """Frames by outcome so far."""
-        return self._counters
-
-    @property
-    def problem(self) -> str:
-        """Why the latest stream ended, or why a frame was rejected; empty after a frame that was mapped."""
-        return self._problem
 
     def send(self, frame: Frame, lens: Lens | None) -> None:
         """Queue a frame; lens: distortion of its images."""
@@ -150,12 +138,12 @@ class FrameSender:
             try:
                 self._stream(delay)
             except GaussLiteError as error:
-                self._problem = str(error)
+                self.problem = str(error)
                 with self._changed:
                     # the iterator of the broken stream must not take frames of the next one
                     self._stream_number += 1
                     self._changed.notify_all()
-                c = self._counters
+                c = self.counters
                 self._count("lost", c.sent - c.mapped - c.skipped - c.dropped - c.rejected - c.lost)
                 if self._closing or self._stopped.wait(delay.after(error)):
                     return
@@ -166,7 +154,7 @@ class FrameSender:
         for outcome in self._client.ingest(self._frames(self._stream_number, lens), self._lossless, lens):
             name = _OUTCOMES.get(outcome.outcome, "skipped")
             self._count(name)
-            self._problem = f"frame {outcome.index} was rejected: {outcome.reason}" if name == "rejected" else ""
+            self.problem = f"frame {outcome.index} was rejected: {outcome.reason}" if name == "rejected" else ""
             delay.reset()
 
     def _frames(self, stream_number: int, lens: Lens | None) -> Iterator[Frame]:
@@ -188,7 +176,7 @@ class FrameSender:
 
     def _count(self, name: str, number: int = 1) -> None:
         with self._changed:
-            self._counters = replace(self._counters, **{name: getattr(self._counters, name) + number})
+            self.counters = replace(self.counters, **{name: getattr(self.counters, name) + number})
 
 
 _CLOSE_S = 10.0
@@ -218,17 +206,13 @@ class AgentLink:
         self._sender = FrameSender(client, self._settings.queue_frames, self._settings.lossless)
         self._task: str | None = None
         self._task_problem = self._status_problem = ""
-        self._snapshot: AgentSnapshot | None = None
+        self.snapshot: AgentSnapshot | None = None
+        """The agent's latest status; None before the first and while the agent does not answer."""
         self._closing = self._woken = False
         self._changed = threading.Condition()
         self._follower = MapFollower(client.watch_map) if self._settings.follow_map else None
         self._thread = threading.Thread(target=self._run, name="agent link", daemon=True)
         self._thread.start()
-
-    @property
-    def snapshot(self) -> AgentSnapshot | None:
-        """The agent's latest status; None before the first and while the agent does not answer."""
-        return self._snapshot
 
     @property
     def sent_frames(self) -> SentFrames:
@@ -267,7 +251,7 @@ class AgentLink:
             self._changed.notify_all()
         try:
             self._sender.close(_CLOSE_S)
-            waits_for_task = self._snapshot is not None and self._snapshot.state == "waiting_for_task"
+            waits_for_task = self.snapshot is not None and self.snapshot.state == "waiting_for_task"
             if not end_mission or waits_for_task:
                 return ""
             return self._client.end_mission(self._settings.handover, self._settings.drain_s).summary
@@ -305,7 +289,7 @@ class AgentLink:
 
     def _query_status(self) -> None:
         try:
-            self._snapshot = AgentSnapshot.from_message(self._client.status())
+            self.snapshot = AgentSnapshot.from_message(self._client.status())
             self._status_problem = ""
         except GaussLiteError as error:
-            self._snapshot, self._status_problem = None, str(error)
+            self.snapshot, self._status_problem = None, str(error)

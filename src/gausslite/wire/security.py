@@ -130,46 +130,30 @@ class RejectionLog:
 
 
 _ANY = frozenset({Role.ROBOT, Role.VIEWER, Role.OPERATOR})
-_ROBOT, _OPERATOR = frozenset({Role.ROBOT}), frozenset({Role.OPERATOR})
-_PARSER, _AGENT, _FUSION, _REGION = (
-    f"/gausslite.v1.{name}Service/" for name in ("Parser", "Agent", "Fusion", "Region")
+_ROBOT, _OPERATOR, _SERVER = (frozenset({role}) for role in (Role.ROBOT, Role.OPERATOR, Role.SERVER))
+_CONTRIBUTE = (
+    "JoinSession ContributeSubsets ContributeKeyframes ReportObjects KeepSession GetUpdateDigests LeaveSession"
 )
-_FOR_SERVERS = (
-    *("StorePart", "BeginAgent", "RemoveAgent", "ReadVoxels", "WatchFusedMap", "GetSessionStatus", "GetUpdateDigests"),
-    "CallHome",
+_SHARE = "StorePart BeginAgent RemoveAgent ReadVoxels WatchFusedMap GetSessionStatus GetUpdateDigests CallHome"
+_METHODS = (
+    ("Parser", _ANY, "ParseTask"),
+    ("Agent", _OPERATOR, "AssignTask EndMission"),
+    ("Agent", _ROBOT | _OPERATOR, "IngestFrames"),
+    ("Agent", _ANY, "GetAgentStatus WatchMap GetCameraView RenderView"),
+    ("Fusion", _ROBOT, _CONTRIBUTE),
+    ("Fusion", _ANY, "WatchFusedMap GetKeyframe ExportFusedMap QueryObjects RenderView GetSessionStatus"),
+    ("Fusion", _OPERATOR, "RefineFusedMap EvictAgent UnbanAgent"),
+    ("Region", _SERVER, _SHARE),
 )
-
 ROLES_OF_METHOD: Final = {
-    _PARSER + "ParseTask": _ANY,
-    _AGENT + "AssignTask": _OPERATOR,
-    _AGENT + "EndMission": _OPERATOR,
-    _AGENT + "IngestFrames": _ROBOT | _OPERATOR,
-    _AGENT + "GetAgentStatus": _ANY,
-    _AGENT + "WatchMap": _ANY,
-    _AGENT + "GetCameraView": _ANY,
-    _AGENT + "RenderView": _ANY,
-    _FUSION + "JoinSession": _ROBOT,
-    _FUSION + "ContributeSubsets": _ROBOT,
-    _FUSION + "ContributeKeyframes": _ROBOT,
-    _FUSION + "ReportObjects": _ROBOT,
-    _FUSION + "KeepSession": _ROBOT,
-    _FUSION + "GetUpdateDigests": _ROBOT,
-    _FUSION + "LeaveSession": _ROBOT,
-    _FUSION + "WatchFusedMap": _ANY,
-    _FUSION + "GetKeyframe": _ANY,
-    _FUSION + "ExportFusedMap": _ANY,
-    _FUSION + "QueryObjects": _ANY,
-    _FUSION + "RenderView": _ANY,
-    _FUSION + "GetSessionStatus": _ANY,
-    _FUSION + "RefineFusedMap": _OPERATOR,
-    _FUSION + "EvictAgent": _OPERATOR,
-    _FUSION + "UnbanAgent": _OPERATOR,
-    **{_REGION + name: frozenset({Role.SERVER}) for name in _FOR_SERVERS},
+    f"/gausslite.v1.{service}Service/{name}": roles for service, roles, names in _METHODS for name in names.split()
 }
 """The caller's certificate must state one of these roles."""
 
 _LOCAL_WITHOUT_CERTIFICATES: Final = frozenset(
-    {_FUSION + "EvictAgent", _FUSION + "UnbanAgent", *(_REGION + name for name in _FOR_SERVERS)}
+    method
+    for method, roles in ROLES_OF_METHOD.items()
+    if roles == _SERVER or method.endswith(("/EvictAgent", "/UnbanAgent"))
 )
 """Without certificates, every caller may call the other methods; these need a caller on the server's machine."""
 
@@ -274,10 +258,9 @@ class Tls:
 def _read(option: str, path: Path) -> bytes:
     try:
         return path.read_bytes()
-    except FileNotFoundError:
-        raise InvalidInputError(f"{option} {path}: expected a PEM file, got nothing") from None
-    except IsADirectoryError:
-        raise InvalidInputError(f"{option} {path}: expected a PEM file, got a folder") from None
+    except (FileNotFoundError, IsADirectoryError):
+        found = "a folder" if path.is_dir() else "nothing"
+        raise InvalidInputError(f"{option} {path}: expected a PEM file, got {found}") from None
     except PermissionError:
         user = os.geteuid()
         raise InvalidInputError(

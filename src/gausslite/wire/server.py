@@ -25,17 +25,8 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError, UnavailableError
+from gausslite.wire import security
 from gausslite.wire.channel import KEEPALIVE_S, UNIX, connection_options, host_and_port
-from gausslite.wire.security import (
-    Caller,
-    CallLimits,
-    CallUsage,
-    RejectionLog,
-    Tls,
-    TokenBucket,
-    require_role,
-    wait_for_bandwidth,
-)
 from gausslite.wire.status import code_and_reason, to_status
 
 _log = logging.getLogger(__name__)
@@ -86,9 +77,15 @@ class ReadinessWatch:
                     await self._check_in_time()
                     next_check_s = time.monotonic() + _CHECK_S
             except GaussLiteError as error:
-                await self._record_failure(error)
+                if self._failing_since_s is None:
+                    self._failing_since_s = time.monotonic()
+                    _log.error("%s is NOT_SERVING: %s", self._service, error)
+                    await self._set_serving(False)
             else:
-                await self._record_success()
+                if self._failing_since_s is not None:
+                    failed_s, self._failing_since_s = time.monotonic() - self._failing_since_s, None
+                    _log.info("%s is SERVING again after %.0f s", self._service, failed_s)
+                    await self._set_serving(True)
 
     async def _check_in_time(self) -> None:
         """Wait for the running check, or for a new one. Raises UnavailableError if it takes too long."""
@@ -100,21 +97,9 @@ class ReadinessWatch:
         checked, self._checking = self._checking, None
         checked.result()
 
-    async def _record_failure(self, error: GaussLiteError) -> None:
-        if self._failing_since_s is None:
-            self._failing_since_s = time.monotonic()
-            _log.error("%s is NOT_SERVING: %s", self._service, error)
-            await self._set_serving(False)
-
-    async def _record_success(self) -> None:
-        if self._failing_since_s is not None:
-            _log.info("%s is SERVING again after %.0f s", self._service, time.monotonic() - self._failing_since_s)
-            self._failing_since_s = None
-            await self._set_serving(True)
-
 
 _LAST_CALLS_S = 1.0
-_HEALTH_LIMITS = CallLimits(connections=64, idle_s=10)
+_HEALTH_LIMITS = security.CallLimits(connections=64, idle_s=10)
 # the longest path of a unix socket that Linux accepts
 _MAX_SOCKET_PATH_BYTES = 107
 _OPTIONS = (
@@ -165,8 +150,8 @@ class RunningServer:
 async def start_server(
     listen: str,
     services: Sequence[Service],
-    tls: Tls | None = None,
-    limits: CallLimits | None = None,
+    tls: security.Tls | None = None,
+    limits: security.CallLimits | None = None,
     health_listen: str | None = None,
 ) -> RunningServer:
     """Serve on HOST:PORT (port 0 = any free port) or unix:PATH, with health and reflection; encrypted with `tls`.
@@ -175,7 +160,7 @@ async def start_server(
     encryption, so that connections to the other one cannot keep health checks out; None for no such address.
     Raises UnavailableError if the address is in use, InvalidInputError if it is not an address.
     """
-    limits = limits or CallLimits()
+    limits = limits or security.CallLimits()
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
     watches = [
         ReadinessWatch(
@@ -187,7 +172,7 @@ async def start_server(
         for service in services
         if service.check is not None
     ]
-    interceptor = CallInterceptor(CallUsage(limits), watches)
+    interceptor = CallInterceptor(security.CallUsage(limits), watches)
     server = grpc.aio.server(interceptors=[interceptor], options=(*_OPTIONS, *limits.connection_options))
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
     for service in services:
@@ -210,8 +195,8 @@ async def serve_until_stopped(
     listen: str,
     services: Sequence[Service],
     background_task: Callable[[], Awaitable[None]] | None = None,
-    tls: Tls | None = None,
-    limits: CallLimits | None = None,
+    tls: security.Tls | None = None,
+    limits: security.CallLimits | None = None,
     health_listen: str | None = None,
 ) -> None:
     """Serve until SIGTERM or SIGINT, or until the background task ends; then drain the server. Logs the addresses.
@@ -255,9 +240,9 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     Unexpected errors are INTERNAL and logged.
     """
 
-    def __init__(self, usage: CallUsage, watches: Sequence[ReadinessWatch] = ()) -> None:
+    def __init__(self, usage: security.CallUsage, watches: Sequence[ReadinessWatch] = ()) -> None:
         self._usage, self._watches = usage, watches
-        self._rejections = RejectionLog(_log)
+        self._rejections = security.RejectionLog(_log)
 
     async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
         """Return a handler that runs the called method and converts its errors; foreign services stay unchanged."""
@@ -267,14 +252,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
             return handler
         # requests are decoded inside the guard, because gRPC itself would answer UNKNOWN to an invalid message
         message_codecs = {"request_deserializer": None, "response_serializer": handler.response_serializer}
-        guard = _Guard(
-            method,
-            self._usage,
-            self._rejections,
-            self._watches,
-            handler.request_deserializer,
-            handler.request_streaming,
-        )
+        guard = _Guard(method, handler, self._usage, self._rejections, self._watches)
         kind = f"{_ARITY[handler.request_streaming]}_{_ARITY[handler.response_streaming]}"
         wrap = guard.stream_method if handler.response_streaming else guard.unary_method
         return getattr(grpc, f"{kind}_rpc_method_handler")(wrap(getattr(handler, kind)), **message_codecs)
@@ -285,11 +263,10 @@ class _Guard:
     """Runs one method of a servicer for callers that may call it, within their limits."""
 
     method: str
-    usage: CallUsage
-    rejections: RejectionLog
+    handler: Any
+    usage: security.CallUsage
+    rejections: security.RejectionLog
     watches: Sequence[ReadinessWatch]
-    deserialize: Callable[[bytes], Any]
-    request_streaming: bool
 
     def unary_method(self, inner: Any) -> Any:
         async def guarded(request: Any, context: Any) -> Any:
@@ -310,13 +287,13 @@ class _Guard:
     async def _admit(self, request: Any, context: Any) -> AsyncIterator[Any]:
         """Give the decoded request, or stream of requests, at the caller's bandwidth; an error ends the call."""
         try:
-            caller = Caller.of(context)
-            require_role(self.method, caller)
+            caller = security.Caller.of(context)
+            security.require_role(self.method, caller)
             with self.usage.open_call(caller) as bandwidth:
-                if self.request_streaming:
+                if self.handler.request_streaming:
                     yield self._read_stream(context, bandwidth)
                 else:
-                    await wait_for_bandwidth(bandwidth, len(request))
+                    await security.wait_for_bandwidth(bandwidth, len(request))
                     yield self._decode(request)
         except Exception as error:
             await self._abort(error, context)
@@ -332,22 +309,22 @@ class _Guard:
             for watch in self.watches:
                 watch.wake()
         elif not isinstance(error, UnavailableError):
-            self.rejections.record(Caller.of(context).key, code_and_reason(error)[1], str(error))
+            self.rejections.record(security.Caller.of(context).key, code_and_reason(error)[1], str(error))
         await context.abort_with_status(to_status(error))
         raise error
 
-    async def _read_stream(self, context: Any, bandwidth: TokenBucket | None) -> AsyncIterator[Any]:
+    async def _read_stream(self, context: Any, bandwidth: security.TokenBucket | None) -> AsyncIterator[Any]:
         """Yield the requests at the caller's bandwidth; HTTP/2's flow control then slows the caller down."""
         # gRPC's iterator would keep the bytes of a request while the method works on it
         while (data := await context.read()) is not grpc.aio.EOF:  # type: ignore[attr-defined]
-            await wait_for_bandwidth(bandwidth, len(data))
+            await security.wait_for_bandwidth(bandwidth, len(data))
             request = self._decode(data)
             del data
             yield request
 
     def _decode(self, data: bytes) -> Any:
         try:
-            return self.deserialize(data)
+            return self.handler.request_deserializer(data)
         except DecodeError as error:
             raise InvalidInputError(
                 f"{self.method}: expected its request message, got {len(data)} invalid bytes"
@@ -361,7 +338,7 @@ async def _set_health(health_servicer: Any, service: str, is_serving: bool) -> N
         await health_servicer.set(name, states.SERVING if is_serving else states.NOT_SERVING)
 
 
-def _bind(server: grpc.aio.Server, listen: str, tls: Tls | None) -> str:
+def _bind(server: grpc.aio.Server, listen: str, tls: security.Tls | None) -> str:
     """Let the server listen; returns the address with the actual port. Raises UnavailableError, InvalidInputError."""
     _require_free_address(listen)
     try:

@@ -24,6 +24,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -171,20 +172,12 @@ class Spool:
         records = to_records(batch.gaussians)
         offsets = batch.offsets.tolist()
         sums = np.minimum(batch.kappa_sums, np.uint64(_MAX_INTEGER)).tolist()
+        rows = (
+            (key, int(purpose), kappa_sum, stop - start, records[start:stop].tobytes())
+            for key, kappa_sum, (start, stop) in zip(batch.keys.tolist(), sums, pairwise(offsets), strict=True)
+        )
         with self._transaction():
-            self._database.executemany(
-                _ENQUEUE,
-                (
-                    (
-                        key,
-                        int(purpose),
-                        sums[i],
-                        offsets[i + 1] - offsets[i],
-                        records[offsets[i] : offsets[i + 1]].tobytes(),
-                    )
-                    for i, key in enumerate(batch.keys.tolist())
-                ),
-            )
+            self._database.executemany(_ENQUEUE, rows)
 
     def voxels(self, purpose: Purpose | None = None) -> Int64[ndarray, " v"]:
         """Return the keys of the voxels whose latest update has Gaussians, ascending; purpose: only updates for it."""

@@ -17,16 +17,7 @@ from dataclasses import replace
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.domain.errors import (
-    GaussLiteError,
-    InvalidInputError,
-    MismatchError,
-    NameInUseError,
-    NotPermittedError,
-    QuotaError,
-    SessionUnknownError,
-    StorageError,
-)
+from gausslite.domain import errors
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.v1 import geometry_pb2
@@ -169,9 +160,9 @@ class Uplink:
             while self._wait_until_due():
                 try:
                     self._end_round(self._send_round())
-                except (MismatchError, NotPermittedError, InvalidInputError) as error:
+                except (errors.MismatchError, errors.NotPermittedError, errors.InvalidInputError) as error:
                     self._stop(str(error))
-                except GaussLiteError as error:
+                except errors.GaussLiteError as error:
                     if not self._closing:
                         self._recover(error)
             if self._session is not None and not self._last_error:
@@ -262,7 +253,7 @@ class Uplink:
             return
         try:
             self._token_bucket.spend(self._client.report_objects(session.session_id, report))
-        except InvalidInputError as error:
+        except errors.InvalidInputError as error:
             # the map does not depend on it
             _log.warning("uplink: the report of objects is dropped: %s", error)
         self._sent_report = report
@@ -304,17 +295,17 @@ class Uplink:
                 self._counters = replace(self._counters, connected=True, joins=self._counters.joins + 1)
         return self._session
 
-    def _recover(self, error: GaussLiteError) -> None:
+    def _recover(self, error: errors.GaussLiteError) -> None:
         """Prepare a retry: join again, send smaller messages, or only wait."""
         if str(error) != self._last_error:
             # logged once and not at every retry, because a robot may be offline for hours
             _log.warning("uplink: %s; retrying", error)
             self._last_error = str(error)
-        if isinstance(error, NameInUseError):
+        if isinstance(error, errors.NameInUseError):
             self._session = None
-        if isinstance(error, SessionUnknownError):
+        if isinstance(error, errors.SessionUnknownError):
             self._forget_session()
-        if isinstance(error, (QuotaError, StorageError)):
+        if isinstance(error, (errors.QuotaError, errors.StorageError)):
             self._sender.halve_messages()
         with self._changed:
             self._counters = replace(self._counters, connected=False)

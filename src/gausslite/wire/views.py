@@ -17,17 +17,7 @@ from gausslite.domain.relevance import CameraView, DetectedBox, DetectedImage
 from gausslite.v1 import agent_service_pb2 as agent_pb
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
-from gausslite.wire.convert import (
-    MAX_IMAGE_PX,
-    camera_from_message,
-    camera_to_message,
-    decode_colour,
-    decode_mask,
-    encode_colour,
-    encode_mask,
-    transform_from_message,
-    transform_to_message,
-)
+from gausslite.wire import convert
 
 MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
 _SIDES = ("left_px", "top_px", "right_px", "bottom_px")
@@ -38,18 +28,20 @@ def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewRes
     if view is None:
         return agent_pb.GetCameraViewResponse()
     return agent_pb.GetCameraViewResponse(
-        colour_jpeg=encode_colour(view.rgb),
-        region_png=encode_mask(view.roi),
-        camera=camera_to_message(view.camera),
+        colour_jpeg=convert.encode_colour(view.rgb),
+        region_png=convert.encode_mask(view.roi),
+        camera=convert.camera_to_message(view.camera),
         frame_index=view.frame_index,
-        t_world_camera=transform_to_message(view.T_world_camera),
+        t_world_camera=convert.transform_to_message(view.T_world_camera),
         path=[
             agent_pb.StampedPose(
-                capture_time_ns=int(view.times_ns[i]), t_world_camera=transform_to_message(view.path[i])
+                capture_time_ns=int(view.times_ns[i]), t_world_camera=convert.transform_to_message(view.path[i])
             )
             for i in _evenly(len(view.path), MAX_POSES)
         ],
-        keyframes=[transform_to_message(view.keyframes[i]) for i in _evenly(len(view.keyframes), MAX_KEYFRAMES)],
+        keyframes=[
+            convert.transform_to_message(view.keyframes[i]) for i in _evenly(len(view.keyframes), MAX_KEYFRAMES)
+        ],
         detected=None if view.detected is None else _detected_to_message(view.detected),
     )
 
@@ -64,13 +56,13 @@ def camera_view_from_message(message: agent_pb.GetCameraViewResponse) -> CameraV
     ):
         if count > highest:
             raise InvalidInputError(f"camera view {name}: expected at most {highest} poses, got {count}")
-    camera = camera_from_message(message.camera)
+    camera = convert.camera_from_message(message.camera)
     return CameraView(
-        rgb=decode_colour(message.colour_jpeg, camera.width_px, camera.height_px),
-        roi=decode_mask(message.region_png, camera.width_px, camera.height_px),
+        rgb=convert.decode_colour(message.colour_jpeg, camera.width_px, camera.height_px),
+        roi=convert.decode_mask(message.region_png, camera.width_px, camera.height_px),
         camera=camera,
         frame_index=message.frame_index,
-        T_world_camera=transform_from_message("camera view t_world_camera", message.t_world_camera),
+        T_world_camera=convert.transform_from_message("camera view t_world_camera", message.t_world_camera),
         times_ns=np.array([view_pose.capture_time_ns for view_pose in message.path], np.int64),
         path=_poses("camera view path", [view_pose.t_world_camera for view_pose in message.path]),
         keyframes=_poses("camera view keyframes", list(message.keyframes)),
@@ -83,7 +75,7 @@ def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
     boxes = sorted(detected.boxes, key=lambda box: -box.score)[:MAX_BOXES]
     return agent_pb.DetectedImage(
         frame_index=detected.index,
-        colour_jpeg=encode_colour(detected.rgb),
+        colour_jpeg=convert.encode_colour(detected.rgb),
         width_px=width_px,
         height_px=height_px,
         boxes=[
@@ -96,9 +88,9 @@ def _detected_to_message(detected: DetectedImage) -> agent_pb.DetectedImage:
 
 
 def _detected_from_message(message: agent_pb.DetectedImage) -> DetectedImage:
-    if not 0 < message.width_px * message.height_px <= MAX_IMAGE_PX:
+    if not 0 < message.width_px * message.height_px <= convert.MAX_IMAGE_PX:
         size = f"{message.width_px}x{message.height_px}"
-        raise InvalidInputError(f"detected image: expected 1 to {MAX_IMAGE_PX} pixels, got {size}")
+        raise InvalidInputError(f"detected image: expected 1 to {convert.MAX_IMAGE_PX} pixels, got {size}")
     if len(message.boxes) > MAX_BOXES:
         raise InvalidInputError(f"detected boxes: expected at most {MAX_BOXES}, got {len(message.boxes)}")
     boxes = []
@@ -108,12 +100,13 @@ def _detected_from_message(message: agent_pb.DetectedImage) -> DetectedImage:
         if not all(math.isfinite(value) for value in (*box_px, box.score)):
             raise InvalidInputError("detected boxes: expected finite numbers, got others")
         boxes.append(DetectedBox(box.phrase, box.score, box_px, is_weak=box.is_weak))
-    rgb = decode_colour(message.colour_jpeg, message.width_px, message.height_px)
+    rgb = convert.decode_colour(message.colour_jpeg, message.width_px, message.height_px)
     return DetectedImage(message.frame_index, rgb, tuple(boxes))
 
 
 def _poses(name: str, messages: list[geometry_pb2.RigidTransform]) -> Float64[ndarray, "n 4 4"]:
-    return np.array([transform_from_message(name, message) for message in messages], np.float64).reshape(-1, 4, 4)
+    poses = [convert.transform_from_message(name, message) for message in messages]
+    return np.array(poses, np.float64).reshape(-1, 4, 4)
 
 
 def _evenly(count: int, highest: int) -> Int64[ndarray, " n"]:
@@ -180,21 +173,23 @@ class StoredKeyframe:
 
 def region_from_png(data: bytes, camera: Camera) -> Bool[ndarray, "h w"] | None:
     """Decode the region of a keyframe; None for empty bytes. Raises InvalidInputError."""
-    return decode_mask(data, camera.width_px, camera.height_px) if data else None
+    return convert.decode_mask(data, camera.width_px, camera.height_px) if data else None
 
 
 def stored_keyframe_from_message(message: pb.GetKeyframeResponse) -> StoredKeyframe | None:
     """Decode a keyframe; None if the server has none of the agent. Raises InvalidInputError, PoseError."""
     if not message.colour:
         return None
-    camera = camera_from_message(message.camera)
+    camera = convert.camera_from_message(message.camera)
     has_pose = message.HasField("t_world_camera")
     return StoredKeyframe(
         index=message.index,
         capture_time_ns=message.capture_time_ns,
-        rgb=decode_colour(message.colour, camera.width_px, camera.height_px),
+        rgb=convert.decode_colour(message.colour, camera.width_px, camera.height_px),
         camera=camera,
-        T_world_camera=transform_from_message("keyframe t_world_camera", message.t_world_camera) if has_pose else None,
+        T_world_camera=convert.transform_from_message("keyframe t_world_camera", message.t_world_camera)
+        if has_pose
+        else None,
         indices=tuple(message.indices),
         roi=region_from_png(message.region_png, camera),
     )
