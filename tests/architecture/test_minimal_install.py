@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
-_SHARING = ("part_sender", "peers", "region_", "shared_", "sharing")
+_SHARING = ("peers", "region_", "shared_")
 NEED_AN_EXTRA = {
     "torch": ("gausslite.render.reference", "gausslite.render.cuda"),
     "psycopg": ("gausslite.fusion.postgres_", *(f"gausslite_fusion_server.{name}" for name in _SHARING)),

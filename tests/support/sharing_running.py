@@ -18,7 +18,7 @@ from gausslite.wire.clients import FusionClient
 from gausslite.wire.security import Tls
 from gausslite.wire.server import start_server
 from gausslite_fusion_server.settings import ServerSettings
-from gausslite_fusion_server.sharing import Share, open_share
+from gausslite_fusion_server.shared_servicer import Share, open_share
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
-from types import TracebackType
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import asdict
 
 import google_crc32c
 import numpy as np
@@ -22,14 +24,8 @@ from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
-from gausslite.wire.convert import (
-    decode_frame,
-    encode_colour,
-    encode_depth,
-    frame_from_message,
-    transform_from_message,
-    transform_to_message,
-)
+from gausslite.wire import convert
+from gausslite.wire.map_changes import read_deadline
 from gausslite.wire.security import Caller
 from gausslite.wire.views import region_from_png
 
@@ -61,7 +57,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     pixels = message.camera.width_px * message.camera.height_px
     engine.settings.quotas.require_keyframe(message.index, pixels, message.ByteSize())
     # decoded here to refuse invalid images; stored as received, which needs less space
-    frame = frame_from_message(message)
+    frame = convert.frame_from_message(message)
     region_from_png(message.region_png, frame.camera)
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
@@ -86,30 +82,23 @@ def select_map(engine: FusionEngine, request: pb.ExportFusedMapRequest) -> Voxel
 _CHUNK_BYTES = 1 << 20
 
 
-class ExportedFile:
-    """Owns a file without a name, which ends with this object. One reader."""
-
-    def __init__(self, data: bytes) -> None:
-        self._size_bytes, self._crc32c = len(data), google_crc32c.value(data)
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by __exit__
-        self._file.write(data)
-        self._file.seek(0)
-
-    def __enter__(self) -> ExportedFile:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-    def next_chunk(self) -> pb.ExportFusedMapResponse | None:
-        """Return the next message; None at the end."""
-        offset = self._file.tell()
-        data = self._file.read(_CHUNK_BYTES)
-        if not data:
-            return None
-        return pb.ExportFusedMapResponse(offset=offset, total_bytes=self._size_bytes, data=data, crc32c=self._crc32c)
+async def exported_file(
+    lock: asyncio.Lock, read: Callable[[], Awaitable[bytes]], require_open: Callable[[], None]
+) -> AsyncIterator[pb.ExportFusedMapResponse]:
+    """Yield a file in messages, from a copy on the disk. read: returns its bytes; lock: held until the copy is made."""
+    with tempfile.TemporaryFile() as file:
+        async with lock:
+            data = await read()
+            size_bytes, crc32c = len(data), google_crc32c.value(data)
+            await asyncio.to_thread(file.write, data)
+            del data
+        file.seek(0)
+        offset = 0
+        while data := await asyncio.to_thread(file.read, _CHUNK_BYTES):
+            require_open()
+            with read_deadline():
+                yield pb.ExportFusedMapResponse(offset=offset, total_bytes=size_bytes, data=data, crc32c=crc32c)
+            offset += len(data)
 
 
 def read_keyframe(engine: FusionEngine, request: pb.GetKeyframeRequest) -> pb.GetKeyframeResponse:
@@ -119,30 +108,21 @@ def read_keyframe(engine: FusionEngine, request: pb.GetKeyframeRequest) -> pb.Ge
     if not data:
         return pb.GetKeyframeResponse()
     message = EncodedFrame.FromString(data)
-    in_fused_frame = engine.in_fused_frame([AgentKeyframe(request.agent_id, decode_frame(data))])
+    in_fused_frame = engine.in_fused_frame([AgentKeyframe(request.agent_id, convert.decode_frame(data))])
     return pb.GetKeyframeResponse(
-        index=message.index,
-        capture_time_ns=message.capture_time_ns,
-        colour=message.colour,
-        camera=message.camera,
-        t_world_camera=transform_to_message(in_fused_frame[0].frame.T_world_camera) if in_fused_frame else None,
+        **convert.values_of(message, ("index", "capture_time_ns", "colour", "camera", "region_png")),
+        t_world_camera=convert.transform_to_message(in_fused_frame[0].frame.T_world_camera) if in_fused_frame else None,
         indices=indices,
-        region_png=message.region_png,
     )
 
 
 _STATES = {
-    AlignmentState.UNKNOWN: pb.ALIGNMENT_STATE_UNSPECIFIED,
-    AlignmentState.REFERENCE: pb.ALIGNMENT_STATE_REFERENCE,
-    AlignmentState.ALIGNED: pb.ALIGNMENT_STATE_ALIGNED,
-    AlignmentState.CORRECTED: pb.ALIGNMENT_STATE_CORRECTED,
-    AlignmentState.QUARANTINED: pb.ALIGNMENT_STATE_QUARANTINED,
-    AlignmentState.UNLOCALISED: pb.ALIGNMENT_STATE_UNLOCALISED,
+    state: pb.AlignmentState.Value(f"ALIGNMENT_STATE_{state.name.replace('UNKNOWN', 'UNSPECIFIED')}")
+    for state in AlignmentState
 }
 _LAYERS: dict[int, MapLayer] = {
-    pb.MAP_LAYER_UNSPECIFIED: MapLayer.VOTE,
-    pb.MAP_LAYER_VOTE: MapLayer.VOTE,
-    pb.MAP_LAYER_REFINED: MapLayer.REFINED,
+    0: MapLayer.VOTE,
+    **{pb.MapLayer.Value(f"MAP_LAYER_{layer.name}"): layer for layer in MapLayer},
 }
 
 
@@ -156,7 +136,9 @@ def layer_from_message(number: int) -> MapLayer:
 def view_to_message(view: LayerView) -> pb.RenderFusedViewResponse:
     """Encode a rendered view as PNG images."""
     return pb.RenderFusedViewResponse(
-        colour_png=encode_colour(view.rgb, lossless=True), depth_png=encode_depth(view.depth_m), revision=view.revision
+        colour_png=convert.encode_colour(view.rgb, lossless=True),
+        depth_png=convert.encode_depth(view.depth_m),
+        revision=view.revision,
     )
 
 
@@ -178,7 +160,7 @@ def declared_frame_from_message(request: pb.JoinSessionRequest) -> Float64[ndarr
         return None
     if request.frame_is_unknown:
         raise InvalidInputError("t_fused_agent: expected none of an unknown frame, got one")
-    T_fused_agent = transform_from_message("t_fused_agent", request.t_fused_agent)
+    T_fused_agent = convert.transform_from_message("t_fused_agent", request.t_fused_agent)
     if np.abs(T_fused_agent[:3, 3]).max() > MAX_COORDINATE_M:
         raise InvalidInputError(
             f"t_fused_agent: expected a translation within {MAX_COORDINATE_M:g} m, got {T_fused_agent[:3, 3].tolist()}"
@@ -190,7 +172,7 @@ def alignment_to_message(alignment: FrameAlignment) -> pb.FrameAlignment:
     """Encode how an agent's frame fits the fused map."""
     message = pb.FrameAlignment(
         state=_STATES[alignment.state],
-        t_fused_agent=transform_to_message(alignment.T_fused_agent),
+        t_fused_agent=convert.transform_to_message(alignment.T_fused_agent),
         message=alignment.message,
     )
     fit = alignment.fit
@@ -201,23 +183,25 @@ def alignment_to_message(alignment: FrameAlignment) -> pb.FrameAlignment:
     return message
 
 
+_CONTRIBUTION = (
+    *(
+        "agent_id",
+        "joined",
+        "voxels",
+        "gaussians",
+        "kappa_sum",
+        "won_voxels",
+        "last_update_seq",
+        "keyframes",
+        "targets",
+    ),
+)
+
+
 def contribution_to_message(agent: AgentContribution) -> pb.AgentContribution:
     """Encode the figures of one agent."""
     return pb.AgentContribution(
-        agent_id=agent.agent_id,
-        joined=agent.joined,
-        gaussians=agent.gaussians,
-        voxels=agent.voxels,
-        won_voxels=agent.won_voxels,
-        roi_bytes=agent.traffic.roi_bytes,
-        handover_bytes=agent.traffic.handover_bytes,
-        subsets_accepted=agent.traffic.subsets_accepted,
-        subsets_stale=agent.traffic.subsets_stale,
-        subsets_rejected=agent.traffic.subsets_rejected,
-        keyframes=agent.keyframes,
-        kappa_sum=agent.kappa_sum,
-        last_update_seq=agent.last_update_seq,
-        last_seen_ns=agent.traffic.last_seen_ns,
-        targets=agent.targets,
+        **convert.values_of(agent, _CONTRIBUTION),
+        **asdict(agent.traffic),
         alignment=alignment_to_message(agent.alignment),
     )

@@ -112,18 +112,14 @@ def _extra_needed() -> Iterator[None]:
         ) from error
 
 
-def _open_database(url: str) -> FusionStore:
-    with _extra_needed():
-        from gausslite.fusion.postgres_store import PostgresStore
-    return PostgresStore(url)
-
-
 def _open_store(settings: ServerSettings) -> FusionStore:
     """Return the store. Raises InvalidInputError, StorageError."""
     if settings.store is None:
         return MemoryStore()
     if isinstance(settings.store, str):
-        return _open_database(settings.store)
+        with _extra_needed():
+            from gausslite.fusion.postgres_store import PostgresStore
+        return PostgresStore(settings.store)
     return SqliteStore(settings.store, settings.store_max_bytes)
 
 
@@ -174,7 +170,7 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
 async def _serve_share(settings: ServerSettings, peer_address: str) -> None:
     """Serve a part of a mission, together with the other servers of the database."""
     with _extra_needed():
-        from gausslite_fusion_server.sharing import open_share
+        from gausslite_fusion_server.shared_servicer import open_share
     async with open_share(settings, peer_address) as share:
         metrics = metrics_server(settings.metrics, share.engine, share.sender.acknowledgements, share.counts)
         with metrics, _page(settings):

@@ -45,7 +45,10 @@ class RegionHost:
         # the connection and the slots of the open engine
         self._opened: tuple[int, frozenset[int]] | None = None
         self._owned = OwnedSlots(frozenset())
-        self._owners = Owners()
+        self.server = slots.server
+        """The address of this server among the others."""
+        self.owners = Owners()
+        """Who owned which slot at the latest look."""
         # those at the latest look that had nothing to do
         self._steady: Owners | None = None
         self._woken = asyncio.Event()
@@ -54,16 +57,6 @@ class RegionHost:
         """Notified when the owners, or the open engine, have changed."""
         self.traffic = TrafficLog()
         """Of the messages that this server received."""
-
-    @property
-    def server(self) -> str:
-        """The address of this server among the others."""
-        return self._slots.server
-
-    @property
-    def owners(self) -> Owners:
-        """Who owned which slot at the latest look."""
-        return self._owners
 
     @property
     def owned(self) -> OwnedSlots:
@@ -155,8 +148,8 @@ class RegionHost:
             await asyncio.to_thread(self._slots.release, surplus)
             await self._open_local()
             owners = await asyncio.to_thread(self._slots.owners)
-        if owners != self._owners:
-            self._owners = owners
+        if owners != self.owners:
+            self.owners = owners
             self.changes.notify()
 
     async def _open_local(self) -> None:

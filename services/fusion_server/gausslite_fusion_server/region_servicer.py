@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
@@ -15,6 +16,7 @@ from gausslite.codec.subset_codec import SubsetCoding, encode_subset, split_batc
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
+from gausslite.fusion.store_values import SessionRecord
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
@@ -24,6 +26,7 @@ from gausslite.wire.server import Service
 from gausslite_fusion_server.contributions import StoredCount
 from gausslite_fusion_server.messages import select_map
 from gausslite_fusion_server.region_host import RegionHost
+from gausslite_fusion_server.servicer import FusionServicer
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
 
@@ -33,21 +36,12 @@ _SENDER = "fusion-server"
 _log = logging.getLogger(__name__)
 
 
-class HomeMethod(NamedTuple):
-    """A method of FusionService that an agent's home answers."""
-
-    request: type[Message]
-    response: type[Message]
-    is_stream: bool
-
-
 AT_HOME = {
-    method.name: HomeMethod(
-        GetMessageClass(method.input_type), GetMessageClass(method.output_type), method.client_streaming
-    )
+    method.name: method
     for method in pb.DESCRIPTOR.services_by_name["FusionService"].methods
     if not method.server_streaming
 }
+"""The methods of FusionService that an agent's home answers."""
 
 
 async def _stream_of(request: Message) -> AsyncIterator[Message]:
@@ -63,10 +57,7 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
-        return Service(
-            region_pb.DESCRIPTOR.services_by_name["RegionService"].full_name,
-            lambda server: region_pb_grpc.add_RegionServiceServicer_to_server(self, server),
-        )
+        return Service("gausslite.v1.RegionService", partial(region_pb_grpc.add_RegionServiceServicer_to_server, self))
 
     async def store_part(self, session_id: str, part: StoredSubset) -> StoredCount:
         """Store a part of a message. Raises GaussLiteError."""
@@ -74,7 +65,7 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
             if not self._host.owned.have(part.voxels.keys):
                 self.foreign += 1
                 raise UnavailableError(f"server {self._host.server}: does not own all of these voxels")
-            count = await self._host.local().store_part(session_id, part)
+            count = await self._host.local().store_message(SessionRecord(session_id, part.agent_id), part)
         except RuntimeError as error:
             # the threads of an engine that has just been closed
             raise UnavailableError(f"server {self._host.server}: its regions change") from error
@@ -91,18 +82,16 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
 
     async def BeginAgent(self, request: region_pb.BeginAgentRequest, context: Any) -> region_pb.BeginAgentResponse:
         """Note that an agent has joined at its home."""
-        engine = self._host.local().engine
         fresh_map = request.fresh_map and request.home != self._host.server
         if fresh_map and self._host.owned.is_home(request.agent_id):
             raise UnavailableError(f"server {self._host.server}: has become the home of this agent; join again")
-        await self._state_slots(context)
+        engine = (await self._local(context)).engine
         highest = await asyncio.to_thread(engine.begin_elsewhere, request.agent_id, fresh_map)
         return region_pb.BeginAgentResponse(highest_update_seq=highest)
 
     async def RemoveAgent(self, request: region_pb.RemoveAgentRequest, context: Any) -> region_pb.RemoveAgentResponse:
         """Delete an agent's voxels here."""
-        local = self._host.local()
-        await self._state_slots(context)
+        local = await self._local(context)
         voxels = await asyncio.to_thread(local.engine.remove_elsewhere, request.agent_id)
         local.publish_changes()
         return region_pb.RemoveAgentResponse(voxels=voxels)
@@ -111,8 +100,7 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         self, request: pb.ExportFusedMapRequest, context: Any
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the voxels of a map that are owned here, without loss."""
-        engine = self._host.local().engine
-        await self._state_slots(context)
+        engine = (await self._local(context)).engine
         batch = await asyncio.to_thread(select_map, engine, request)
         for part in split_batch(batch, BLOCK_BYTES, SubsetCoding.LOSSLESS):
             subset = RoiSubset(_SENDER, "", 0, 0, part)
@@ -124,23 +112,20 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         self, request: pb.WatchFusedMapRequest, context: Any
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the part of the map that is owned here, then its changes."""
-        local = self._host.local()
-        await self._state_slots(context)
+        local = await self._local(context)
         async for response in local.WatchFusedMap(request, context):
             yield response
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the part of the mission that is owned here."""
-        local = self._host.local()
-        await self._state_slots(context)
+        local = await self._local(context)
         return await local.GetSessionStatus(request, context)
 
     async def GetUpdateDigests(
         self, request: pb.GetUpdateDigestsRequest, context: Any
     ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
         """Return the digests of an agent's updates that are owned here."""
-        local = self._host.local()
-        await self._state_slots(context)
+        local = await self._local(context)
         async for response in local.GetUpdateDigests(request, context):
             yield response
 
@@ -148,7 +133,7 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         """Call a method for an agent whose home this server is."""
         if request.method not in AT_HOME:
             raise InvalidInputError(f"method: expected one of {', '.join(AT_HOME)}, got {quote_name(request.method)}")
-        own = AT_HOME[request.method].request.FromString(request.request)
+        own = GetMessageClass(AT_HOME[request.method].input_type).FromString(request.request)
         response = await self.call_home(request.agent_id, request.method, own, context)
         return region_pb.CallHomeResponse(response=response.SerializeToString())
 
@@ -156,13 +141,15 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         """Return the answer of the own servicer. Raises UnavailableError if this is not the agent's home."""
         if not self._host.owned.is_home(agent_id):
             raise UnavailableError(f"server {self._host.server}: is not the home of this agent")
-        argument = _stream_of(request) if AT_HOME[method].is_stream else request
+        argument = _stream_of(request) if AT_HOME[method].client_streaming else request
         response: Message = await getattr(self._host.local(), method)(argument, context)
         return response
 
-    async def _state_slots(self, context: Any) -> None:
-        slots = sum(1 << slot for slot in self._host.owned.slots)
+    async def _local(self, context: Any) -> FusionServicer:
+        """Return what serves the own part, after a statement of the slots for which its answer holds."""
+        local, slots = self._host.local(), sum(1 << slot for slot in self._host.owned.slots)
         await context.send_initial_metadata(((SLOTS_KEY, f"{slots:x}"),))
+        return local
 
 
 def _require_codes_of(grid: VoxelGrid, voxels: StoredVoxels) -> None:

@@ -6,49 +6,30 @@ import asyncio
 import functools
 import logging
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from typing import Any, TypeVar
 
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
-from gausslite.domain.checks import require_identifier
 from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.refinement import MapRenderer
-from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord
+from gausslite.fusion.store_values import MissionConfig, SessionRecord
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
-from gausslite.wire.convert import (
-    box_from_message,
-    camera_from_message,
-    digests_to_messages,
-    grid_from_message,
-    grid_to_message,
-    transform_from_message,
-)
+from gausslite.wire import convert
 from gausslite.wire.convert_task import graph_from_message, object_to_message, report_from_message
 from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
 from gausslite.wire.views import ChangeNotifier
+from gausslite_fusion_server import messages
 from gausslite_fusion_server.contributions import Contributions, PacedLock, StoredCount
-from gausslite_fusion_server.messages import (
-    ExportedFile,
-    contribution_to_message,
-    declare_frame,
-    declared_frame_from_message,
-    kept_session,
-    layer_from_message,
-    read_keyframe,
-    select_map,
-    session_of,
-    store_keyframe,
-    view_to_message,
-)
 from gausslite_fusion_server.refinement_worker import RefinementWorker
-from gausslite_fusion_server.watch import FusedMapReader, WatchedPart
+from gausslite_fusion_server.watch import FusedMapReader, watched_part
 
 _Message = TypeVar("_Message")
 
@@ -133,7 +114,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
         self._contributions = Contributions(
-            self._session, self._store_message, engine.traffic.record, RejectionLog(_log)
+            self._session, self.store_message, engine.traffic.record, RejectionLog(_log)
         )
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
         self._exports, self._queries, self._joins, self._keyframes = *(asyncio.Lock() for _ in range(3)), PacedLock()
@@ -141,7 +122,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
         return Service(
-            pb.DESCRIPTOR.services_by_name["FusionService"].full_name,
+            "gausslite.v1.FusionService",
             functools.partial(pb_grpc.add_FusionServiceServicer_to_server, self),
             self.engine.storage.check,
             self.engine.acknowledgements.check,
@@ -154,19 +135,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             self._aligning.cancel()
         self._map_changes.notify()
 
-    async def _store_message(self, session: SessionRecord, message: bytes) -> StoredCount:
-        return await self._commit_queued(functools.partial(self.engine.enqueue_update, session, message))
-
-    async def store_part(self, session_id: str, part: StoredSubset) -> StoredCount:
-        """Store a decoded message, or a part of one. Raises UnavailableError, and as FusionEngine.contribute."""
-        return await self._commit_queued(functools.partial(self.engine.enqueue_part, session_id, part))
-
-    async def _commit_queued(self, enqueue: Callable[[], Future[PutOutcome]]) -> StoredCount:
+    async def store_message(self, session: SessionRecord, message: bytes | StoredSubset) -> StoredCount:
+        """Store a message, or a decoded part of one. Raises UnavailableError, and as FusionEngine.contribute."""
         self._gate.require_open()
-        put = enqueue()
+        put = self.engine.enqueue_update(session, message)
         self._commit_soon()
         try:
-            return StoredCount.of(await asyncio.wrap_future(put))
+            stored = await asyncio.wrap_future(put)
+            return StoredCount(len(stored.accepted), len(stored.stale))
         finally:
             self.publish_changes()
 
@@ -197,13 +173,13 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def JoinSession(self, request: pb.JoinSessionRequest, context: Any) -> pb.JoinSessionResponse:
         """Join the mission."""
         Caller.of(context).require_agent(request.agent_id)
-        grid = grid_from_message(request.grid)
+        grid = convert.grid_from_message(request.grid)
         requested = MissionConfig(request.mission_id, request.world_frame, grid.size_m)
         task = graph_from_message(request.task) if request.HasField("task") else None
-        declared_frame_from_message(request)
+        messages.declared_frame_from_message(request)
         async with self._joins:
             joined = await self._work(self.engine.join, request.agent_id, requested, request.fresh_map, request.token)
-        await self._work(declare_frame, self.engine, request)
+        await self._work(messages.declare_frame, self.engine, request)
         if task is not None:
             objects = await self._work(self.engine.reported_objects, request.agent_id, task)
             await self._work(self.engine.report_objects, joined.session.session_id, ObjectReport(task, objects))
@@ -212,7 +188,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             session_id=joined.session.session_id,
             highest_update_seq=joined.highest_update_seq,
             fused_revision=joined.fused_revision,
-            grid=grid_to_message(self.engine.grid),
+            grid=convert.grid_to_message(self.engine.grid),
             max_subset_bytes=MAX_SUBSET_BYTES,
             max_gaussians=self.engine.settings.quotas.gaussians_per_agent,
             keyframes=joined.keyframes,
@@ -222,14 +198,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
         """Renew the agent's lease; return what identifies the stored updates."""
-        return await self._work(kept_session, self.engine, request.session_id, Caller.of(context))
+        return await self._work(messages.kept_session, self.engine, request.session_id, Caller.of(context))
 
     async def GetUpdateDigests(
         self, request: pb.GetUpdateDigestsRequest, context: Any
     ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
         """Return the digests of the agent's stored updates."""
         agent_id = (await self._session(request.session_id, Caller.of(context))).agent_id
-        for block in digests_to_messages(await self._work(self.engine.stored_digests, agent_id)):
+        for block in convert.digests_to_messages(await self._work(self.engine.stored_digests, agent_id)):
             with read_deadline():
                 yield block
 
@@ -248,7 +224,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         async for request in self._gate.admit(request_iterator):
             try:
                 async with self._keyframes:
-                    await self._work(store_keyframe, self.engine, request, caller)
+                    await self._work(messages.store_keyframe, self.engine, request, caller)
                 response.accepted += 1
             except (InvalidInputError, QuotaError) as error:
                 if len(response.rejected) >= MAX_REPORTED_REJECTIONS:
@@ -260,17 +236,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
         """Return a stored keyframe of an agent, for a person."""
         self.engine.require_mission(request.mission_id)
-        return await self._work(read_keyframe, self.engine, request)
+        return await self._work(messages.read_keyframe, self.engine, request)
 
     async def WatchFusedMap(
         self, request: pb.WatchFusedMapRequest, context: Any
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the map, then its changes. A slow watcher gets several changes as one; nothing is queued."""
         self.engine.require_mission(request.mission_id)
-        region = box_from_message(request.region) if request.HasField("region") else None
-        if request.exclude_agent_id:
-            require_identifier("exclude_agent_id", request.exclude_agent_id)
-        watched = WatchedPart(layer_from_message(request.layer), region, request.exclude_agent_id)
+        watched = watched_part(request)
         reader = FusedMapReader(self.engine, watched, self._encoded_parts, request.since_revision)
 
         async def read(_since_revision: int) -> FusedMapReader:
@@ -292,12 +265,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         response = pb.RefineFusedMapResponse()
         async for progress in self._refinement_worker.run(self.engine, request):
             self._gate.require_open()
-            response = pb.RefineFusedMapResponse(
-                iteration=progress.iteration,
-                iterations=progress.iterations,
-                loss=progress.loss,
-                gaussians=progress.gaussians,
-            )
+            response = pb.RefineFusedMapResponse(**asdict(progress))
             yield response
         self._map_changes.notify()
         response.done = True
@@ -308,13 +276,13 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.ExportFusedMapResponse]:
         """Send a map as the bytes of a PLY file."""
         self.engine.require_mission(request.mission_id)
-        async with self._exports:
-            exported = await self._work(self._export, request)
-        with exported:
-            while chunk := await self._work(exported.next_chunk):
-                self._gate.require_open()
-                with read_deadline():
-                    yield chunk
+
+        async def read() -> bytes:
+            batch = await self._work(messages.select_map, self.engine, request)
+            return await self._work(ply_bytes, batch.gaussians, self.engine.mission_config.given_world_frame)
+
+        async for chunk in messages.exported_file(self._exports, read, self._gate.require_open):
+            yield chunk
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
         """Replace the agent's task graph and objects."""
@@ -336,11 +304,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Render a layer of the map from a camera pose."""
         self._gate.require_open()
         self.engine.require_mission(request.mission_id)
-        camera = camera_from_message(request.camera)
-        T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
-        layer = layer_from_message(request.layer)
+        camera = convert.camera_from_message(request.camera)
+        T_world_camera = convert.transform_from_message("t_world_camera", request.t_world_camera)
+        layer = messages.layer_from_message(request.layer)
         render = functools.partial(self._renderer.render, camera, T_world_camera, layer)
-        return view_to_message(await asyncio.get_running_loop().run_in_executor(self._background, render))
+        return messages.view_to_message(await asyncio.get_running_loop().run_in_executor(self._background, render))
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
@@ -348,15 +316,11 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         status = await self._work(self.engine.status)
         return pb.GetSessionStatusResponse(
             mission_id=status.mission_config.mission_id,
-            grid=grid_to_message(self.engine.grid),
+            grid=convert.grid_to_message(self.engine.grid),
             world_frame=status.mission_config.world_frame,
             fused_revision=status.revision,
-            fused_gaussians=status.fused_gaussians,
-            fused_voxels=status.fused_voxels,
-            agents=[contribution_to_message(agent) for agent in status.agents],
-            keyframes=status.keyframes,
-            refined=status.refined,
-            banned_agents=status.banned_agents,
+            agents=map(messages.contribution_to_message, status.agents),
+            **convert.values_of(status, ("fused_gaussians", "fused_voxels", "keyframes", "refined", "banned_agents")),
         )
 
     async def LeaveSession(self, request: pb.LeaveSessionRequest, context: Any) -> pb.LeaveSessionResponse:
@@ -371,7 +335,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self.engine.require_mission(request.mission_id)
         voxels = await self._work(self.engine.evict, request.agent_id, request.ban)
         self.publish_changes()
-        _log.warning("agent %s: %s, data of %d voxels deleted", request.agent_id, _evicted(request), voxels)
+        _log.warning(
+            "agent %s: %s, data of %d voxels deleted", request.agent_id, "banned" if request.ban else "evicted", voxels
+        )
         return pb.EvictAgentResponse(fused_revision=self.engine.revision, voxels=voxels)
 
     async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
@@ -380,10 +346,6 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         await self._work(self.engine.unban, request.agent_id)
         _log.warning("agent %s: may join again", request.agent_id)
         return pb.UnbanAgentResponse()
-
-    def _export(self, request: pb.ExportFusedMapRequest) -> ExportedFile:
-        batch = select_map(self.engine, request)
-        return ExportedFile(ply_bytes(batch.gaussians, self.engine.mission_config.given_world_frame))
 
     def _align_in_background(self) -> None:
         """Compare the frames that are due soon, unless that is pending or running. Use on the event loop."""
@@ -414,14 +376,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
         if self.engine.known_session(session_id) is None:
             # it may wait for the engine's lock, and so for the disk
-            return await self._work(session_of, self.engine, session_id, caller)
-        return session_of(self.engine, session_id, caller)
+            return await self._work(messages.session_of, self.engine, session_id, caller)
+        return messages.session_of(self.engine, session_id, caller)
 
     async def _work(self, function: Callable[..., _Result], *arguments: Any) -> _Result:
         """Run the function in a worker thread. Raises UnavailableError if the server drains."""
         self._gate.require_open()
         return await asyncio.get_running_loop().run_in_executor(self._workers, function, *arguments)
-
-
-def _evicted(request: pb.EvictAgentRequest) -> str:
-    return "banned" if request.ban else "evicted"

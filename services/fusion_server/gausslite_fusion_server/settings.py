@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from gausslite.config.command_parser import CommandParser
@@ -43,16 +44,6 @@ def _read_store(text: str) -> Path | str | None:
     return text if text.startswith(POSTGRES_SCHEME) else read_path(text)
 
 
-def _read_health(text: str) -> str:
-    host_and_port("health", text)
-    return text
-
-
-def _read_peer(text: str) -> str:
-    require_callable("peer-address", text)
-    return text
-
-
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
     """Address, storage (a file, the URL of a PostgreSQL database, or memory) and limits of the server; the mission."""
@@ -80,7 +71,7 @@ class ServerSettings:
         None,
         "where the other servers of the database reach this one: servers with it share the mission (default: alone)",
         metavar="ADDRESS",
-        convert=_read_peer,
+        convert=partial(require_callable, "peer-address"),
     )
     fusion: FusionSettings = field(default_factory=FusionSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
@@ -102,7 +93,7 @@ class ServerSettings:
         None,
         "answer health checks also there, without encryption (default: no)",
         metavar="HOST:PORT",
-        convert=_read_health,
+        convert=lambda text: host_and_port("health", text) and text,
     )
 
 

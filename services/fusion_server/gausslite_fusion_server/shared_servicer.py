@@ -1,4 +1,4 @@
-"""The methods of FusionService where several servers share a mission: route each call to who owns what it needs."""
+"""Serve a mission together with other servers: route each call to who owns what it needs."""
 
 from __future__ import annotations
 
@@ -6,34 +6,43 @@ import asyncio
 import functools
 import logging
 from collections.abc import AsyncIterator, Iterable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+from google.protobuf.message_factory import GetMessageClass
 
 from gausslite.codec.ply import ply_bytes
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
-from gausslite.domain.checks import require_identifier
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, UnavailableError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, merge_batches
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.postgres_regions import SharedSlots
 from gausslite.fusion.regions import Owners
 from gausslite.fusion.store_values import SessionRecord
+from gausslite.render.choose import choose_rasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.wire.channel import MAX_MESSAGE_BYTES
-from gausslite.wire.convert import box_from_message, digests_from_messages, digests_to_messages
+from gausslite.wire.convert import digests_from_messages, digests_to_messages
 from gausslite.wire.map_changes import read_deadline
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
 from gausslite_fusion_server.contributions import Contributions
-from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_message, layer_from_message
-from gausslite_fusion_server.part_sender import PartSender
-from gausslite_fusion_server.peers import READ_S, Peers
+from gausslite_fusion_server.messages import declared_frame_from_message, exported_file
+from gausslite_fusion_server.metrics import MessageCounts
+from gausslite_fusion_server.peers import READ_S, PartSender, Peers
+from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.region_host import RegionHost
 from gausslite_fusion_server.region_servicer import AT_HOME, RegionServicer
-from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate
+from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate, FusionServicer
+from gausslite_fusion_server.settings import ServerSettings
 from gausslite_fusion_server.shared_watch import SharedRevisions, SharedWatch
+from gausslite_fusion_server.watch import watched_part
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
 
@@ -49,12 +58,12 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         self._gate = DrainGate()
         self._watch = SharedWatch(host, peers, SharedRevisions(), host.settings.grid)
         self._contributions = Contributions(self._session, sender.store, host.traffic.record, RejectionLog(_log))
-        self._exports = asyncio.Semaphore(1)
+        self._exports = asyncio.Lock()
 
     def service(self) -> Service:
         """Return the servicer, ready for a server."""
         return Service(
-            pb.DESCRIPTOR.services_by_name["FusionService"].full_name,
+            "gausslite.v1.FusionService",
             functools.partial(pb_grpc.add_FusionServiceServicer_to_server, self),
             self._host.check,
             self._sender.acknowledgements.check,
@@ -139,10 +148,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the map, then its changes, from the owners of what is looked at."""
         await self._require_mission(request.mission_id)
-        region = box_from_message(request.region) if request.HasField("region") else None
-        if request.exclude_agent_id:
-            require_identifier("exclude_agent_id", request.exclude_agent_id)
-        layer_from_message(request.layer)
+        region = watched_part(request).region
         async for response in self._watch.follow(request, region, self._gate.require_open):
             yield response
 
@@ -158,15 +164,14 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.ExportFusedMapResponse]:
         """Send a map, put together from all owners, as the bytes of a PLY file."""
         await self._require_mission(request.mission_id)
-        async with self._exports:
+
+        async def read() -> bytes:
             batch = await self._read_map(request)
             world_frame = (await self._host.ready()).engine.mission_config.given_world_frame
-            exported = await asyncio.to_thread(lambda: ExportedFile(ply_bytes(batch.gaussians, world_frame)))
-        with exported:
-            while chunk := await asyncio.to_thread(exported.next_chunk):
-                self._gate.require_open()
-                with read_deadline():
-                    yield chunk
+            return await asyncio.to_thread(ply_bytes, batch.gaussians, world_frame)
+
+        async for chunk in exported_file(self._exports, read, self._gate.require_open):
+            yield chunk
 
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
         """Refuse: a view needs the whole map in one server."""
@@ -256,7 +261,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         except UnavailableError:
             self._host.wake()
             raise
-        return AT_HOME[method].response.FromString(answer.response)
+        return GetMessageClass(AT_HOME[method].output_type).FromString(answer.response)
 
     async def _read_map(self, request: pb.ExportFusedMapRequest) -> VoxelBatch:
         if request.strategy == pb.FUSION_STRATEGY_REFINED:
@@ -311,3 +316,60 @@ def _add(agent: pb.AgentContribution, part: pb.AgentContribution) -> None:
         setattr(agent, name, getattr(agent, name) + getattr(part, name))
     for name in ("last_update_seq", "last_seen_ns"):
         setattr(agent, name, max(getattr(agent, name), getattr(part, name)))
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """One of the servers of a mission: what it serves, and what it has to run meanwhile."""
+
+    host: RegionHost
+    regions: RegionServicer
+    sender: PartSender
+    servicer: SharedServicer
+
+    @property
+    def services(self) -> list[Service]:
+        """The service for agents and watchers, and the one for the other servers."""
+        return [self.servicer.service(), self.regions.service()]
+
+    async def run(self) -> None:
+        """Take part until it is cancelled; then end the open streams, and leave the regions to the other servers."""
+        try:
+            await self.host.run()
+        finally:
+            self.servicer.drain()
+            await self.host.close()
+
+    def engine(self) -> FusionEngine:
+        """Return the engine of the part that this server owns. Raises UnavailableError while it is opened."""
+        return self.host.local().engine
+
+    def counts(self) -> MessageCounts:
+        """Return how much of the mission's work this server has done."""
+        return MessageCounts(self.sender.received, self.sender.sent, self.regions.stored, self.regions.foreign)
+
+
+@asynccontextmanager
+async def open_share(settings: ServerSettings, peer_address: str) -> AsyncIterator[Share]:
+    """Take part in a mission while the context is open. Raises InvalidInputError, StorageError."""
+    assert isinstance(settings.store, str)
+    slots = await asyncio.to_thread(SharedSlots, settings.store, peer_address)
+    _log.info("server %s: shares its mission; frames of agents are used as they are (trust)", peer_address)
+
+    def create_servicer(engine: FusionEngine) -> FusionServicer:
+        return FusionServicer(
+            engine, RefinementWorker(settings.refine, partial(choose_rasterizer, settings.rasterizer))
+        )
+
+    # names are fixed, and frames are trusted
+    agreed = settings.fusion.mission_config.with_default_names()
+    fusion = replace(settings.fusion, mission_id=agreed.mission_id, world_frame=agreed.world_frame, alignment=None)
+    host, peers = RegionHost(slots, fusion, create_servicer), Peers(settings.tls)
+    regions = RegionServicer(host)
+    sender = PartSender(host, regions, peers, fusion.grid)
+    try:
+        yield Share(host, regions, sender, SharedServicer(host, regions, peers, sender))
+    finally:
+        await host.close()
+        await asyncio.to_thread(sender.close)
+        await peers.close()

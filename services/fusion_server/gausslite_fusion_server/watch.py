@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from gausslite.domain.checks import require_identifier
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import (
     TILE_VOXELS,
@@ -19,8 +19,11 @@ from gausslite.domain.voxels import (
 )
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer, WonVoxels
+from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import Provenance
+from gausslite.wire.convert import box_from_message
 from gausslite.wire.map_changes import EncodedPart, EncodedPartCache, Parts, encode_parts
+from gausslite_fusion_server.messages import layer_from_message
 
 _SENDER = "fusion-server"
 """The agent id inside the subset bytes of fused voxels; readers use the provenance instead."""
@@ -34,9 +37,16 @@ class WatchedPart:
     region: AxisAlignedBox | None = None
     exclude_agent: str = ""
 
-    def __post_init__(self) -> None:
-        if self.exclude_agent and self.layer is MapLayer.REFINED:
+
+def watched_part(request: pb.WatchFusedMapRequest) -> WatchedPart:
+    """Return what a watcher asks for. Raises InvalidInputError."""
+    layer, exclude_agent = layer_from_message(request.layer), request.exclude_agent_id
+    if exclude_agent:
+        require_identifier("exclude_agent_id", exclude_agent)
+        if layer is MapLayer.REFINED:
             raise InvalidInputError("exclude_agent_id: expected none with REFINED, whose voxels belong to everyone")
+    region = box_from_message(request.region) if request.HasField("region") else None
+    return WatchedPart(layer, region, exclude_agent)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +64,7 @@ class FusedMapReader:
     def snapshot(self) -> tuple[int, Parts]:
         """Return the current revision and the tiles of the layer, each as it is when it is read."""
         revision, tiles = self.engine.maps.tiles(self.watched.layer)
-        return revision, self._tiles(self._in_region(tiles))
+        return revision, (self._tile(tile) for tile in self._in_region(tiles).tolist())
 
     def changes(self, since_revision: int) -> tuple[int, Parts]:
         """Return the current revision and what changed since, or more. Raises RevisionGoneError."""
@@ -74,10 +84,6 @@ class FusedMapReader:
             return _encode(won, np.setdiff1d(changed, won.batch.keys), self.engine.grid)
 
         return revision, (self.cache.get((self.watched, since_revision, revision), encode),)
-
-    def _tiles(self, tiles: np.ndarray) -> Iterator[tuple[EncodedPart, ...]]:
-        for tile in tiles.tolist():
-            yield self._tile(tile)
 
     def _tile(self, tile: int) -> tuple[EncodedPart, ...]:
         """Return a tile as it is now; a tile completely in the region is shared with other watchers."""

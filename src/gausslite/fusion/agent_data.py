@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -23,13 +22,8 @@ _log = logging.getLogger(__name__)
 _EARLIER_SUFFIX = ":earlier"
 
 
-@runtime_checkable
-class AgentPart(Protocol):
-    """Holds data of agents."""
-
-    def remove_agent(self, agent_id: str) -> object:
-        """Delete or forget what is held of the agent."""
-        ...
+Forget = Callable[[str], object]
+"""Deletes or forgets what a part of the engine holds of an agent."""
 
 
 def earlier_map_of(agent_id: str) -> str:
@@ -57,11 +51,11 @@ class AgentData:
         maps: FusedMapLayers,
         alignments: FrameAlignments,
         aligner: FrameAligner,
-        parts: Sequence[AgentPart],
+        parts: Sequence[Forget],
     ) -> None:
         self._store, self._votes, self._maps, self._alignments = store, votes, maps, alignments
         self._aligner = aligner
-        self._parts: tuple[AgentPart, ...] = (alignments, aligner, *parts)
+        self._parts = alignments.remove_agent, aligner.remove_agent, *parts
 
     def remove(self, agent_id: str) -> None:
         """Delete all data of the agent, with its earlier map. Raises StorageError."""
@@ -104,8 +98,8 @@ class AgentData:
 
     def _remove(self, name: str) -> None:
         # the store last: a part waits for the end of what it writes
-        for part in self._parts:
-            part.remove_agent(name)
+        for forget in self._parts:
+            forget(name)
         self._maps.record(name, np.union1d(self._store.remove_agent(name), self._votes.remove_agent(name)))
 
     def _alignment_of_earlier(self, agent_id: str) -> FrameAlignment:

@@ -7,7 +7,7 @@ and by colour, because the optimum of a registration alone is 15 to 30 mm off ev
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -67,21 +67,13 @@ class FrameFit:
 
     def as_json(self) -> dict[str, Any]:
         """Return the fit as plain values, from which `from_json` makes one with the same bits."""
-        return {
-            "motion": self.motion.reshape(-1).tolist(),
-            "misfits": [self.before.distance_m, self.before.colour, self.after.distance_m, self.after.colour],
-            "rest": [self.shift_m, self.rotation_deg, self.compared, self.is_better, self.is_apart],
-        }
+        return {**asdict(self), "motion": self.motion.tolist()}
 
     @classmethod
-    def from_json(cls, value: dict[str, Any]) -> FrameFit:
+    def from_json(cls, values: dict[str, Any]) -> FrameFit:
         """Return the fit of plain values. Raises KeyError, TypeError, ValueError."""
-        motion = np.array(value["motion"], np.float64).reshape(4, 4)
-        misfits = [float(number) for number in value["misfits"]]
-        shift_m, rotation_deg, compared, *flags = value["rest"]
-        is_better, is_apart = (bool(flag) for flag in flags)
-        sizes = float(shift_m), float(rotation_deg), int(compared)
-        return cls(motion, Misfit(*misfits[:2]), Misfit(*misfits[2:]), *sizes, is_better, is_apart)
+        misfits = {name: Misfit(**values[name]) for name in ("before", "after")}
+        return cls(**{**values, **misfits, "motion": np.array(values["motion"], np.float64).reshape(4, 4)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

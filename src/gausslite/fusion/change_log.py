@@ -80,17 +80,13 @@ class ChangeLog:
         self.voxels = VoxelLog(first_revision, max_removed)
         self._winner: dict[int, tuple[str, int]] = {}
         self._won_voxels: dict[str, int] = {}
-        self._fused_gaussians = 0
+        self.fused_gaussians = 0
+        """The number of Gaussians of the fused map."""
 
     @property
     def fused_voxels(self) -> int:
         """The number of voxels of the fused map."""
         return len(self._winner)
-
-    @property
-    def fused_gaussians(self) -> int:
-        """The number of Gaussians of the fused map."""
-        return self._fused_gaussians
 
     def won_voxels(self, agent_id: str) -> int:
         """Return the number of voxels that the agent wins."""
@@ -135,11 +131,11 @@ class ChangeLog:
         old = self._winner.pop(key, None)
         if old is not None:
             self._won_voxels[old[0]] -= 1
-            self._fused_gaussians -= old[1]
+            self.fused_gaussians -= old[1]
         if new is not None:
             self._winner[key] = new
             self._won_voxels[new[0]] = self._won_voxels.get(new[0], 0) + 1
-            self._fused_gaussians += new[1]
+            self.fused_gaussians += new[1]
 
 
 def _winners(vote: VoteResult) -> dict[int, tuple[str, int]]:

@@ -36,14 +36,20 @@ from gausslite.fusion.keyframes import (
 )
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.membership import Membership
-from gausslite.fusion.mission_clock import MissionClock
 from gausslite.fusion.objects import RECORD as OBJECTS
 from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
 from gausslite.fusion.unknown_frames import Find, UnknownFrames, find_frame
-from gausslite.fusion.updates import PendingUpdate, UpdateChecks, UpdateCommitter, require_own, require_within_quotas
+from gausslite.fusion.updates import (
+    MissionClock,
+    PendingUpdate,
+    UpdateChecks,
+    UpdateCommitter,
+    require_own,
+    require_within_quotas,
+)
 from gausslite.fusion.vote_input import VoteInput
 
 
@@ -97,7 +103,8 @@ class FusionEngine:
         refined = None if store.is_shared else load_refinement(store)
         self.maps = FusedMapLayers(self._votes, self._lock, self.grid, first, settings.max_removed_voxels, refined)
         parts = self._members.sessions, self._checks, self.traffic, self._keyframes, self._objects
-        self._agents = AgentData(store, self._votes, self.maps, self._alignments, self._aligner, parts)
+        forget = [part.remove_agent for part in parts]
+        self._agents = AgentData(store, self._votes, self.maps, self._alignments, self._aligner, forget)
         self._committer = UpdateCommitter(store, self._lock, self.grid, self._check_update, self._record_updates)
 
     @property
@@ -193,29 +200,23 @@ class FusionEngine:
         Raises SessionUnknownError, MismatchError (another grid), NotPermittedError (another agent's name),
         InvalidInputError, QuotaError, StorageError, UnavailableError; see UpdateCommitter for what is stored then.
         """
-        agent_id = self.session(session_id).agent_id
-        require_own(agent_id, subset.agent_id, grid, self.grid)
+        session = self.session(session_id)
+        require_own(session.agent_id, subset.agent_id, grid, self.grid)
         stored = StoredSubset.exact(subset)
         stored = replace(stored, voxels=stored.voxels.with_computed_sums())
-        future = self._enqueue(PendingUpdate(session_id, agent_id, stored))
+        future = self.enqueue_update(session, stored)
         self.commit_updates()
         # another thread may be committing it
         return future.result()
 
-    def enqueue_update(self, session: SessionRecord, message: bytes) -> Future[PutOutcome]:
-        """Queue an encoded message of a session; the future has what `contribute` returns or raises, after a commit.
+    def enqueue_update(self, session: SessionRecord, message: bytes | StoredSubset) -> Future[PutOutcome]:
+        """Queue a message of a session; the future has what `contribute` returns or raises, after a commit.
 
-        The message is decoded when it is its agent's turn. Raises UnavailableError.
+        An encoded message is decoded when it is its agent's turn; a decoded one may be the part that is this server's.
+        Raises UnavailableError.
         """
-        return self._enqueue(PendingUpdate(session.session_id, session.agent_id, message))
-
-    def enqueue_part(self, session_id: str, part: StoredSubset) -> Future[PutOutcome]:
-        """Queue a decoded message, or the part of one that is this server's, as `enqueue_update` does."""
-        return self._enqueue(PendingUpdate(session_id, part.agent_id, part))
-
-    def _enqueue(self, update: PendingUpdate) -> Future[PutOutcome]:
-        put = self._committer.add(update)
-        self.acknowledgements.add(update.agent_id, put)
+        put = self._committer.add(PendingUpdate(session.session_id, session.agent_id, message))
+        self.acknowledgements.add(session.agent_id, put)
         return put
 
     def commit_updates(self) -> None:
@@ -268,7 +269,7 @@ class FusionEngine:
 
     def _require_open(self, session_id: str) -> None:
         """Raise SessionUnknownError for a session that has ended; without the lock, which who ended it may hold."""
-        if self.known_session(session_id) is None:
+        if self.known_session(session_id) is None and self._store.find_session(session_id) is None:
             raise SessionUnknownError("session: has ended; join again")
 
     def reported_objects(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:

@@ -137,7 +137,7 @@ def _answer(question: bytes, source: SurfaceSamples, target: SurfaceSamples) -> 
     except Exception as error:
         # the next comparison may succeed
         return {"error": f"{type(error).__name__}: {error}"}
-    return {"fit": None if found.fit is None else found.fit.as_json(), "reason": found.reason}
+    return {"fit": found.fit and found.fit.as_json(), "reason": found.reason}
 
 
 def _samples(data: bytes) -> SurfaceSamples:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -223,7 +223,7 @@ class FrameAlignments:
 
     def put(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Replace the agent's alignment. Raises StorageError."""
-        self._store.save_record(agent_id, RECORD, _encode(alignment))
+        self._store.save_record(agent_id, RECORD, json.dumps(asdict(alignment), default=np.ndarray.tolist).encode())
         self._by_agent[agent_id] = alignment
 
     def remove_agent(self, agent_id: str) -> None:
@@ -247,38 +247,20 @@ class FrameAlignments:
         return {name for name, alignment in self._by_agent.items() if not alignment.is_localised}
 
 
-def _encode(alignment: FrameAlignment) -> bytes:
-    fit = alignment.fit
-    value = {
-        "order": alignment.order,
-        "state": str(alignment.state),
-        "segments": [[first, T.reshape(-1).tolist()] for first, T in alignment.segments],
-        "declared": alignment.declared.reshape(-1).tolist(),
-        "message": alignment.message,
-        "against": list(alignment.against),
-        "is_unknown": alignment.is_unknown,
-        "fit": None if fit is None else fit.as_json(),
-    }
-    return json.dumps(value).encode()
-
-
 def _decode(data: bytes) -> FrameAlignment:
     """Decode a stored alignment. Raises CodecError."""
     try:
-        value = json.loads(data)
-        fit = None if value["fit"] is None else FrameFit.from_json(value["fit"])
-        if fit is not None:
-            require_rigid("stored motion", fit.motion)
-        return FrameAlignment(
-            int(value["order"]),
-            AlignmentState(value["state"]),
-            tuple((int(first), _matrix(T)) for first, T in value["segments"]),
-            fit,
-            str(value["message"]),
-            declared=_matrix(value["declared"]),
-            against=tuple(str(name) for name in value["against"]),
-            is_unknown=bool(value["is_unknown"]),
-        )
+        values = json.loads(data)
+        fit = values["fit"]
+        plain = {
+            **values,
+            "state": AlignmentState(values["state"]),
+            "segments": tuple((int(first), _matrix(T)) for first, T in values["segments"]),
+            "fit": None if fit is None else FrameFit.from_json(fit),
+            "declared": _matrix(values["declared"]),
+            "against": tuple(map(str, values["against"])),
+        }
+        return FrameAlignment(**plain)
     except (KeyError, TypeError, ValueError, RecursionError, GaussLiteError) as error:
         raise CodecError(f"alignment: expected the JSON of an alignment, got other bytes ({error})") from error
 

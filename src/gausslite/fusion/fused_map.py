@@ -94,11 +94,8 @@ def save_refinement(store: FusionStore, stored: StoredRefinement) -> None:
 def load_refinement(store: FusionStore) -> StoredRefinement | None:
     """Return the store's refinement, None without one. Raises CodecError, StorageError."""
     data = store.records(RECORD).get(_OWNER)
-    return None if data is None else _decode_refinement(data)
-
-
-def _decode_refinement(data: bytes) -> StoredRefinement:
-    """Return a stored refinement. Raises CodecError."""
+    if data is None:
+        return None
     try:
         columns = load(data)
         gaussians = from_bytes(columns["records"].tobytes())

@@ -9,15 +9,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection
 
+from gausslite.domain import errors
 from gausslite.domain.checks import quote_name, require_identifier
-from gausslite.domain.errors import (
-    InvalidInputError,
-    MismatchError,
-    NameInUseError,
-    NotPermittedError,
-    QuotaError,
-    SessionUnknownError,
-)
 from gausslite.fusion.agent_data import is_earlier_map
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.store import FusionStore
@@ -43,7 +36,7 @@ class BanList:
     def require_allowed(self, agent_id: str) -> None:
         """Raise NotPermittedError for a banned agent."""
         if agent_id in self._agents:
-            raise NotPermittedError(f"agent {quote_name(agent_id)}: banned by an operator of this server")
+            raise errors.NotPermittedError(f"agent {quote_name(agent_id)}: banned by an operator of this server")
 
     def add(self, agent_id: str) -> None:
         """Ban an agent. Call it after the agent's other records were deleted. Raises StorageError."""
@@ -54,7 +47,9 @@ class BanList:
         """Allow a banned agent again. Raises InvalidInputError if it is not banned, StorageError."""
         if agent_id not in self._agents:
             expected = ", ".join(self.agents[:8]) or "none is banned"
-            raise InvalidInputError(f"agent_id: expected a banned agent ({expected}), got {quote_name(agent_id)}")
+            raise errors.InvalidInputError(
+                f"agent_id: expected a banned agent ({expected}), got {quote_name(agent_id)}"
+            )
         # it has nothing else
         self._store.remove_agent(agent_id)
         self._agents.remove(agent_id)
@@ -97,7 +92,7 @@ class SessionRegistry:
         """Raise NameInUseError while another token holds the agent's lease."""
         remaining_s = self._remaining_s(agent_id)
         if remaining_s > 0 and not self._is_holder(agent_id, token):
-            raise NameInUseError(
+            raise errors.NameInUseError(
                 f"agent {quote_name(agent_id)}: {_NAME_TAKEN}, or wait {remaining_s:.0f} s for the end of its lease",
                 retry_after_s=remaining_s,
             )
@@ -143,14 +138,14 @@ class SessionRegistry:
         if session is not None:
             return session
         if (session_id, True) in self._replaced:
-            raise MismatchError(f"session: {_NAME_TAKEN}")
+            raise errors.MismatchError(f"session: {_NAME_TAKEN}")
         if (session_id, False) in self._replaced:
-            error = NameInUseError(f"session: {_NAME_TAKEN}")
+            error = errors.NameInUseError(f"session: {_NAME_TAKEN}")
             error.retry_after_s = self._lease_s
             raise error
         elsewhere = self._store.find_session(session_id)
         if elsewhere is None:
-            raise SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
+            raise errors.SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
         self._elsewhere[session_id] = elsewhere
         return elsewhere
 
@@ -233,7 +228,9 @@ class Membership:
         self.bans.require_allowed(agent_id)
         self.sessions.require_free(agent_id, token)
         ended = self._make_room(agent_id)
-        agreed = self._mission_config if self._is_agreed(agent_id) else self._settings.mission_config
+        # another live agent, or any data, fixes it
+        is_agreed = bool(self._store.agents() or self.sessions.live_agents - {agent_id})
+        agreed = self._mission_config if is_agreed else self._settings.mission_config
         mission_config = reconcile(agreed, requested).with_default_names()
         if mission_config != self._stored_config:
             self._store.set_mission_config(mission_config)
@@ -256,13 +253,9 @@ class Membership:
             require_identifier("agent_id", agent_id)
         elif agent_id not in self.sources:
             expected = ", ".join(sorted(self.sources)[:8]) or "no agents yet"
-            raise InvalidInputError(
+            raise errors.InvalidInputError(
                 f"agent_id: expected an agent of the mission ({expected}), got {quote_name(agent_id)}"
             )
-
-    def _is_agreed(self, agent_id: str) -> bool:
-        """Return whether another live agent, or any data, fixes the mission's configuration."""
-        return bool(frozenset(self._store.agents()) or self.sessions.live_agents - {agent_id})
 
     def _make_room(self, agent_id: str) -> list[str]:
         """End the sessions of agents without updates whose lease has ended, if the mission is full; returns them.
@@ -274,7 +267,7 @@ class Membership:
             return []
         ended = self.sessions.end_unused(kept=frozenset(self._store.agents()))
         if len(self._agents()) >= limit:
-            raise QuotaError(
+            raise errors.QuotaError(
                 f"agents: expected at most {limit} in this mission, {quote_name(agent_id)} exceeds it; names without "
                 "data are free again when their leases end, or with gausslite evict"
             )

@@ -235,8 +235,8 @@ class TeamObjects:
     def __init__(self, store: FusionStore) -> None:
         self._store = store
         self._changing = Lock()
-        self._encoded: dict[str, bytes] = {}
-        self._reports: dict[str, ObjectReport] = {}
+        # as stored, and decoded
+        self._reports: dict[str, tuple[bytes, ObjectReport]] = {}
         self._read()
 
     def report(self, agent_id: str, report: ObjectReport, require: Callable[[], object] = lambda: None) -> None:
@@ -245,7 +245,7 @@ class TeamObjects:
         with self._changing:
             require()
             self._store.save_record(agent_id, RECORD, encoded)
-            self._encoded[agent_id], self._reports[agent_id] = encoded, report
+            self._reports[agent_id] = encoded, report
 
     def of_task(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""
@@ -255,7 +255,6 @@ class TeamObjects:
     def remove_agent(self, agent_id: str) -> None:
         """Forget the agent's report; the store deletes it with the agent's updates."""
         with self._changing:
-            self._encoded.pop(agent_id, None)
             self._reports.pop(agent_id, None)
 
     def reports(self) -> dict[str, ObjectReport]:
@@ -263,15 +262,12 @@ class TeamObjects:
         if self._store.is_shared:
             with self._changing:
                 self._read()
-        return dict(self._reports)
+        return {name: report for name, (_, report) in self._reports.copy().items()}
 
     def _read(self) -> None:
-        encoded, known = self._store.records(RECORD), dict(self._reports)
-        unchanged = {name for name, data in encoded.items() if name in known and self._encoded.get(name) == data}
-        self._reports = {
-            name: known[name] if name in unchanged else decode_object_report(data) for name, data in encoded.items()
-        }
-        self._encoded = encoded
+        known = dict(self._reports.values())
+        encoded = self._store.records(RECORD).items()
+        self._reports = {name: (data, known.get(data) or decode_object_report(data)) for name, data in encoded}
 
 
 class MergedObjects:
@@ -284,8 +280,7 @@ class MergedObjects:
     def __init__(self) -> None:
         # held while reports are merged, so that many queries at once merge once
         self._lock = Lock()
-        self._reports: dict[str, ObjectReport] = {}
-        self._frames: dict[str, Float64[ndarray, "4 4"]] = {}
+        self._of: tuple[dict[str, ObjectReport], dict[str, bytes]] = {}, {}
         self._merged: tuple[TeamObject, ...] = ()
         self._reused_until_s = 0.0
 
@@ -293,24 +288,16 @@ class MergedObjects:
         self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]]
     ) -> tuple[TeamObject, ...]:
         """Return `merge_objects` of these reports and frames."""
+        # a report is never changed, so most are compared by identity
+        of = reports, {name: T_fused_agent.tobytes() for name, T_fused_agent in frames.items()}
         with self._lock:
-            if time.monotonic() >= self._reused_until_s and not self._is_of(reports, frames):
+            if time.monotonic() >= self._reused_until_s and of != self._of:
                 begin_s = time.thread_time()
-                self._merged = merge_objects(reports, frames)
-                self._reports, self._frames = reports, frames
+                self._merged, self._of = merge_objects(reports, frames), of
                 spent_s = time.thread_time() - begin_s
                 if spent_s > _QUICK_S:
                     self._reused_until_s = time.monotonic() + _REUSE * spent_s
             return self._merged
-
-    def _is_of(self, reports: dict[str, ObjectReport], frames: dict[str, Float64[ndarray, "4 4"]]) -> bool:
-        # a report is never changed, so the same object has the same content
-        return (
-            reports.keys() == self._reports.keys()
-            and all(report is self._reports[agent_id] for agent_id, report in reports.items())
-            and frames.keys() == self._frames.keys()
-            and all(np.array_equal(frame, self._frames[agent_id]) for agent_id, frame in frames.items())
-        )
 
 
 def find_objects(objects: Sequence[TeamObject], noun: str = "") -> tuple[TeamObject, ...]:

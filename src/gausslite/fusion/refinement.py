@@ -126,7 +126,7 @@ def refine(
                 masked=True,
                 update_counter=UpdateCounter(table.kappa),
             )
-            if _density_control_is_due(iteration, settings.density):
+            if iteration % settings.density.densify_every == 0 or iteration % settings.density.prune_every == 0:
                 binding.close()
                 _control_density(table, iteration, settings, extent_m)
                 binding.enter_context(rasterizer.bind_tables(*_tables(table)))
@@ -189,10 +189,6 @@ class _ViewPool:
             if len(self._prepared) < self._max_prepared:
                 self._prepared[index] = view
         return view, inverse(frame.T_world_camera)
-
-
-def _density_control_is_due(iteration: int, density: DensitySettings) -> bool:
-    return iteration % density.densify_every == 0 or iteration % density.prune_every == 0
 
 
 def _control_density(table: SplatTable, iteration: int, settings: RefineSettings, extent_m: float) -> None:

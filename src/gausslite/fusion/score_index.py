@@ -33,20 +33,15 @@ class ScoreIndex:
 
     def __init__(self) -> None:
         self._rows: dict[str, _AgentRows] = {}
-        self._agents: tuple[str, ...] = ()
+        self.agents: tuple[str, ...] = ()
+        """The ids of the agents with rows, sorted."""
         # for each voxel a bit set of the agents with a row, so that a look-up asks only these agents
         self._holders: dict[int, int] = {}
         self._bits: dict[str, int] = {}
 
-    @property
-    def agents(self) -> tuple[str, ...]:
-        """The ids of the agents with rows, sorted."""
-        return self._agents
-
     def totals(self, agent_id: str) -> AgentTotals:
         """Return the sums over an agent's rows; zero for an unknown one."""
-        rows = self._rows.get(agent_id)
-        return AgentTotals() if rows is None else rows.totals
+        return self._rows.get(agent_id, _NO_ROWS).totals
 
     def digests(self, agent_id: str) -> TileDigests:
         """Return the digests of an agent's rows; empty for an unknown one."""
@@ -55,28 +50,27 @@ class ScoreIndex:
 
     def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels, in their order."""
-        rows = self._rows.get(agent_id)
-        return np.full(len(keys), _MISSING) if rows is None else rows.stored(rows.find(keys))
+        rows = self._rows.get(agent_id, _NO_ROWS)
+        return rows.stored(rows.find(keys))
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         wanted = None if keys is None else np.unique(keys)
         holders = -1 if wanted is None else self._holders_of(wanted)
-        present = [index for index, agent_id in enumerate(self._agents) if self._bits[agent_id] & holders]
-        parts = [self._rows[self._agents[index]].sorted_scores(wanted) for index in present]
+        present = [index for index, agent_id in enumerate(self.agents) if self._bits[agent_id] & holders]
+        parts = [self._rows[self.agents[index]].sorted_scores(wanted) for index in present]
         agent_index = np.repeat(np.array(present, np.int32), [len(part) for part in parts])
-        return VoxelScoreTable(self._agents, agent_index, join_elements([NO_SCORES, *parts]))
+        return VoxelScoreTable(self.agents, agent_index, join_elements([NO_SCORES, *parts]))
 
     def sorted_scores(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> Scores:
         """Return the agent's totals on those of these voxels (ascending keys) that it has, or on all."""
-        rows = self._rows.get(agent_id)
-        return NO_SCORES if rows is None else rows.sorted_scores(keys)
+        return self._rows.get(agent_id, _NO_ROWS).sorted_scores(keys)
 
     def put(self, agent_id: str, scores: Scores) -> Scores:
         """Replace the agent's totals on the voxels of the scores; returns those from before."""
         if agent_id not in self._rows:
             self._rows[agent_id] = _AgentRows()
-            self._agents = tuple(sorted(self._rows))
+            self.agents = tuple(sorted(self._rows))
             used = reduce(or_, self._bits.values(), 0)
             self._bits[agent_id] = ~used & (used + 1)
         bit = self._bits[agent_id]
@@ -90,7 +84,7 @@ class ScoreIndex:
         rows = self._rows.pop(agent_id, None)
         if rows is None:
             return np.zeros(0, np.int64)
-        self._agents = tuple(sorted(self._rows))
+        self.agents = tuple(sorted(self._rows))
         bit = self._bits.pop(agent_id)
         keys = rows.sorted_scores(None)["keys"].copy()
         for key in keys.tolist():
@@ -190,3 +184,6 @@ class _AgentRows:
         if size > capacity:
             extra = max(size, 2 * capacity) - capacity
             self._scores = np.concatenate([self._scores, np.zeros(extra, SCORES)])
+
+
+_NO_ROWS = _AgentRows()

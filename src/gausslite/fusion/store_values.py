@@ -75,15 +75,7 @@ class PutOutcome:
     stale: Int64[ndarray, " s"]
 
 
-SCORES = np.dtype(
-    [
-        ("keys", np.int64),
-        ("update_seqs", np.int64),
-        ("kappa_sums", np.uint64),
-        ("counts", np.uint32),
-        ("rows", np.int64),
-    ]
-)
+SCORES = np.dtype([("keys", "i8"), ("update_seqs", "i8"), ("kappa_sums", "u8"), ("counts", "u4"), ("rows", "i8")])
 Scores = NDArray[Any]
 """An element of SCORES for each of an agent's updates: its totals, and the store's row that has its Gaussians.
 

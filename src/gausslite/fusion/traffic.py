@@ -25,12 +25,8 @@ class StorageProbe:
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
-        self._is_writable = True
-
-    @property
-    def is_writable(self) -> bool:
-        """The result of the latest check; True before the first."""
-        return self._is_writable
+        self.is_writable = True
+        """The result of the latest check."""
 
     def check(self) -> None:
         """Raise StorageError if the store does not take 256 KiB."""
@@ -39,9 +35,9 @@ class StorageProbe:
             # its pages are free again, so that the next check needs new ones if messages have taken them
             self._store.save_record(*_PROBE, b"")
         except StorageError:
-            self._is_writable = False
+            self.is_writable = False
             raise
-        self._is_writable = True
+        self.is_writable = True
 
 
 ACKNOWLEDGEMENT_BOUNDS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import logging
 import struct
@@ -19,15 +20,9 @@ from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import declared_bytes, decode_stored
+from gausslite.domain import errors
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import (
-    GaussLiteError,
-    InvalidInputError,
-    MismatchError,
-    NotPermittedError,
-    QuotaError,
-    UnavailableError,
-)
+from gausslite.domain.errors import StorageError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.store import FusionStore
@@ -36,7 +31,7 @@ from gausslite.fusion.store_values import PutOutcome
 MAX_SEQ_STEP = 1 << 32
 """An honest agent counts its messages; a larger step would let one message use up all later numbers."""
 RECORD = "first-joined"
-_JOINED = struct.Struct("<d")
+_SECONDS = struct.Struct("<d")
 
 
 def decode_own(message: bytes, agent_id: str, grid: VoxelGrid) -> StoredSubset:
@@ -52,9 +47,47 @@ def decode_own(message: bytes, agent_id: str, grid: VoxelGrid) -> StoredSubset:
 def require_own(agent_id: str, named: str, grid: VoxelGrid, expected: VoxelGrid) -> None:
     """Raise NotPermittedError for another agent's name, MismatchError for another grid."""
     if named != agent_id:
-        raise NotPermittedError(f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(named)}")
+        raise errors.NotPermittedError(f"subset agent_id: expected {quote_name(agent_id)}, got {quote_name(named)}")
     if grid != expected:
-        raise MismatchError(f"voxel size: this mission votes on {expected.size_m:g} m, got {grid.size_m:g} m")
+        raise errors.MismatchError(f"voxel size: this mission votes on {expected.size_m:g} m, got {grid.size_m:g} m")
+
+
+# no agent can have an empty id
+_CLOCK = "", "mission-clock"
+_SAVE_INTERVAL_S = 60.0
+_LONGEST_PAUSE_S = 86_400.0
+
+
+class MissionClock:
+    """Gives the time in seconds. It starts at the wall clock's and runs with the monotonic one, so it never goes back.
+
+    It persists with the store. The time without a server counts as the wall clock has it, up to a day.
+    """
+
+    def __init__(
+        self,
+        store: FusionStore,
+        wall_s: Callable[[], float] = time.time,
+        monotonic_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._store, self._monotonic_s = store, monotonic_s
+        stored = store.find_record(*_CLOCK)
+        start_s = wall_s()
+        if stored:
+            saved_s = float(_SECONDS.unpack(stored)[0])
+            start_s = min(max(start_s, saved_s), saved_s + _LONGEST_PAUSE_S)
+        self._offset_s = start_s - monotonic_s()
+        self._next_save_s = start_s
+
+    def __call__(self) -> float:
+        """Return the time; it is saved once a minute."""
+        now_s = self._monotonic_s() + self._offset_s
+        if now_s >= self._next_save_s:
+            # the next minute tries again, and the time since then counts from the wall clock
+            with contextlib.suppress(StorageError):
+                self._store.save_record(*_CLOCK, _SECONDS.pack(now_s))
+            self._next_save_s = now_s + _SAVE_INTERVAL_S
+        return now_s
 
 
 class UpdateChecks:
@@ -65,13 +98,13 @@ class UpdateChecks:
 
     def __init__(self, store: FusionStore, quotas: Quotas, clock_s: Callable[[], float]) -> None:
         self._store, self._quotas, self._clock_s = store, quotas, clock_s
-        self._first_joined_s = {agent_id: _JOINED.unpack(data)[0] for agent_id, data in store.records(RECORD).items()}
+        self._first_joined_s = {agent_id: _SECONDS.unpack(data)[0] for agent_id, data in store.records(RECORD).items()}
 
     def record_join(self, agent_id: str) -> None:
         """Note the agent's first join. Raises StorageError."""
         if agent_id not in self._first_joined_s:
             now_s = self._clock_s()
-            self._store.save_record(agent_id, RECORD, _JOINED.pack(now_s))
+            self._store.save_record(agent_id, RECORD, _SECONDS.pack(now_s))
             self._first_joined_s[agent_id] = now_s
 
     def require_plausible(self, subset: StoredSubset) -> None:
@@ -81,12 +114,12 @@ class UpdateChecks:
         """
         name, highest = quote_name(subset.agent_id), self._store.totals(subset.agent_id).highest_update_seq
         if subset.update_seq > highest + MAX_SEQ_STEP:
-            raise InvalidInputError(
+            raise errors.InvalidInputError(
                 f"agent {name}: expected an update_seq of at most {highest + MAX_SEQ_STEP}, got {subset.update_seq}"
             )
         largest, bound = int(subset.voxels.gaussians["kappa"].max(initial=0)), self._kappa_bound(subset.agent_id)
         if largest > bound:
-            raise QuotaError(
+            raise errors.QuotaError(
                 f"agent {name}: expected a kappa of at most {bound} this long after its first join, got {largest}"
             )
 
@@ -99,7 +132,7 @@ class UpdateChecks:
         now_s = self._clock_s()
         if agent_id not in self._first_joined_s:
             stored = self._store.find_record(agent_id, RECORD)
-            self._first_joined_s[agent_id] = _JOINED.unpack(stored)[0] if stored else now_s
+            self._first_joined_s[agent_id] = _SECONDS.unpack(stored)[0] if stored else now_s
         elapsed_s = max(0.0, now_s - self._first_joined_s[agent_id])
         return self._quotas.kappa_at_join + int(self._quotas.kappa_per_second * elapsed_s)
 
@@ -201,13 +234,15 @@ class UpdateQueue:
         agent_id, size = update.agent_id, update.encoded_bytes
         with self._lock:
             own = self._pending.get(agent_id, ())
-            if own and (len(own) >= _MAX_PENDING or size + sum(map(_encoded_bytes, own)) > _AGENT_BYTES):
-                raise UnavailableError(
+            if own and (
+                len(own) >= _MAX_PENDING or size + sum(waiting.encoded_bytes for waiting in own) > _AGENT_BYTES
+            ):
+                raise errors.UnavailableError(
                     f"agent {quote_name(agent_id)}: expected at most {_MAX_PENDING} messages and {_AGENT_BYTES >> 20} "
                     "MiB that wait for their acknowledgement; wait for some"
                 )
             if self._bytes + size > _TOTAL_BYTES:
-                raise UnavailableError(
+                raise errors.UnavailableError(
                     f"fusion server: {len(self._pending)} agents have {self._bytes >> 20} MiB that wait for their "
                     "acknowledgement; try again in a moment"
                 )
@@ -266,10 +301,6 @@ class UpdateQueue:
         heapq.heappush(self._waiting, (finish, self._arrivals, agent_id))
 
 
-def _encoded_bytes(update: PendingUpdate) -> int:
-    return update.encoded_bytes
-
-
 _GROUP_BYTES = 1 << 19
 """Of about 20 messages of a robot; a message that comes during a commit waits for its end."""
 Check = Callable[[PendingUpdate], None]
@@ -319,7 +350,7 @@ class UpdateCommitter:
             try:
                 if isinstance(update.message, bytes):
                     update.message = decode_own(update.message, update.agent_id, self._grid)
-            except GaussLiteError as error:
+            except errors.GaussLiteError as error:
                 _fail(update, error)
 
     def _log_if_late(self, update: PendingUpdate) -> None:
@@ -337,19 +368,14 @@ class UpdateCommitter:
                 try:
                     self._check(update)
                     checked.append((update, update.next_slice()))
-                except GaussLiteError as error:
+                except errors.GaussLiteError as error:
                     _fail(update, error)
         if not checked:
             return
         outcomes = self._put(checked)
         with self._lock:
-            self._record(
-                [
-                    (part.agent_id, outcome.accepted)
-                    for (_, part), outcome in zip(checked, outcomes, strict=True)
-                    if outcome is not None
-                ]
-            )
+            results = zip(checked, outcomes, strict=True)
+            self._record([(part.agent_id, put.accepted) for (_, part), put in results if put is not None])
         for (update, _), outcome in zip(checked, outcomes, strict=True):
             if outcome is not None and update.add_outcome(outcome):
                 update.future.set_result(update.outcome())
@@ -358,15 +384,11 @@ class UpdateCommitter:
         """Store the messages; if the group fails, each alone, so that one too large for the disk fails alone."""
         try:
             return list(self._store.put_all([part for _, part in checked]))
-        except GaussLiteError:
-            return [self._put_alone(update, part) for update, part in checked]
-
-    def _put_alone(self, update: PendingUpdate, part: StoredSubset) -> PutOutcome | None:
-        try:
-            return self._store.put_all([part])[0]
-        except GaussLiteError as error:
-            _fail(update, error)
-            return None
+        except errors.GaussLiteError as error:
+            if len(checked) > 1:
+                return [outcome for own in checked for outcome in self._put([own])]
+            _fail(checked[0][0], error)
+            return [None]
 
 
 def _fail(update: PendingUpdate, error: BaseException) -> None:
@@ -385,6 +407,6 @@ def require_within_quotas(subset: StoredSubset, store: FusionStore, quotas: Quot
         ("Gaussians", totals.gaussians + int(added), quotas.gaussians_per_agent),
     ):
         if value > limit:
-            raise QuotaError(
+            raise errors.QuotaError(
                 f"agent {quote_name(subset.agent_id)}: expected at most {limit} {name} in all, got {value}"
             )

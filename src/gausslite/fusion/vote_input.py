@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.fusion.frames import FrameAlignments
@@ -166,11 +165,7 @@ class VoteInput:
 
     def _in_range(self, gaussians: Gaussians) -> Bool[ndarray, " n"]:
         """Return which Gaussians are within the range of the grid; the others are dropped."""
-        inside = np.ones(len(gaussians), np.bool_)
-        try:
-            self._grid.keys(gaussians.means_m)
-        except InvalidInputError:
-            inside = (np.abs(gaussians.means_m) < 0.99 * self._grid.max_coordinate_m).all(axis=1)
+        inside: Bool[ndarray, " n"] = (np.abs(gaussians.means_m) < 0.99 * self._grid.max_coordinate_m).all(axis=1)
         return inside
 
     def _with_moved(

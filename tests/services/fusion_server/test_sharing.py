@@ -328,7 +328,7 @@ def test_a_server_refuses_what_an_owner_that_has_stopped_cannot_take(
     postgres: PostgresServer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # a tenth of the default, so that the owner is stopped for less time than a connection may be silent
-    monkeypatch.setattr("gausslite_fusion_server.part_sender._OWNER_BYTES", 1_600_000)
+    monkeypatch.setattr("gausslite_fusion_server.peers._OWNER_BYTES", 1_600_000)
     url, peer, address = postgres.new_database(), f"unix:{folder}/stopped.sock", f"unix:{folder}/own.sock"
     with sharing_server(url, address) as own:
         arguments = ["--store", url, "--set", f"peer-address={peer}", "--listen", peer, "--voxel-size", "0.1"]
