@@ -147,12 +147,13 @@ def make_subset(agent_id: str, revision: int, cells: dict[int, Sequence[int]]) -
 
 
 def frame(index: int, camera: Camera = CAMERA, T_world_camera: np.ndarray | None = None) -> Frame:
-    """A view from the origin along z, a grey wall 1.2 m away."""
+    """A view from the origin along z, a shaded grey wall 1.2 m away."""
     size = (camera.height_px, camera.width_px)
+    shade = np.linspace(100, 140, camera.width_px).astype(np.uint8)
     return Frame(
         index,
         index * 1_000_000,
-        np.full((*size, 3), 120, np.uint8),
+        np.broadcast_to(shade[None, :, None], (*size, 3)).copy(),
         np.full(size, 1.2, np.float32),
         camera,
         np.eye(4) if T_world_camera is None else T_world_camera,

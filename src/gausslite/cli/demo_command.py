@@ -250,7 +250,7 @@ def _score(
     """Score the maps on the held-out frames that can be read."""
     regions = list(scenario.regions.values())
     frames = (frame for stream in scenario.held_out for frame in stream.frames(corrupt))
-    views = [HeldOutView.of(frame, regions) for frame in frames if frame.has_depth]
+    views = [HeldOutView.of(frame, regions) for frame in frames if not frame.defect]
     if not views and corrupt.first_error is not None:
         raise corrupt.first_error
     viewers = view_maps({name: read_ply(path, print_message) for name, path in maps.items()}, options.threads)

@@ -272,7 +272,7 @@ def _score_views(
         if conditions.trajectory is not None:
             frame = replace(frame, T_world_camera=conditions.trajectory(frame.capture_time_ns))
         view = HeldOutView.of(frame, regions)
-        if not view.frame.has_depth:
+        if view.frame.defect:
             continue
         start = conditions.start_of_fit(view.frame)
         rendered = render_fitted(viewer, start) if conditions.fit_views else viewer.render_frame(view.frame)

@@ -29,6 +29,7 @@ from gausslite.datasets.open import open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError, StorageError
+from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, found_text
 from gausslite.domain.relevance import Region
@@ -334,7 +335,8 @@ class _Run:
         """Print the figures and the notes of a complete run."""
         totals, report = result.totals, self._report
         counts = (
-            (totals.skipped - totals.lost, "without depth"),
+            (totals.reasons[NO_DEPTH], "without depth"),
+            (totals.reasons[ONE_COLOUR], "of one colour"),
             (totals.lost, "lost by tracking"),
             (self._corrupt.count, "corrupt"),
         )

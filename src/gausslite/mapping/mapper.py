@@ -119,7 +119,7 @@ class GaussianMapper:
 
     @property
     def skipped(self) -> int:
-        """Number of frames without a depth reading, which are not mapped."""
+        """Number of frames with a defect, which are not mapped."""
         return self._skipped
 
     @property
@@ -139,13 +139,13 @@ class GaussianMapper:
 
         relevance: w(u, v) of Sec. III-B. rendered: the map rendered from frame.T_world_camera; if None, or if the pose
         is refined, the mapper renders it. odometry: the frame with the odometry's pose, if frame has another. A frame
-        without a depth reading is skipped. Raises ShapeError if relevance and frame differ in size.
+        with a defect is skipped. Raises ShapeError if relevance and frame differ in size.
         """
         require_array("relevance pixel_weights", relevance.pixel_weights, frame.depth_m.shape, np.float32)
         scheduler = CountedScheduler() if scheduler is None else scheduler
-        if not frame.has_depth:
+        if defect := frame.defect:
             self._skipped += 1
-            return MappedFrame(frame.index, 0, 0, self.count, "no pixel has a depth reading")
+            return MappedFrame(frame.index, 0, 0, self.count, defect)
         self._refiner.history.begin(odometry or frame, self._keyframes.next_anchor)
         with scheduler.timing(Stage.VIEW_PREPARATION):
             view = self._prepare_view(frame, relevance)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -126,13 +127,11 @@ _NO_FRAME_INDEX = -1
 class MissionTotals:
     """Sums over the frames of a mission.
 
-    frames: mapped ones; late: those of them that missed their deadline. skipped: frames without depth, and those that
-    tracking has lost, which `lost` counts alone.
+    frames: mapped ones; late: those of them that missed their deadline. reasons: of the skipped frames.
     """
 
     frames: int = 0
-    skipped: int = 0
-    lost: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
     late: int = 0
     iterations: int = 0
     keyframes_reevaluated: int = 0
@@ -141,14 +140,23 @@ class MissionTotals:
     busy_s: float = 0.0
     region_seen: bool = False
 
+    @property
+    def skipped(self) -> int:
+        """Number of frames that were not mapped."""
+        return self.reasons.total()
+
+    @property
+    def lost(self) -> int:
+        """Number of frames that tracking has lost."""
+        return self.reasons[TRACKING_LOST]
+
     def add(self, outcome: FrameOutcome) -> None:
         """Add one frame."""
         self.keyframes_reevaluated += outcome.reevaluation.keyframes
         self.seeded_in_keyframes += outcome.reevaluation.seeded
         self.region_seen |= outcome.roi_share > 0
         if outcome.skipped is not None:
-            self.skipped += 1
-            self.lost += outcome.skipped == TRACKING_LOST
+            self.reasons[outcome.skipped] += 1
             return
         self.frames += 1
         self.late += outcome.timing.late

@@ -82,6 +82,7 @@ class TaskMapper:
         self._publish = publish
         self._tracker = tracker
         self._detected: DetectedImage | None = None
+        self._defects: dict[str, int] = {}
         # a person takes seconds to point, while newer frames replace most of the newest keyframes
         self._shown: deque[Frame] = deque(maxlen=_MAX_SHOWN)
 
@@ -115,9 +116,11 @@ class TaskMapper:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Messages of the relevance estimator and of the loops for the operator, one line each."""
-        loops = self._mapper.loops.describe()
-        return (*self._estimator.notes, loops) if loops else self._estimator.notes
+        """Messages of the relevance estimator, on frames with a defect and on loops, one line each."""
+        defects = (
+            f"frames are skipped in which {defect}; the first one is {index}" for defect, index in self._defects.items()
+        )
+        return (*self._estimator.notes, *defects, *filter(None, [self._mapper.loops.describe()]))
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
@@ -216,12 +219,15 @@ class TaskMapper:
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Process one frame and return its outcome; waited_s is its time in the queue.
 
-        A frame whose pose is not found by tracking is skipped.
+        A frame with a defect is skipped, and one whose pose is not found by tracking.
         """
         self._scheduler.begin(waited_s)
+        if defect := frame.defect:
+            self._defects.setdefault(defect, frame.index)
+            return self._skip(frame, defect)
         odometry, tracked = frame, self._track(frame)
         if tracked is None:
-            return FrameOutcome(frame.index, 0, self._mapper.count, 0.0, self._scheduler.end(), TRACKING_LOST)
+            return self._skip(frame, TRACKING_LOST)
         frame = tracked if self._tracker is not None else self._mapper.corrected(frame)
         frame = self._without_moving(frame)
         view = self._render(frame)
@@ -234,14 +240,14 @@ class TaskMapper:
             if mapped.T_corrected_earlier is not None:
                 self._tracker.move(mapped.T_corrected_earlier)
             self._tracker.confirm(mapped.T_world_camera, mapped.anchor)
-        changed_roi = self._publish_changed_roi() if mapped.skipped is None else None
+        changed_roi = self._publish_changed_roi()
         return FrameOutcome(
             index=frame.index,
             iterations=mapped.iterations,
             gaussians=mapped.gaussians,
             roi_share=estimate.relevance.roi_share,
             timing=self._scheduler.end(),
-            skipped=mapped.skipped,
+            skipped=None,
             changed_roi=changed_roi,
             detection_lag_frames=lag_frames,
             reevaluation=reevaluation,
@@ -267,7 +273,7 @@ class TaskMapper:
 
     def _track(self, frame: Frame) -> Frame | None:
         """Return the frame with its tracked pose, the frame itself without tracking, or None if the camera is lost."""
-        if self._tracker is None or not frame.has_depth:
+        if self._tracker is None:
             return frame
         with self._scheduler.timing(Stage.TRACKING):
             T_world_camera = self._tracker.track(frame)
@@ -275,7 +281,7 @@ class TaskMapper:
 
     def _without_moving(self, frame: Frame) -> Frame:
         """Return the frame without the things that move; hide in an earlier keyframe what has moved since."""
-        if not frame.has_depth or not self._mapper.settings.leaves_out_moving:
+        if not self._mapper.settings.leaves_out_moving:
             return frame
         keyframes = self._mapper.keyframes()[-MovingSettings().references :]
         frames = [keyframe.frame for keyframe in keyframes]
@@ -287,6 +293,10 @@ class TaskMapper:
                 self._mapper.hide(moved, keyframes[chosen], [*frames[:chosen], *later])
         moving = moving_pixels(frame, frames)
         return self._mapper.without(moving, frame) if moving.any() else frame
+
+    def _skip(self, frame: Frame, reason: str) -> FrameOutcome:
+        """Return the outcome of a frame that is not mapped."""
+        return FrameOutcome(frame.index, 0, self._mapper.count, 0.0, self._scheduler.end(), reason)
 
     def _render(self, frame: Frame) -> RenderedView | None:
         """Render the map from the frame's pose, for the depth of the relevance estimate and for seeding."""

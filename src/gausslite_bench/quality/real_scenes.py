@@ -98,7 +98,7 @@ class RealScenePlan:
         regions = choose_regions(all_regions, self.objects)
         training, held_out = self.split.split(self._positions(source))
         views = [HeldOutView.of(source.frame(i, size), regions) for i in held_out]
-        views = [view for view in views if view.frame.has_depth]
+        views = [view for view in views if not view.frame.defect]
         if views and not any(view.shows_region for view in views):
             raise UnseenRegionError(
                 f"{self.name}: expected held-out views that show at least {MIN_ROI_PIXELS} pixels of "

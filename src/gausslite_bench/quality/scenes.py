@@ -108,8 +108,8 @@ def make_scene(
     info: SceneInfo,
 ) -> Scene:
     """Return the scene of the frames and views that have depth. Raises DatasetError if none has."""
-    usable = [frame for frame in training if frame.has_depth]
-    views = [view for view in held_out if view.frame.has_depth]
+    usable = [frame for frame in training if not frame.defect]
+    views = [view for view in held_out if not view.frame.defect]
     if not usable or not views:
         counts = f"{len(usable)} and {len(views)}"
         raise DatasetError(f"{task!r}: expected training frames and held-out views with depth, got {counts}")

@@ -116,12 +116,12 @@ class HomeTeamPlan:
         regions = choose_regions(held_out.regions(), names)
         views = [HeldOutView.of(held_out.frame(i), regions) for i in range(len(held_out))]
         info = SceneInfo(held_out.up_axis, held_out.regions())
-        return TeamScene(self.name, agents, [view for view in views if view.frame.has_depth], info)
+        return TeamScene(self.name, agents, [view for view in views if not view.frame.defect], info)
 
     def _agent_scene(self, agent_id: str, task: HomeTask, walk: tuple[int, int], size: tuple[int, int]) -> AgentScene:
         trajectory, more_frames = walk
         source = open_source(self._spec(trajectory, self.frames + more_frames, size))
-        frames = [frame for frame in (source.frame(i) for i in range(len(source))) if frame.has_depth]
+        frames = [frame for frame in (source.frame(i) for i in range(len(source))) if not frame.defect]
         return agent_scene(agent_id, task.task, task.objects, frames, source.regions())
 
     def _spec(self, trajectory: int, frames: int, size: tuple[int, int]) -> str:

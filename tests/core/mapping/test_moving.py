@@ -24,7 +24,8 @@ WALL_M, BOX_M = 2.0, 1.2
 def frame(index: int, left_px: int | None, x_m: float = 0.0) -> Frame:
     """A wall, and a box in front of it whose left side is in this column; None: no box."""
     depth_m = np.full((120, 160), WALL_M, np.float32)
-    rgb = np.full((120, 160, 3), 120, np.uint8)
+    # a shade, because an image of one colour is a defect
+    rgb = np.broadcast_to(np.linspace(100, 140, 160).astype(np.uint8)[None, :, None], (120, 160, 3)).copy()
     if left_px is not None:
         depth_m[30:90, left_px : left_px + 40] = BOX_M
         rgb[30:90, left_px : left_px + 40] = (200, 60, 30)
