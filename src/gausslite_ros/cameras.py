@@ -164,10 +164,7 @@ class FrameConverter:
         depth_m = _depth_image(f"{location}: {self.depth_topic}", messages[1], self.units_per_metre)
         image = resize_rgbd(self.cameras.join(location, rgb, depth_m), size)
         # to the precision of a float64 in seconds, as in folders: keyframes are chosen by their times
-        time_ns = round(stamp_ns / 10**9 * 1e9)
-        return Frame(
-            number, time_ns, image.rgb, image.depth_m, image.camera, T_world_camera, recorded_rgb=image.recorded_rgb
-        )
+        return image.frame(number, round(stamp_ns / 10**9 * 1e9), T_world_camera)
 
 
 def _colour_image(location: str, message: Any) -> UInt8[ndarray, "h w 3"]:

@@ -89,7 +89,7 @@ def calibrate(
     """
     stated = stated or StatedValues()
     contradiction = None if stated.checked else _contradiction(source, stated.force)
-    if contradiction is not None and not contradiction.in_places:
+    if contradiction is not None and not contradiction.is_small:
         correction, prior = stated.correction, stated.pose_prior
         lens = stated.lens or (source.lens if source.depth_registered else None)
         stated = replace(
@@ -148,7 +148,7 @@ def _contradiction(source: Source, force: bool) -> Contradiction | None:
     if source.poses_exact or source.camera_ideal:
         return None
     found = find_contradiction(source)
-    if found is None or found.in_places:
+    if found is None or found.is_small:
         return found
     way = "state it as scale in the camera file of a folder, or as depth_unit=Xmm in the address of a bag"
     if found.only_unit and not source.depth_unit_stated:

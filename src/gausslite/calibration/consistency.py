@@ -2,7 +2,7 @@
 
 Features of two frames and measured depth show how the camera moved. Where the stated poses move the points of the first
 frame elsewhere, other conventions are tried: the inverse poses, other axes of the camera, another order of the
-quaternion, another clock, another unit of depth, another focal length.
+quaternion, another clock, another unit of depth, other intrinsics. Depth images are then compared with each other.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.calibration.depth_consistency import find_other_depth
 from gausslite.calibration.features import RelativePose, detect_features, relative_pose
+from gausslite.calibration.rig_fit import REGISTERED, UNREGISTERED, PointMotion, fit_intrinsics, fit_mount
 from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.source import Source, downscaled_size
@@ -35,6 +37,8 @@ _DOUBTFUL, _WRONG, _RIGHT = 0.15, 0.6, 0.3
 """Median error of the points' places, as a share of their motion. Right poses of real recordings have 0.02 to 0.13,
 also with unregistered depth; poses of another convention 0.16 to 1.8, and the right reading at most a third of it."""
 _CONVENTION_GAIN, _SCALE_GAIN = 0.4, 0.7
+_MOUNT_GAIN = 0.7
+"""A mount counts only if it leaves this share of the distances that other intrinsics leave: small ones look alike."""
 _LEAST_FACTOR = 1.5
 """Depth counts as wrong beyond this factor; right recordings reach 1.2."""
 _JUMP = 0.03
@@ -42,7 +46,6 @@ _JUMP = 0.03
 with unregistered depth by 0.023; a jump by 15 cm at a distance of 2 m by 0.032."""
 _JUMP_RATIO, _LEAST_JUMP_M, _LEAST_JUMP_RAD, _MAX_JUMPS = 2.0, 0.05, 0.1, 6
 """A step of the poses is compared with the images if it is by this ratio longer than the median and not small."""
-_MAX_FOCAL_FACTOR, _FOCAL_FACTORS = 3.0, 25
 _MIN_CLOCK_S, _MAX_CLOCK_S = 0.1, 3.0
 """A smaller difference of the clocks is a time offset, which `estimate_camera` finds."""
 
@@ -83,11 +86,6 @@ class _Pair:
         largest_px[largest_px < _MIN_MOTION * self.camera.width_px] = np.nan
         errors_px = _median_distance(predicted, self.matched.pixels)
         return errors_px, errors_px / largest_px
-
-    def with_focal_length(self, factor: float) -> _Pair:
-        """Return the pair of a camera whose focal length is multiplied."""
-        points_m = self.matched.points_m * (1 / factor, 1 / factor, 1.0)
-        return replace(self, matched=replace(self.matched, points_m=points_m), camera=self.camera.zoomed(factor))
 
     def scale(self, motion: Float64[ndarray, "4 4"]) -> float:
         """Return the factor of the motion's translation that fits the points best; NaN if they do not show it."""
@@ -144,12 +142,13 @@ def _errors(readings: Sequence[_Reading], pairs: Sequence[_Pair]) -> Float64[nda
 class Contradiction:
     """How poses or depth contradict the images, and what would agree, as one line.
 
-    only_unit: the stated poses and another unit of depth would agree. in_places: other frames do not contradict.
+    only_unit: the stated poses and another unit of depth would agree. is_small: the recording can be mapped, because
+    other frames do not contradict, or because depth is late by one frame.
     """
 
     text: str
     only_unit: bool = False
-    in_places: bool = False
+    is_small: bool = False
 
     def __str__(self) -> str:
         return self.text
@@ -161,19 +160,22 @@ def find_contradiction(source: Source) -> Contradiction | None:
     Frames that cannot be read are ignored. Takes about a second. Raises DatasetError, PoseError.
     """
     pairs, trajectory = _matched_pairs(source), source.trajectory()
-    found = _find_everywhere(trajectory, pairs) if len(pairs) >= _MIN_PAIRS else None
-    return found or _find_in_places(source, trajectory.T_world_camera, pairs)
+    found = _find_everywhere(source, trajectory, pairs) if len(pairs) >= _MIN_PAIRS else None
+    return found or _find_in_depth(source, trajectory, pairs) or _find_in_places(source, trajectory, pairs)
 
 
-def _find_everywhere(trajectory: Trajectory, pairs: Sequence[_Pair]) -> Contradiction | None:
+def _find_everywhere(source: Source, trajectory: Trajectory, pairs: Sequence[_Pair]) -> Contradiction | None:
     """Return the contradiction of most pairs; None without one."""
     stated = _Reading("", _motions(trajectory.T_world_camera, pairs))
     error = float(_errors([stated], pairs)[0])
-    depth = _scaled_to_agree(stated, pairs, error)
-    if not math.isfinite(error) or (error < _DOUBTFUL and depth is None):
+    depth, best = _scaled_to_agree(stated, pairs, error), None
+    if not math.isfinite(error):
         return None
+    if error >= _DOUBTFUL or depth is not None:
+        best = _best_reading(list(_readings(trajectory, pairs)), pairs, error, depth)
+    if best is None:
+        best = _best_rig(source, trajectory, pairs, error)
     off = f"points of {len(pairs)} pairs of frames are off by {error:.0%} of their motion"
-    best = _best_reading(list(_readings(trajectory, pairs)), pairs, error, depth) or _focal_length(stated, pairs, error)
     if best is not None:
         only_unit = depth is not None and best == depth.words
         return Contradiction(f"poses and depth do not fit the images ({off}); {best} would agree", only_unit)
@@ -185,14 +187,48 @@ def _find_everywhere(trajectory: Trajectory, pairs: Sequence[_Pair]) -> Contradi
     )
 
 
-def _find_in_places(
-    source: Source, T_world_camera: Float64[ndarray, "n 4 4"], pairs: Sequence[_Pair]
-) -> Contradiction | None:
+def _best_rig(source: Source, trajectory: Trajectory, pairs: Sequence[_Pair], error: float) -> str | None:
+    """Return the intrinsics or the mount of the camera, in words, that fit far better than the stated ones."""
+    motions = _motions(trajectory.T_world_camera, pairs)
+    limits = REGISTERED if source.depth_registered else UNREGISTERED
+    intrinsics = fit_intrinsics(_point_motions(pairs, motions), source.camera.width_px, limits)
+    readings = [_Reading(words, axes @ motions @ axes.T) for words, axes in _axes()]
+    nearest = readings[int(np.argmin(_errors(readings, pairs))) if error >= _DOUBTFUL else 0]
+    mount = fit_mount(_point_motions(pairs, nearest.motions))
+    if mount is not None and (intrinsics is None or mount.distance < _MOUNT_GAIN * intrinsics.distance):
+        return f"{mount.words} with {nearest.words}," if mount.words and nearest.words else mount.words or None
+    return None if intrinsics is None else intrinsics.words or None
+
+
+def _point_motions(pairs: Sequence[_Pair], motions: Float64[ndarray, "p 4 4"]) -> list[PointMotion]:
+    return [PointMotion(pair.matched, pair.camera, T) for pair, T in zip(pairs, motions, strict=True)]
+
+
+def _find_in_depth(source: Source, trajectory: Trajectory, pairs: Sequence[_Pair]) -> Contradiction | None:
+    """Return the contradiction of depth images among each other; None without one."""
+
+    def poses_are_late(lag: int) -> bool:
+        T_world_camera, count = trajectory.T_world_camera, len(trajectory.T_world_camera)
+        earlier = T_world_camera[np.clip(np.arange(count) - lag, 0, count - 1)]
+        readings = [_Reading("", _motions(T, pairs)) for T in (T_world_camera, earlier)]
+        stated, late = _errors(readings, pairs) if pairs else (np.inf, np.inf)
+        return bool(late <= stated)
+
+    found = find_other_depth(source, trajectory, poses_are_late)
+    if found is None:
+        return None
+    return Contradiction(
+        f"depth images do not fit each other by the stated poses; {found.words} would agree",
+        is_small=abs(found.lag) == 1,
+    )
+
+
+def _find_in_places(source: Source, trajectory: Trajectory, pairs: Sequence[_Pair]) -> Contradiction | None:
     """Return the contradiction of some pairs, as where poses jump or a tracker or a camera stands still; None without.
 
     Beside the given pairs, steps of the poses that are far longer than most, and some without motion, are tried.
     """
-    images = _rectified(source)
+    images, T_world_camera = _rectified(source), trajectory.T_world_camera
     wrong = [pair for pair in pairs if pair.contradicts(_motions(T_world_camera, [pair])[0])]
     for first in _unusual_steps(T_world_camera):
         with suppress(DatasetError, PoseError):  # a frame that cannot be read is reported when it is mapped
@@ -208,7 +244,7 @@ def _find_in_places(
     return Contradiction(
         f"poses do not fit the images from frame {numbers[pair.first]} to {numbers[pair.second]}{more}: they move by "
         f"{stated_m:.2f} m, the images show {shown_m:.2f} m; was tracking lost there? The map may show things twice",
-        in_places=True,
+        is_small=True,
     )
 
 
@@ -226,17 +262,6 @@ def _unusual_steps(T_world_camera: Float64[ndarray, "n 4 4"]) -> list[int]:
     still = np.flatnonzero((T_world_camera[1:] == T_world_camera[:-1]).all(axis=(1, 2)))
     spread = still[np.linspace(0, max(len(still) - 1, 0), min(len(still), _MAX_JUMPS)).round().astype(int)]
     return sorted({*longest[excess[longest] > 1].tolist(), *spread.tolist()})
-
-
-def _focal_length(stated: _Reading, pairs: Sequence[_Pair], error: float) -> str | None:
-    """Return the factor of the focal length, in words, that lowers the error far; None without one."""
-    factors = np.geomspace(1 / _MAX_FOCAL_FACTOR, _MAX_FOCAL_FACTOR, _FOCAL_FACTORS)
-    errors = [float(_errors([stated], [pair.with_focal_length(factor) for pair in pairs])[0]) for factor in factors]
-    if min(errors) > min(_RIGHT, _CONVENTION_GAIN * error):
-        return None
-    factor = float(factors[int(np.argmin(errors))])
-    change = f"multiplied by {factor:.2g}" if factor > 1 else f"divided by {1 / factor:.2g}"
-    return f"the camera's focal length {change} (intrinsics of another size or camera)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +296,8 @@ def _scaled_to_agree(reading: _Reading, pairs: Sequence[_Pair], error: float) ->
     if scale is None or abs(math.log(scale)) < math.log(_LEAST_FACTOR):
         return None
     scaled_error = float(_errors([reading.scaled(scale)], pairs)[0])
-    if scaled_error > min(_RIGHT, _SCALE_GAIN * error):
+    # small errors have other causes, such as the offset of a depth camera
+    if scaled_error > min(_RIGHT, (_SCALE_GAIN if error >= _DOUBTFUL else _CONVENTION_GAIN) * error):
         return None
     factor, change = (1.0 / scale, "multiplied") if scale < 1.0 else (scale, "divided")
     rounded = float(f"{factor:.2g}")

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.moving_pairs import read_frames, warp_into
+from gausslite.calibration.moving_pairs import warp_into
 from gausslite.datasets.corrected import correct_frame
-from gausslite.datasets.source import Source, capped_size
+from gausslite.datasets.source import Source, capped_size, usable_frames
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, Twist, inverse
@@ -57,10 +57,9 @@ def estimate_exposure_time(source: Source, correction: CameraCorrection) -> tupl
     """
     trajectory = source.trajectory()
     positions = _speed_pairs(trajectory)
-    frames = read_frames(
-        source, sorted({i for pair in positions for i in pair}), capped_size(source.camera, _MAX_ANALYSIS_PIXELS)
-    )
-    corrected = {i: correct_frame(frames[i], correction, frames[i].camera, trajectory.twist(i)) for i in frames}
+    involved = sorted({i for pair in positions for i in pair})
+    frames = usable_frames(source, involved, capped_size(source.camera, _MAX_ANALYSIS_PIXELS))
+    corrected = {i: correct_frame(frame, correction, frame.camera, trajectory.twist(i)) for i, frame in frames}
     times = [
         time
         for slow, fast in positions

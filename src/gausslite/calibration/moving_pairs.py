@@ -6,7 +6,6 @@ lens or wrong times leave a photometric residual, and a rotation that the fit ne
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,9 +25,8 @@ from gausslite.calibration.alignment import (
 from gausslite.datasets.corrected import correct_frame
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.registered_source import register_depth
-from gausslite.datasets.source import Source
+from gausslite.datasets.source import Source, usable_frames
 from gausslite.domain.camera import back_project
-from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, transform_points, twist_of
 from gausslite.domain.recording import HANDHELD_PRIOR, CameraCorrection
@@ -112,7 +110,7 @@ class MovingPairs:
         """Read the pairs of a source at this size; frames that cannot be read are absent."""
         trajectory = source.trajectory()
         pairs = fastest_pairs(trajectory)
-        return cls(trajectory, pairs, read_frames(source, sorted({i for pair in pairs for i in pair}), size))
+        return cls(trajectory, pairs, dict(usable_frames(source, sorted({i for pair in pairs for i in pair}), size)))
 
     def halved(self) -> MovingPairs:
         """Return the pairs with frames of half the width and height, for a coarse search in a third of the time.
@@ -173,15 +171,6 @@ def fastest_pairs(trajectory: Trajectory) -> list[tuple[int, int]]:
             if second is not None:
                 pairs.append((i, second))
     return pairs
-
-
-def read_frames(source: Source, positions: Sequence[int], size: tuple[int, int]) -> dict[int, Frame]:
-    """Return the frames that can be read, by position."""
-    frames = {}
-    for position in positions:
-        with contextlib.suppress(DatasetError, PoseError):
-            frames[position] = source.frame(position, size)
-    return frames
 
 
 def _first_rotated(trajectory: Trajectory, i: int) -> int | None:

@@ -7,7 +7,6 @@ score on images of decreasing blur, from the best candidate of a coarse grid aro
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,9 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from gausslite.datasets.source import Source, select_frames
+from gausslite.datasets.source import Source, select_frames, usable_frames
 from gausslite.domain.camera import Camera, FileIntrinsics, lift
-from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.recording import DepthRegistration
 
@@ -152,20 +151,12 @@ def estimate_depth_registration(source: Source, frames: str = ":", count: int = 
     selected = positions[:: max(1, len(positions) // max(1, count))]
     full = source.camera
     shrink = _MAX_SIDE_PX / max(full.width_px, full.height_px)
-    if shrink >= 1:
-        return estimate_from_frames(_readable_frames(source, selected))
-    size = round(full.width_px * shrink), round(full.height_px * shrink)
-    estimate = estimate_from_frames(_readable_frames(source, selected, size))
+    size = None if shrink >= 1 else (round(full.width_px * shrink), round(full.height_px * shrink))
+    estimate = estimate_from_frames([frame for _, frame in usable_frames(source, selected, size)])
+    if size is None:
+        return estimate
     registration = estimate.registration.scaled(full.width_px / size[0], full.height_px / size[1])
     return replace(estimate, registration=registration)
-
-
-def _readable_frames(source: Source, positions: Sequence[int], size: tuple[int, int] | None = None) -> list[Frame]:
-    frames = []
-    for position in positions:
-        with contextlib.suppress(DatasetError, PoseError):
-            frames.append(source.frame(position, size))
-    return frames
 
 
 def find_registration(source: Source) -> tuple[DepthRegistration | None, str]:

@@ -66,7 +66,7 @@ from gausslite.mission.settings import (
     SourceSettings,
     TaskSettings,
 )
-from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
+from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome, TaskMapper
 from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, Sibling, import_extra, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.channel import MAX_PORT
@@ -100,6 +100,12 @@ def tracking_text(report: Mapping[str, Any]) -> str:
     return f"tracking (frames): {counts}; ATE {1e3 * ate['rmse_m']:.1f} mm RMSE over {ate['poses']} poses"
 
 
+_SKIPPED = {
+    NO_DEPTH: "without depth",
+    ONE_COLOUR: "of one colour",
+    REPEATED: "with a repeated image",
+    TRACKING_LOST: "lost by tracking",
+}
 _NOT_RESUMED = -1
 _POINTED = "pointed"
 """Name of the nouns that a person points at, among the extra arrays of a saved run."""
@@ -335,9 +341,7 @@ class _Run:
         """Print the figures and the notes of a complete run."""
         totals, report = result.totals, self._report
         counts = (
-            (totals.reasons[NO_DEPTH], "without depth"),
-            (totals.reasons[ONE_COLOUR], "of one colour"),
-            (totals.lost, "lost by tracking"),
+            *((totals.reasons[reason], words) for reason, words in _SKIPPED.items()),
             (self._corrupt.count, "corrupt"),
         )
         skipped = ", ".join(f"{count} {reason}" for count, reason in counts if count)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -26,9 +26,8 @@ from gausslite.config.values import (
 )
 from gausslite.datasets.folder import up_note
 from gausslite.datasets.open import open_source
-from gausslite.datasets.source import Source
+from gausslite.datasets.source import Source, usable_frames
 from gausslite.domain.errors import DatasetError, PoseError
-from gausslite.domain.frame import Frame
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
@@ -166,13 +165,7 @@ def _target_region(point: TargetPoint, source: Source) -> Region:
     from gausslite.perception.pointing import region_at
 
     step = max(1, len(source) // _SEARCHED_FRAMES)
-    return region_at(point.point_m, _readable_frames(source, range(0, len(source), step)))
-
-
-def _readable_frames(source: Source, positions: Sequence[int]) -> Iterator[Frame]:
-    for position in positions:
-        with suppress(DatasetError, PoseError):
-            yield source.frame(position)
+    return region_at(point.point_m, (frame for _, frame in usable_frames(source, range(0, len(source), step))))
 
 
 def report_region_file(spec: str, source: Source) -> None:
@@ -188,7 +181,8 @@ _LEAST_DEPTH_M = 0.05
 def require_mappable_depth(source: str, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
     """Raise DatasetError for frames that gave no Gaussian: without depth, or with depth too far away."""
     if result.totals.frames == 0:
-        raise DatasetError(f"{source}: expected frames with depth, got none in {result.processed}")
+        reasons = ", ".join(f"in {count} {reason}" for reason, count in result.totals.reasons.items())
+        raise DatasetError(f"{source}: expected frames with depth, got none in {result.processed}: {reasons}")
     if result.stopped_by is None:
         raise DatasetError(
             f"{source}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "

@@ -248,10 +248,7 @@ class CorrectedSource(WrappedSource):
         if frame.motion is not None and not self._trajectory.is_steady(i):
             # a blur along a wrong velocity does more harm than none
             frame = replace(frame, motion=replace(frame.motion, exposure_s=0.0))
-        image = resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size)
-        return replace(
-            frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera, recorded_rgb=image.recorded_rgb
-        )
+        return resize_rgbd(RgbdImage(frame.rgb, frame.depth_m, frame.camera), size).in_frame(frame)
 
     def trajectory(self) -> Trajectory:
         """The wrapped source's trajectory, as recorded."""
@@ -276,7 +273,4 @@ class UndistortedColourSource(WrappedSource):
             return self._source.frame(i, size)
         recorded = self._source.frame(i)
         rgb = undistort_colour(recorded.rgb, recorded.camera, lens)
-        image = resize_rgbd(RgbdImage(rgb, recorded.depth_m, recorded.camera), size)
-        return replace(
-            recorded, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera, recorded_rgb=image.recorded_rgb
-        )
+        return resize_rgbd(RgbdImage(rgb, recorded.depth_m, recorded.camera), size).in_frame(recorded)

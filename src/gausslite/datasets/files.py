@@ -6,20 +6,20 @@ import codecs
 import re
 import zlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_size
 from gausslite.domain.errors import DatasetError
-from gausslite.domain.frame import image_size
+from gausslite.domain.frame import Frame, image_size
 
 _MAX_IMAGE_PX = 1 << 26
 _PNG_MAGIC, _JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
@@ -48,6 +48,15 @@ class RgbdImage:
     depth_m: Float32[ndarray, "h w"]
     camera: Camera
     recorded_rgb: UInt8[ndarray, "hr wr 3"] | None = None
+
+    def frame(self, number: int, time_ns: int, T_world_camera: Float64[ndarray, "4 4"]) -> Frame:
+        """Return the frame of these images. Raises PoseError, InvalidInputError."""
+        images = self.rgb, self.depth_m, self.camera
+        return Frame(number, time_ns, *images, T_world_camera, recorded_rgb=self.recorded_rgb)
+
+    def in_frame(self, frame: Frame) -> Frame:
+        """Return the frame with these images and this camera in place of its own."""
+        return replace(frame, rgb=self.rgb, depth_m=self.depth_m, camera=self.camera, recorded_rgb=self.recorded_rgb)
 
 
 def read_colour(path: Path) -> UInt8[ndarray, "h w 3"]:

@@ -313,15 +313,7 @@ class NumberedFolderSource(FolderSource, ABC):
         number = self._numbers[i]
         T_world_camera = self._read_pose(number)
         image = load_rgbd(self._colours[number], self._depth_path(number), self._camera, self._units, size)
-        return Frame(
-            number,
-            number * 10**9 // _RATE_HZ,
-            image.rgb,
-            image.depth_m,
-            image.camera,
-            T_world_camera,
-            recorded_rgb=image.recorded_rgb,
-        )
+        return image.frame(number, number * 10**9 // _RATE_HZ, T_world_camera)
 
     def indices(self) -> Sequence[int]:
         """Return the numbers in the file names."""

@@ -298,16 +298,7 @@ class Record3dSource(FolderSource):
             raise DatasetError(f"{self._files.path_of(name)}: expected the size in metadata, {expected}, got {got}")
         depth_m = resize_depth(self._read_depth(number), (camera.width_px, camera.height_px))
         image = resize_rgbd(RgbdImage(np.ascontiguousarray(bgr[..., ::-1]), depth_m, camera), size)
-        time_ns = self._metadata.time_ns(number)
-        return Frame(
-            number,
-            time_ns,
-            image.rgb,
-            image.depth_m,
-            image.camera,
-            self._read_pose(number),
-            recorded_rgb=image.recorded_rgb,
-        )
+        return image.frame(number, self._metadata.time_ns(number), self._read_pose(number))
 
     def indices(self) -> Sequence[int]:
         """Return the numbers in the file names."""

@@ -59,16 +59,8 @@ class RegisteredSource(WrappedSource):
         # register at full size: a resized depth image lacks the pixels that determine its edges
         recorded = self._source.frame(i)
         depth_m = register_depth(recorded.depth_m, recorded.camera, self._camera, self._T_colour_depth)
-        image = resize_rgbd(RgbdImage(recorded.rgb, depth_m, self._camera), size)
-        T_world_colour = recorded.T_world_camera @ inverse(self._T_colour_depth)
-        return replace(
-            recorded,
-            rgb=image.rgb,
-            depth_m=image.depth_m,
-            camera=image.camera,
-            T_world_camera=T_world_colour,
-            recorded_rgb=image.recorded_rgb,
-        )
+        moved = replace(recorded, T_world_camera=recorded.T_world_camera @ inverse(self._T_colour_depth))
+        return resize_rgbd(RgbdImage(recorded.rgb, depth_m, self._camera), size).in_frame(moved)
 
     def trajectory(self) -> Trajectory:
         """Return the poses of the colour camera."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
 from gausslite.domain.camera import Camera, Lens
-from gausslite.domain.errors import DatasetError, InvalidInputError
+from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, UpAxis
 from gausslite.domain.relevance import Region
@@ -162,6 +163,17 @@ def _probable_unit(time: float) -> str:
     """Return the unit of a time since 1970 that is too large for seconds; empty for seconds."""
     limits = ((1e11, ""), (1e14, "milliseconds"), (1e17, "microseconds"))
     return next((unit for limit, unit in limits if time < limit), "nanoseconds")
+
+
+def usable_frames(
+    source: Source, positions: Iterable[int], size: tuple[int, int] | None = None
+) -> Iterator[tuple[int, Frame]]:
+    """Yield position and frame of those that can be read and have no defect; mapping reports the others."""
+    for position in positions:
+        with suppress(DatasetError, PoseError):
+            frame = source.frame(position, size)
+            if not frame.defect:
+                yield position, frame
 
 
 _DOWNSCALED_PIXELS = 320 * 240

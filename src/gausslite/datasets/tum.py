@@ -110,16 +110,7 @@ class TumSource(FolderSource):
         require_position(self.name, i, len(self))
         match = self._matches[i]
         image = load_rgbd(match.colour, match.depth, self._camera, self._units, size)
-        time_ns = round(match.time_s * 1e9)
-        return Frame(
-            match.number,
-            time_ns,
-            image.rgb,
-            image.depth_m,
-            image.camera,
-            match.T_world_camera,
-            recorded_rgb=image.recorded_rgb,
-        )
+        return image.frame(match.number, round(match.time_s * 1e9), match.T_world_camera)
 
     def indices(self) -> Sequence[int]:
         """Return the rows of rgb.txt, from 0."""

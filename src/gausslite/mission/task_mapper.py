@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,8 +16,9 @@ from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounReport, ObjectLandmark
+from gausslite.domain.pose import rotation_angle_deg, translation_m
 from gausslite.domain.relevance import CameraView, DetectedImage, PointedObject, PointM, RelevanceMap
-from gausslite.domain.state import State, add_prefix, select_prefix
+from gausslite.domain.state import State, add_prefix, get_array, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.loops import LoopCounts
@@ -34,6 +36,9 @@ from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, 
 from gausslite.render.rasterizer import Rendering
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
+REPEATED: Final = "the colour image is the one before, although the pose moved"
+_LEAST_MOTION_M, _LEAST_MOTION_DEG = 0.02, 1.0
+"""An image that is repeated at a pose within these is of a robot at rest."""
 _NS_PER_S = 1e9
 _MAX_SHOWN = 16
 
@@ -56,6 +61,33 @@ class FrameOutcome:
     changed_roi: VoxelBatch | None = None
     detection_lag_frames: int | None = None
     reevaluation: Reevaluation = field(default_factory=Reevaluation)
+
+
+class LastImage:
+    """Recognises a camera that repeats its last image while the robot moves; noise makes two images differ."""
+
+    def __init__(self) -> None:
+        self._checksum, self._T_world_camera = np.zeros(1, np.int64), np.eye(4)
+
+    def is_repeated_by(self, frame: Frame) -> bool:
+        """Return True if this frame has the image of the last other one at another pose."""
+        checksum = np.array([zlib.crc32(np.ascontiguousarray(frame.rgb))])
+        if (checksum != self._checksum).any():
+            self._checksum, self._T_world_camera = checksum, frame.T_world_camera
+            return False
+        moved_m = translation_m(self._T_world_camera, frame.T_world_camera)
+        turned_deg = rotation_angle_deg(self._T_world_camera, frame.T_world_camera)
+        return moved_m > _LEAST_MOTION_M or turned_deg > _LEAST_MOTION_DEG
+
+    def state(self) -> State:
+        """Return the checksum and the pose of the last image."""
+        return {"checksum": self._checksum, "pose": self._T_world_camera}
+
+    def restore(self, state: State) -> None:
+        """Continue from a state, which runs of earlier versions do not have."""
+        if state:
+            self._checksum = get_array(state, "checksum", (1,), np.int64).copy()
+            self._T_world_camera = get_array(state, "pose", (4, 4), np.float64).copy()
 
 
 class TaskMapper:
@@ -83,6 +115,7 @@ class TaskMapper:
         self._tracker = tracker
         self._detected: DetectedImage | None = None
         self._defects: dict[str, int] = {}
+        self._last_image = LastImage()
         # a person takes seconds to point, while newer frames replace most of the newest keyframes
         self._shown: deque[Frame] = deque(maxlen=_MAX_SHOWN)
 
@@ -201,6 +234,7 @@ class TaskMapper:
             **add_prefix("estimator", self._estimator.state()),
             **add_prefix("sent_voxels", sent_voxels),
             **add_prefix("tracker", {} if self._tracker is None else self._tracker.state()),
+            **add_prefix("last_image", self._last_image.state()),
         }
 
     def restore(self, state: State) -> None:
@@ -215,6 +249,7 @@ class TaskMapper:
             self._sent_voxels.restore(sent_voxels)
         if self._tracker is not None:
             self._tracker.restore(select_prefix(state, "tracker"))
+        self._last_image.restore(select_prefix(state, "last_image"))
 
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Process one frame and return its outcome; waited_s is its time in the queue.
@@ -222,7 +257,8 @@ class TaskMapper:
         A frame with a defect is skipped, and one whose pose is not found by tracking.
         """
         self._scheduler.begin(waited_s)
-        if defect := frame.defect:
+        repeats = self._last_image.is_repeated_by(frame)
+        if defect := frame.defect or (REPEATED if repeats else ""):
             self._defects.setdefault(defect, frame.index)
             return self._skip(frame, defect)
         odometry, tracked = frame, self._track(frame)

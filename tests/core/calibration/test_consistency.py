@@ -175,10 +175,73 @@ def test_real_recordings_agree(shared_dir, name: str) -> None:
 
 def test_another_focal_length_is_named(recording: Recording) -> None:
     camera = recording.frames[0].camera
-    wrong = replace(camera, fx_px=2.0 * camera.fx_px, fy_px=2.0 * camera.fy_px)
-    recording.frames = [replace(frame, camera=wrong) for frame in recording.frames]
+    with_camera(recording, fx_px=2.0 * camera.fx_px, fy_px=2.0 * camera.fy_px)
     with pytest.raises(DatasetError, match=r"focal length divided by (1\.9|2|2\.1) \(intrinsics of another size"):
         calibrate(recording, NOTHING_ESTIMATED)
+
+
+def with_camera(recording: Recording, **changed_px: float) -> None:
+    recording.frames = [replace(frame, camera=replace(frame.camera, **changed_px)) for frame in recording.frames]
+
+
+def test_another_principal_point_or_ratio_of_focal_lengths_is_named(home: Source) -> None:
+    recording = Recording(home, list(range(0, 48, 2)))
+    camera = recording.frames[0].camera
+    with_camera(recording, cx_px=camera.cx_px + 0.15 * camera.width_px)
+    with pytest.raises(DatasetError, match=r"principal point moved by \(-2\d, -?\d\) px \(intrinsics of"):
+        calibrate(recording, NOTHING_ESTIMATED)
+    with_camera(recording, cx_px=camera.cx_px, fy_px=1.3 * camera.fy_px)
+    with pytest.raises(DatasetError, match=r"the camera's focal length fy divided by 1\.3 \(intrinsics of"):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def test_depth_along_the_ray_is_named(recording: Recording) -> None:
+    camera = recording.frames[0].camera
+    x, y = camera.slopes(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    stretch = np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
+    recording.frames = [replace(frame, depth_m=frame.depth_m * stretch) for frame in recording.frames]
+    with pytest.raises(DatasetError, match="depth along the ray of each pixel instead of the optical axis would agree"):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def test_mirrored_depth_images_are_named(recording: Recording) -> None:
+    recording.frames = [replace(frame, depth_m=frame.depth_m[:, ::-1].copy()) for frame in recording.frames]
+    with pytest.raises(DatasetError, match="depth images mirrored left to right would agree"):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def test_frames_of_two_cameras_in_turn_are_refused(home: Source) -> None:
+    recording = Recording(home, list(range(24)))
+    recording.frames = [recording.frames[(i + 12 * (i % 2)) % 24] for i in range(24)]
+    with pytest.raises(DatasetError, match=r"do not fit .*; no other "):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def test_poses_of_another_link_are_named(home: Source) -> None:
+    recording = Recording(home, list(range(24)))
+    mount = transform_of(np.array([0.1, -0.2, 0.15, 0.0, 0.25, 0.1]))
+    recording.poses = np.array([T @ mount for T in recording.poses])
+    with pytest.raises(
+        DatasetError, match=r"another link than the camera, which is turned by 1\d degrees .* would agree"
+    ):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+@pytest.mark.parametrize(("late", "words"), [(4, r"0\.13 s \(4 frames\) later"), (-2, r"0\.07 s \(2 frames\) earlier")])
+def test_depth_images_of_another_time_are_named(home: Source, late: int, words: str) -> None:
+    recording = Recording(home, list(range(24)))
+    depths = [recording.frames[min(max(i - late, 0), 23)].depth_m for i in range(24)]
+    recording.frames = [replace(frame, depth_m=depth) for frame, depth in zip(recording.frames, depths, strict=True)]
+    with pytest.raises(DatasetError, match=f"depth images {words} would agree"):
+        calibrate(recording, NOTHING_ESTIMATED)
+
+
+def test_depth_images_that_are_late_by_one_frame_are_noted(home: Source) -> None:
+    recording = Recording(home, list(range(24)))
+    depths = [recording.frames[max(i - 1, 0)].depth_m for i in range(24)]
+    recording.frames = [replace(frame, depth_m=depth) for frame, depth in zip(recording.frames, depths, strict=True)]
+    [note] = calibrate(recording, NOTHING_ESTIMATED).notes
+    assert "depth images 0.03 s (1 frame) later would agree" in note
 
 
 def jump(poses: Poses) -> Poses:

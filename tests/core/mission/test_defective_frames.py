@@ -11,7 +11,7 @@ from mapping_scenes import wall_frame
 from gausslite.domain.frame import ONE_COLOUR, Frame
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_mapper import REPEATED, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.render.cpu import CpuRasterizer
 
@@ -49,3 +49,16 @@ def test_a_camera_that_drops_out_changes_no_bit_of_the_map_and_is_reported_once(
     assert np.array_equal(with_gap.gaussians().means_m, without.gaussians().means_m)
     assert with_gap.notes == (f"frames are skipped in which {ONE_COLOUR}; the first one is 1",)
     assert without.notes == ()
+
+
+def test_a_camera_that_repeats_its_image_while_the_robot_moves_is_skipped() -> None:
+    first = wall_frame(0, SIZE)
+    task_mapper = TaskMapper(
+        NoTaskEstimator(), GaussianMapper(MapperSettings(max_gaussians=200), CpuRasterizer(threads=1))
+    )
+    moved = first.T_world_camera.copy()
+    moved[0, 3] += 0.1
+    frames = [first, replace(first, index=1), replace(first, index=2, T_world_camera=moved), wall_frame(3, SIZE)]
+    skipped = [task_mapper.process(frame).skipped for frame in frames]
+    assert skipped == [None, None, REPEATED, None]
+    assert task_mapper.notes == (f"frames are skipped in which {REPEATED}; the first one is 2",)

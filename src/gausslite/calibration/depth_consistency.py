@@ -1,0 +1,165 @@
+"""Compare depth images of several poses with each other: is depth measured along the ray, mirrored, of another time?
+
+Depth of one frame is moved into another one's view by the stated poses. Where both measure the same surface, they agree
+within a few per cent. Images of depth alone decide, so that neither features nor a registration to colour matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy import ndarray
+
+from gausslite.datasets.source import Source, downscaled_size
+from gausslite.domain.camera import Camera, lift
+from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.pose import Trajectory
+
+_MAX_PAIRS, _MIN_PAIRS, _MIN_POINTS = 12, 4, 60
+_GRID_PX = 8
+_FULL_ERROR, _SAME_SURFACE, _LEAST_OVERLAP = 0.04, 0.1, 0.3
+"""Relative differences of depth: from the first, points disagree fully; up to the second, they are one surface. The
+last is the share of one frame's points that are so."""
+_LEAST_ERROR, _GAIN, _BETTER_PAIRS = 0.2, 0.8, 0.9
+"""Mean disagreement from which readings are tried, and the share of it, and of the pairs that gain, which a reading
+needs. Wrong readings of right recordings have at least 1.6 times the disagreement, right ones of wrong recordings at
+most 0.67 times, from one frame of lag on."""
+_RANDOM_ERROR = 0.85
+"""Median disagreement of neighbours that no surface explains: two cameras in turn, bytes in another order."""
+_NO_READING = "no other time, side or distance"
+_MAX_LAG, _MAX_LAG_S = 15, 3.0
+
+
+DepthImage = Float32[ndarray, "h w"]
+
+
+def _along_axis(depth_m: DepthImage, camera: Camera) -> DepthImage:
+    x, y = camera.slopes(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    along_axis_m: DepthImage = depth_m / np.sqrt(1.0 + np.square(x)[None, :] + np.square(y)[:, None]).astype(np.float32)
+    return along_axis_m
+
+
+_READINGS: Mapping[str, Callable[[DepthImage, Camera], DepthImage]] = {
+    "depth along the ray of each pixel instead of the optical axis": _along_axis,
+    "depth images mirrored left to right": lambda depth_m, _camera: depth_m[:, ::-1],
+    "depth images turned by 180 degrees": lambda depth_m, _camera: depth_m[::-1, ::-1],
+    "depth images upside down": lambda depth_m, _camera: depth_m[::-1],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DepthReading:
+    """Another reading of depth, in words. lag: each depth image belongs to the colour image so many frames before."""
+
+    words: str
+    lag: int = 0
+
+
+def find_other_depth(
+    source: Source, trajectory: Trajectory, poses_are_late: Callable[[int], bool]
+) -> DepthReading | None:
+    """Return the reading of depth images with which they agree far better than as stated; None without one.
+
+    poses_are_late: whether colour images, too, fit the poses of so many frames before. Frames that cannot be read are
+    ignored.
+    """
+    T, tried = trajectory.T_world_camera, list(_farthest_pairs(source, trajectory))
+    pairs = [pair for pair in tried if pair.disagreement(pair.motion(T))[1] >= _LEAST_OVERLAP]
+    if len(pairs) < _MIN_PAIRS:
+        nearest = np.array([pair.disagreement(pair.motion(T))[0] for pair in tried])
+        judged = nearest[np.isfinite(nearest)]
+        is_random = len(judged) >= _MIN_PAIRS and float(np.median(judged)) > _RANDOM_ERROR
+        return DepthReading(_NO_READING) if is_random else None
+    stated = np.array([pair.disagreement(pair.motion(T))[0] for pair in pairs])
+    if float(stated.mean()) < _LEAST_ERROR:
+        return None
+    step_s = float(np.median(np.diff(trajectory.times_s)))
+    longest = min(_MAX_LAG, len(T) // 3, int(_MAX_LAG_S / max(step_s, 1e-3)))
+    found: dict[DepthReading, float] = {}
+    for words, read in _READINGS.items():
+        read_pairs = [pair.read_by(read) for pair in pairs]
+        found[DepthReading(words)] = _relative_error(stated, [pair.disagreement(pair.motion(T)) for pair in read_pairs])
+    for lag in (*range(1, longest + 1), *range(-1, -longest - 1, -1)):
+        frames = f"{abs(lag)} frame{'s' * (abs(lag) > 1)}"
+        words = f"depth images {abs(lag) * step_s:.2f} s ({frames}) {'later' if lag > 0 else 'earlier'}"
+        errors = [pair.disagreement(pair.motion(T, lag)) for pair in pairs]
+        found[DepthReading(words, lag)] = _relative_error(stated, errors)
+    best = min(found, key=found.__getitem__)
+    return None if found[best] > _GAIN or (best.lag and poses_are_late(best.lag)) else best
+
+
+def _relative_error(stated: Float64[ndarray, " p"], found: Sequence[tuple[float, float]]) -> float:
+    """Return the mean of the errors relative to the stated ones; infinite for few pairs, or if some do not gain."""
+    values = np.array([error for error, _ in found])
+    judged = np.isfinite(values)
+    if np.count_nonzero(judged) < _MIN_PAIRS or np.mean(values[judged] < stated[judged]) < _BETTER_PAIRS:
+        return np.inf
+    return float(values[judged].mean() / stated[judged].mean())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _DepthPair:
+    """The depth images at two positions."""
+
+    first: int
+    second: int
+    camera: Camera
+    first_m: DepthImage
+    second_m: DepthImage
+
+    def motion(self, T_world_camera: Float64[ndarray, "n 4 4"], lag: int = 0) -> Float64[ndarray, "4 4"] | None:
+        """Return T_second_first by the poses of so many frames before; None outside the recording."""
+        first, second = self.first - lag, self.second - lag
+        if min(first, second) < 0 or max(first, second) >= len(T_world_camera):
+            return None
+        motion: Float64[ndarray, "4 4"] = np.linalg.inv(T_world_camera[second]) @ T_world_camera[first]
+        return motion
+
+    def read_by(self, read: Callable[[DepthImage, Camera], DepthImage]) -> _DepthPair:
+        """Return the pair with its images read in another way."""
+        return replace(self, first_m=read(self.first_m, self.camera), second_m=read(self.second_m, self.camera))
+
+    def disagreement(self, T_second_first: Float64[ndarray, "4 4"] | None) -> tuple[float, float]:
+        """Return the mean disagreement of depth from 0 to 1, and the share of the first image's points on one surface.
+
+        The disagreement is NaN with few points and without a motion.
+        """
+        camera = self.camera
+        rows, columns = np.mgrid[
+            _GRID_PX // 2 : camera.height_px : _GRID_PX, _GRID_PX // 2 : camera.width_px : _GRID_PX
+        ].reshape(2, -1)
+        z_m = self.first_m[rows, columns]
+        if T_second_first is None:
+            return np.nan, 0.0
+        points = lift(np.stack([columns, rows], axis=1)[z_m > 0] + 0.5, z_m[z_m > 0], camera)
+        moved = points @ T_second_first[:3, :3].T + T_second_first[:3, 3]
+        moved = moved[moved[:, 2] > 0]
+        u, v = camera.pixels(moved[:, 0] / moved[:, 2], moved[:, 1] / moved[:, 2])
+        inside = (u >= 0) & (v >= 0) & (u < camera.width_px) & (v < camera.height_px)
+        measured_m = self.second_m[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+        predicted_m, measured_m = moved[inside, 2][measured_m > 0], measured_m[measured_m > 0]
+        if len(measured_m) < _MIN_POINTS:
+            return np.nan, 0.0
+        error = np.abs(predicted_m - measured_m) / measured_m
+        return float(np.minimum(error / _FULL_ERROR, 1.0).mean()), float(np.sum(error < _SAME_SURFACE)) / len(z_m)
+
+
+def _farthest_pairs(source: Source, trajectory: Trajectory) -> Iterator[_DepthPair]:
+    """Yield pairs spread over the source, each as far apart as the frames show the same surfaces, else neighbours."""
+    count, size, gap = len(source), downscaled_size(source.camera), 2
+    for first in sorted({round(position) for position in np.linspace(0, count - 1, _MAX_PAIRS)}):
+        direction, gap = 1 if first < count // 2 else -1, max(min(2 * gap + 1, count // 2), 1)
+        with suppress(DatasetError, PoseError):
+            frame = source.frame(first, size)
+            while gap >= 1:
+                second = first + direction * gap
+                other_m = source.frame(second, size).depth_m
+                pair = _DepthPair(first, second, frame.camera, frame.depth_m, other_m)
+                if gap == 1 or pair.disagreement(pair.motion(trajectory.T_world_camera))[1] >= _LEAST_OVERLAP:
+                    yield pair
+                    break
+                gap //= 2
