@@ -71,7 +71,7 @@ class LastImage:
 
     def is_repeated_by(self, frame: Frame) -> bool:
         """Return True if this frame has the image of the last other one at another pose."""
-        checksum = np.array([zlib.crc32(np.ascontiguousarray(frame.rgb))])
+        checksum = np.array([zlib.crc32(frame.rgb.tobytes())])
         if (checksum != self._checksum).any():
             self._checksum, self._T_world_camera = checksum, frame.T_world_camera
             return False
