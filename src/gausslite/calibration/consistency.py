@@ -157,7 +157,7 @@ class Contradiction:
 def find_contradiction(source: Source) -> Contradiction | None:
     """Return how poses or depth contradict the images; None if they do not, or if it cannot be judged.
 
-    Frames that cannot be read are ignored. Takes about a second. Raises DatasetError, PoseError.
+    Frames that cannot be read are ignored. Takes one to two seconds. Raises DatasetError, PoseError.
     """
     pairs, trajectory = _matched_pairs(source), source.trajectory()
     found = _find_everywhere(source, trajectory, pairs) if len(pairs) >= _MIN_PAIRS else None
