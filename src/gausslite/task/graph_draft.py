@@ -23,6 +23,13 @@ class RelationTerms:
     negated: bool = False
     bounds: Bounds = UNBOUNDED
 
+    @property
+    def keeps_away(self) -> bool:
+        """Return True for "at least 2 m from", "not within 2 m of" and "out of reach of"."""
+        low_m, high_m = self.bounds.min_m, self.bounds.max_m
+        is_lower = (low_m is None) if self.negated else (high_m is None)
+        return self.relation == "clear_of" or (self.bounds is not UNBOUNDED and self.relation == "near" and is_lower)
+
 
 class GraphDraft:
     """A mutable task graph of noun phrases; `finalise` removes excluded objects and resolves targets without a name.
@@ -120,7 +127,7 @@ class GraphDraft:
     def _as_predicate(self, terms: RelationTerms, anchor: str) -> tuple[Predicate, bool] | None:
         """Return the predicate, and whether it is negated; None if the preposition states no relation."""
         shown = f"'{terms.relation.replace('_', ' ')}' {anchor!r}"
-        if terms.relation == "far_from":
+        if terms.relation in ("far_from", "clear_of"):
             return Predicate.NEAR, not terms.negated
         encloses = anchor.split()[-1] in lexicon.CONTAINERS or lexicon.is_space(tuple(anchor.split()))
         if terms.relation == "outside" and encloses:

@@ -207,7 +207,10 @@ class RoleAssigner:
         clause = self.clause
         if (clause.crosses and not clause.objects) or (clause.preposition == "has" and self._describes_room(noun)):
             return  # "take the hallway to the left of the stairs"
-        if clause.terms.negated and clause.adds_place and self._has_destination(pending):
+        if self._keeps_away(pending):
+            self._draft.add_target(noun.text, TargetRole.OBSTACLE)  # "place it at least 1 m away from the stove"
+            clause.last_relation = "away"
+        elif clause.terms.negated and clause.adds_place and self._has_destination(pending):
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
         elif pending == "far_from" and clause.verb in verbs.GO_VERBS and not (clause.objects or clause.pending_places):
             self._assign_waypoint(noun)  # "back away from the desk"
@@ -226,6 +229,17 @@ class RoleAssigner:
             if clause.pending_places and clause.verb in verbs.TRAVEL_VERBS:
                 self._make_places_targets()  # "stop behind the car near the tree"
             self._relations.relate(pending, noun)
+
+    def _keeps_away(self, pending: str) -> bool:
+        """Return True if the clause moves to a place far from the noun, unlike "the chair far from the door"."""
+        clause = self.clause
+        moves = verbs.DELIVERY_VERBS | verbs.TRAVEL_VERBS | verbs.PUSHING_VERBS
+        fetches = clause.verb in verbs.FETCHING_VERBS and not clause.places
+        if clause.current_place or clause.statement or fetches or clause.verb not in moves:
+            return False
+        if pending == "far_from" and not clause.places:  # "pull the chair away from the wall": it is there now
+            return clause.verb in verbs.PLACE_VERBS | verbs.STOPPING_VERBS or clause.preposition != "away from"
+        return replace(clause.terms, relation=pending).keeps_away
 
     def _has_destination(self, pending: str) -> bool:
         """Return True if the clause has a destination, and the same preposition as another that it denies."""
@@ -263,6 +277,8 @@ class RoleAssigner:
     def _add_anchor(self, relation: str, noun: NounPhrase) -> None:
         if relation == "to":
             self._add_destination(noun, conjoined=True)
+        elif relation == "away":
+            self._draft.add_target(noun.text, TargetRole.OBSTACLE)
         else:
             self._relations.relate(relation, noun)
 
@@ -333,7 +349,7 @@ class RoleAssigner:
 
     def _is_second_anchor(self, noun: NounPhrase) -> bool:
         """Return True for the stove in "near the sink and the stove", not for a target of its own."""
-        if self.clause.last_relation == "between" or self.clause.between or self.clause.is_alternative:
+        if self.clause.last_relation in ("between", "away") or self.clause.between or self.clause.is_alternative:
             return True
         # "a couch with a throw and two cushions", unlike "the mug with a lid and the plate"
         if self.clause.describes and not noun.is_definite:

@@ -206,10 +206,11 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
 
 
 def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Options:
-    forced = _tag_by_neighbours(before, word, after, later)
+    text, bounds = split_bounds(word)
+    forced = _tag_by_neighbours(before, word, after, later) if bounds is None else Tag.PREPOSITION
     if forced is not None:
         return {forced: 0}
-    closed = _CLOSED.get(split_bounds(word)[0])
+    closed = _CLOSED.get(text)
     if closed is not None:
         return closed
     if after in lexicon.DETERMINERS and verbs.base_of_ing(word) is not None:

@@ -41,7 +41,7 @@ _DISTANCE: Final = re.compile(
 _UNIT_AFTER: Final = re.compile(rf"{_VALUE} ?(?P<unit>{_UNIT})\b")
 _VAGUE: Final = re.compile(
     r"\b(?:a few|several|some|many|various|a number of) (?:met(?:er|re)s?|feet|steps?|paces?|yards?|inch(?:es)?|"
-    r"centimet(?:er|re)s?)(?: away)? from\b|\b(?:at )?(?:some|a|a certain|a short|a safe|a little) "
+    r"centimet(?:er|re)s?)(?: away)? from\b|\b(?:at )?(?:some|a|a certain|a short|a little) "
     r"(?:distance|way)(?: away)? from\b"
 )
 # after a number or a unit, a minus sign is a range: "2 -3 m"
@@ -116,12 +116,10 @@ _PLAIN: Final = {
     # short forms
     r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
     r"(you|we|they)'re": r"\1 are",
-    r"i'm(?= \w+ (?:to|of|with)\b)": "i am",
     r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
     r"gets(?= \w+(?:ed|en|wn)\b)|(?:is|are) to be": "should be",
     r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
     r"let's": "let us",
-    r"(i|you|we) last(?= \w)": r"\1",
     r"^whose": "the",
     r"(?:with|has|have) (?:its|their|the) backs? (?:to|towards?|facing|against)": "near",
     r"belonging to": "of",
@@ -149,13 +147,13 @@ _PLAIN: Final = {
     rf"^(\w+(?: up| me| us)?) ({_NAMED})[.,;]+ {_CORRECTION}(?![\w ]* ones?\b)({_NAMED}){_END}": r"\1 \3, not \2",
     r"(the|an?|my) (\w+)[.;,]? (?:no|sorry),? the (\w+) one\b": r"\1 \3 \2",
     rf"(\w+) ({_NAMED})[.,;]* {_CORRECTION}\1 ({_NAMED}){_END}": r"\1 \3, not \2",
-    rf"(to|on|in|into|under|behind|near|next to) ({_NAMED})[.,;] (?:no|sorry|wait|actually),? \1 ({_NAMED}){_END}": (
-        r"\1 \3, not \1 \2"
-    ),
     rf"(?:do not|don't|never) (\w+ {_NAMED}) ({_PLACED} {_NAMED}),? but ({_PLACED} {_NAMED}){_END}": r"\1 \3, not \2",
+    rf"(?:do not|don't|never) ((?:put|place|set|leave|bring|move|store|keep|park) {_NAMED}) (?:any ?where )?(?:near|"
+    rf"close to|within {_VALUE} ?{_UNIT} of|(?:any )?(?:closer|nearer) than {_VALUE} ?{_UNIT} (?:to|from))": (
+        r"\1 clear of"
+    ),
     r"let (the [\w ]+?) (?:stay|be|remain)(?: where (?:it is|they are))?(?= and\b|$)": r"do not touch \1",
     r"you (?:can|will|may|should)? ?find (?:her|him|it|them)": "it is",
-    r"between (?:you|me|us) and": "between",
     rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",
     rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? "
     r"(?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
@@ -234,7 +232,7 @@ _PLAIN: Final = {
     r"give (.{2,60}?) a (?:wide )?berth": r"avoid \1",
     r"(?:stay|keep|remain) close to": "follow",
     r"keep (?:your|a safe|some|a) distance (?:from|to)|(?:stay|keep) off(?: of)?(?= \w)": "avoid",
-    rf"(?:keep|stay|remain) (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
+    rf"(?:keep|stay|remain)(?:ing)? (?:at least )?{_IDIOMS_DISTANCE} (?:away |clear )?(?:from|of)": "avoid",
     r"not (?:\w+ )?far (?:away )?from": "near",
     r"(\w+) number (?:\d+|one|two|three|four|five)": r"\1",
     rf"(?:\w+ (?:floor|level|story))(?= (?:\w+room|{'|'.join(lexicon.ROOMS)})\b)": "",

@@ -263,6 +263,28 @@ def test_a_double_negation_is_a_request(text):
 
 
 @pytest.mark.parametrize(
+    ("text", "obstacles"),
+    [
+        ("Place the candle at least 1 m away from the curtain", ["curtain"]),
+        ("Put the laptop on the desk, no closer than 30 cm to the radiator", ["radiator"]),
+        ("Move the sofa at least one metre away from the fireplace", ["fireplace"]),
+        ("Set the knife out of reach of the children", ["child"]),
+        ("Keep the dog away from the cake and the pie", ["cake", "pie"]),
+        ("Carry the tray to the table at a safe distance from the piano", ["piano"]),
+        ("Never put the bottle closer than half a metre to the fire", ["fire"]),
+        ("Drive past the shelf, keeping at least 30 cm from the boxes", ["box"]),
+        ("Push the cart away from the door", []),
+        ("Put the lamp on a table far from the window", []),
+        ("Park within a metre of the charger", []),
+    ],
+)
+def test_what_a_thing_is_kept_away_from_is_an_obstacle(text, obstacles):
+    graph = RuleParser().parse(text)
+    roles = dict(zip(graph.targets, graph.roles, strict=True))
+    assert [name for name, role in roles.items() if role is TargetRole.OBSTACLE] == obstacles
+
+
+@pytest.mark.parametrize(
     ("phrase", "predicate", "min_m", "max_m"),
     [
         ("1.5 m from", Predicate.NEAR, 1.5, 1.5),
