@@ -62,7 +62,7 @@ class AgentPanel:
         view = self._client.camera_view()
         self._pointing.show(view, objects)
         if view is not None:
-            self._camera.show(view, objects)
+            self._camera.show(view, contents)
             rendered, _ = self._client.render(view.camera, view.T_world_camera)
             self._quality.add(time.monotonic() - self._started_s, rendered, view.rgb, view.roi)
             keyframes = [KeyframeView(i, 0, view.camera, T, 0) for i, T in enumerate(view.keyframes)]

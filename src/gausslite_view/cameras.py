@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any
 
 import cv2
@@ -16,14 +15,13 @@ from numpy import ndarray
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera, project
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import CameraView, DetectedImage
 from gausslite.domain.state import EvenHistory
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import KEYFRAME_JPEG_QUALITY, decode_colour, encode_colour
 from gausslite.wire.views import StoredKeyframe
-from gausslite_view.contents import AgentPath
+from gausslite_view.contents import AgentPath, ViewContents, object_boxes
 from gausslite_view.map_page import MapPage
 
 _REGION_RGB, _BOX_RGB = (255, 60, 60), (60, 230, 90)
@@ -55,16 +53,12 @@ def with_detections(detected: DetectedImage) -> UInt8[ndarray, "h w 3"]:
 
 
 def with_objects(
-    rgb: UInt8[ndarray, "h w 3"],
-    objects: Sequence[ObjectLandmark],
-    camera: Camera,
-    T_world_camera: Float64[ndarray, "4 4"],
+    rgb: UInt8[ndarray, "h w 3"], contents: ViewContents, camera: Camera, T_world_camera: Float64[ndarray, "4 4"]
 ) -> UInt8[ndarray, "h w 3"]:
     """Return the image with the outline and the name of each object whose whole extent lies in front of the camera."""
     drawn = rgb.copy()
-    for landmark in objects:
-        corners_m = np.array(list(product(*zip(landmark.extent_m.min_m, landmark.extent_m.max_m, strict=True))))
-        p_camera = transform_points(inverse(T_world_camera), corners_m)
+    for landmark, box in zip(contents.objects, object_boxes(contents), strict=True):
+        p_camera = transform_points(inverse(T_world_camera), box.corners_m)
         if p_camera[:, 2].min() < _NEAR_M:
             continue
         pixels_px = project(p_camera.astype(np.float32), camera)
@@ -193,10 +187,10 @@ class CameraPanel:
             pass
         self._images = CameraImages(page, folder)
 
-    def show(self, view: CameraView, objects: Sequence[ObjectLandmark]) -> None:
-        """Show the newest keyframe with its region and these objects, and the boxes of the newest detection."""
+    def show(self, view: CameraView, contents: ViewContents) -> None:
+        """Show the newest keyframe with its region and the map's objects, and the boxes of the newest detection."""
         time_ns = int(view.times_ns[-1]) if len(view.times_ns) else None
-        image = with_objects(with_region(view.rgb, view.roi), objects, view.camera, view.T_world_camera)
+        image = with_objects(with_region(view.rgb, view.roi), contents, view.camera, view.T_world_camera)
         detail = f"frame {view.frame_index}, the task's region in red, objects in green"
         self._images.show(_KEYFRAME, CameraImage(image, "Newest keyframe", detail), time_ns)
         if view.detected is not None:
@@ -236,8 +230,8 @@ class TeamCameras:
         self._folder.visible = most > 0
         self._age.max = max(1, most - 1)
 
-    def draw(self, objects: Sequence[ObjectLandmark], state_ns: int) -> tuple[KeyframeView, ...]:
-        """Draw the images with these objects; return the views for the scene's frusta.
+    def draw(self, contents: ViewContents, state_ns: int) -> tuple[KeyframeView, ...]:
+        """Draw the images with the map's objects; return the views for the scene's frusta.
 
         state_ns: the time of the page's slider. The newest keyframes are kept for it.
         """
@@ -249,7 +243,7 @@ class TeamCameras:
             if keyframe.roi is not None:
                 image, note = with_region(image, keyframe.roi), f"region in red, {note}"
             if keyframe.T_world_camera is not None:
-                image = with_objects(image, objects, keyframe.camera, keyframe.T_world_camera)
+                image = with_objects(image, contents, keyframe.camera, keyframe.T_world_camera)
                 taken_ns = keyframe.capture_time_ns
                 views.append(KeyframeView(number, taken_ns, keyframe.camera, keyframe.T_world_camera, 0))
             self._images.show(agent_id, CameraImage(image, agent_id, f"keyframe {keyframe.index}, {note}"), time_ns)

@@ -15,7 +15,8 @@ from numpy import ndarray
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.arrays import require_array
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox, oriented_box
+from gausslite.domain.pose import upward_axis
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.wire.map_follower import FollowedMap
 
@@ -243,9 +244,8 @@ def start_view(contents: ViewContents) -> StartView:
 
     Without a region, a robot's map is seen from behind its first pose, a map without a trajectory from beside.
     """
-    poses = [keyframe.T_world_camera for keyframe in contents.keyframes] or list(contents.T_world_camera)
-    poses += [view.T_world_camera for path in contents.paths for view in path.keyframes]
-    up = _up(poses)
+    poses = _poses(contents)
+    up = np.array(upward_axis(poses))
     low, centre, high = np.percentile(contents.gaussians.means_m.astype(np.float64), (5, 50, 95), axis=0)
     region = _region(contents)
     if region is not None and np.linalg.norm(region[1] - region[0]) < _MAX_REGION_SHARE * np.linalg.norm(high - low):
@@ -253,8 +253,8 @@ def start_view(contents: ViewContents) -> StartView:
         if view is not None:
             return view
     if not len(contents.times_ns):
-        low = np.min([low, *(landmark.extent_m.min_m for landmark in contents.objects)], axis=0)
-        high = np.max([high, *(landmark.extent_m.max_m for landmark in contents.objects)], axis=0)
+        corners_m = [box.corners_m for box in object_boxes(contents)]
+        low, high = (limit(np.concatenate([[low, high], *corners_m]), axis=0) for limit in (np.min, np.max))
         centre = 0.5 * (low + high)
         first_axis, second_axis = np.eye(3)[np.flatnonzero(up == 0)]
         offset = _BESIDE * (first_axis - second_axis) + _ABOVE * up
@@ -267,14 +267,31 @@ def start_view(contents: ViewContents) -> StartView:
     return StartView(_vector(position), _vector(first[:3, 3] + distance_m * forward), _vector(up))
 
 
+def object_boxes(contents: ViewContents) -> list[OrientedBox]:
+    """Return the box of each object: that of its own Gaussians, or else of its observed cells."""
+    up_axis = upward_axis(_poses(contents))
+    return [
+        oriented_box(landmark, contents.gaussians, contents.targets, up_axis)
+        or OrientedBox.enclosing(landmark.corners_m, up_axis)
+        for landmark in contents.objects
+    ]
+
+
+def _poses(contents: ViewContents) -> Float64[ndarray, "n 4 4"]:
+    poses = [keyframe.T_world_camera for keyframe in contents.keyframes] or list(contents.T_world_camera)
+    poses += [view.T_world_camera for path in contents.paths for view in path.keyframes]
+    return np.array(poses, np.float64).reshape(-1, 4, 4)
+
+
 def _region(contents: ViewContents) -> tuple[Float64[ndarray, "3"], Float64[ndarray, "3"]] | None:
     """Return the ends of the box of the confirmed target with most of the region's Gaussians, or else of these."""
     means_m = contents.gaussians.means_m[contents.gaussians.active].astype(np.float64)
-    boxes = [landmark.extent_m for landmark in contents.objects if landmark.role is ObjectRole.TARGET]
-    if boxes:
-        inside = [np.all((means_m >= box.min_m) & (means_m <= box.max_m), axis=1).sum() for box in boxes]
-        box = boxes[int(np.argmax(inside))]
-        return np.array(box.min_m), np.array(box.max_m)
+    pairs = zip(contents.objects, object_boxes(contents), strict=True)
+    corners_m = [box.corners_m for landmark, box in pairs if landmark.role is ObjectRole.TARGET]
+    limits_m = [(corners.min(axis=0), corners.max(axis=0)) for corners in corners_m]
+    if limits_m:
+        inside = [np.all((means_m >= low) & (means_m <= high), axis=1).sum() for low, high in limits_m]
+        return limits_m[int(np.argmax(inside))]
     if not len(means_m):
         return None
     low, high = np.percentile(means_m, (10, 90), axis=0)
@@ -282,7 +299,7 @@ def _region(contents: ViewContents) -> tuple[Float64[ndarray, "3"], Float64[ndar
 
 
 def _view_of_region(
-    low: Float64[ndarray, "3"], high: Float64[ndarray, "3"], poses: Sequence[Float64[ndarray, "4 4"]], up: np.ndarray
+    low: Float64[ndarray, "3"], high: Float64[ndarray, "3"], poses: Float64[ndarray, "n 4 4"], up: np.ndarray
 ) -> StartView | None:
     """Return a view on the line to the camera that saw the region near and in its middle; None if none saw it."""
     centre = 0.5 * (low + high)
@@ -296,19 +313,6 @@ def _view_of_region(
     distance_m = max(_MIN_DISTANCE_M, _REGION_DISTANCES * float(np.linalg.norm(high - low)))
     share = min(1.0, distance_m / float(distances_m[best]))
     return StartView(_vector(centre + share * (poses[best][:3, 3] - centre)), _vector(centre), _vector(up))
-
-
-def _up(poses: Sequence[Float64[ndarray, "4 4"]]) -> Float64[ndarray, "3"]:
-    """Return the axis of the world that is closest to up in the cameras' images, z without cameras."""
-    snapped = np.zeros(3)
-    if not len(poses):
-        snapped[2] = 1.0
-        return snapped
-    # images have y down, so the mean of the cameras' -y is up
-    up = -np.mean([pose[:3, 1] for pose in poses], axis=0)
-    axis = int(np.argmax(np.abs(up)))
-    snapped[axis] = 1.0 if up[axis] >= 0 else -1.0
-    return snapped
 
 
 def _vector(values: np.ndarray) -> Vector:

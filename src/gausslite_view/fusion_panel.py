@@ -67,13 +67,9 @@ class FusionPanel:
         targets = {agent.agent_id: tuple(agent.targets) for agent in status.agents}
         objects = tuple(team_object.landmark for team_object in self._client.query_objects())
         state_ns = round(time_s * _NS_PER_S)
-        fused = replace(
-            followed_contents(followed, targets),
-            objects=objects,
-            keyframes=self._cameras.draw(objects, state_ns),
-            paths=self._keyframes.paths(),
-            state_ns=state_ns,
-        )
+        paths = self._keyframes.paths()
+        fused = replace(followed_contents(followed, targets), objects=objects, paths=paths, state_ns=state_ns)
+        fused = replace(fused, keyframes=self._cameras.draw(fused, state_ns))
         # the slider goes back in the fused map, whichever map is shown now
         self._page.remember(fused)
         self._page.show(fused if layer == _FUSED else self._download(layer, targets, fused))

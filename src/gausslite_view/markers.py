@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from itertools import combinations, product
+from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
-from gausslite.domain.objects import ObjectLandmark, ObjectRole
-from gausslite_view.contents import AgentPath, StartView, ViewContents, category_colour
+from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox
+from gausslite_view.contents import AgentPath, StartView, ViewContents, category_colour, object_boxes
 from gausslite_view.local_server import LocalServer
 
 _FOV_RAD = np.deg2rad(75.0)
@@ -29,10 +30,13 @@ def label_text(landmark: ObjectLandmark) -> str:
     return f"{landmark.noun} {landmark.confidence:.2f}"
 
 
-def label_positions_m(objects: Sequence[ObjectLandmark], view: StartView) -> Float64[ndarray, "n 3"]:
+def label_positions_m(
+    objects: Sequence[ObjectLandmark], boxes: Sequence[OrientedBox], view: StartView
+) -> Float64[ndarray, "n 3"]:
     """Return where each object's label is: on its box, or higher if another label is there in this view."""
     up = np.array(view.up)
-    positions_m = np.array([_top_m(landmark, up) for landmark in objects]).reshape(-1, 3)
+    tops_m = [np.array(box.centre_m) + up * np.ptp(box.corners_m @ up) / 2 for box in boxes]
+    positions_m = np.array(tops_m).reshape(-1, 3)
     screen, depth_m = _project(positions_m, view)
     placed: list[tuple[float, float, float]] = []
     # from the bottom of the window to its top, so that a label that moves up meets only labels above it
@@ -43,12 +47,6 @@ def label_positions_m(objects: Sequence[ObjectLandmark], view: StartView) -> Flo
         placed.append((float(screen[i, 0]), height, width))
         positions_m[i] += up * _lift_m(positions_m[i], height - float(screen[i, 1]), view)
     return positions_m
-
-
-def _top_m(landmark: ObjectLandmark, up: Float64[ndarray, "3"]) -> Float64[ndarray, "3"]:
-    low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
-    top: Float64[ndarray, "3"] = (low + high) / 2 + up * np.abs(up @ (high - low)) / 2
-    return top
 
 
 def _free_height(
@@ -103,6 +101,8 @@ _MAX_TRAJECTORY_POINTS = 5000
 _TRAJECTORY_RGB, _KEYFRAME_RGB, _ROBOT_RGB = (40, 90, 220), (90, 140, 230), (220, 40, 40)
 _TARGET_RGB, _ANCHOR_RGB = (20, 150, 60), (200, 130, 20)
 _MIN_BOX_M = 0.01
+_EDGES = [pair for pair in combinations(range(8), 2) if (pair[0] ^ pair[1]).bit_count() == 1]
+"""The pairs of a box's corners that differ along one side."""
 _UNKNOWN_CAMERA = Camera(525.0, 525.0, 320.0, 240.0, 640, 480)
 
 
@@ -139,8 +139,7 @@ class SceneMarkers:
             contents = self._contents
             if contents is None:
                 return
-            objects = contents.objects if self._switches["Objects"].value else ()
-            self._replace("objects", self._objects(objects))
+            self._replace("objects", self._objects(contents) if self._switches["Objects"].value else [])
             views = self._spread(contents.keyframes, _MAX_FRUSTA)
             frusta = [self._frustum(f"/keyframes/{v.index}", v.camera, v.T_world_camera, _KEYFRAME_RGB) for v in views]
             self._replace("keyframes", frusta)
@@ -202,21 +201,23 @@ class SceneMarkers:
         clear: Bool[ndarray, " n"] = np.linalg.norm(points_m - eye_m, axis=1) > _CLEAR * reach_m
         return clear
 
-    def _objects(self, objects: Sequence[ObjectLandmark]) -> list[Any]:
+    def _objects(self, contents: ViewContents) -> list[Any]:
         if self._view is None:
             return []
-        labels_m = label_positions_m(objects, self._view)
-        return [handle for i, landmark in enumerate(objects) for handle in self._object(i, landmark, labels_m[i])]
+        objects, boxes = contents.objects, object_boxes(contents)
+        placed = zip(objects, boxes, label_positions_m(objects, boxes, self._view), strict=True)
+        return [handle for i, of_object in enumerate(placed) for handle in self._object(i, *of_object)]
 
-    def _object(self, index: int, landmark: ObjectLandmark, label_m: Float64[ndarray, "3"]) -> list[Any]:
+    def _object(
+        self, index: int, landmark: ObjectLandmark, box: OrientedBox, label_m: Float64[ndarray, "3"]
+    ) -> list[Any]:
         """Draw an object's box and its name, with a line between them if the name had to move up."""
         is_target = landmark.role is ObjectRole.TARGET
         colour, thickness_m = (_TARGET_RGB, 0.004) if is_target else (_ANCHOR_RGB, 0.002)
-        low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
-        high = np.maximum(high, low + _MIN_BOX_M)
+        corners_m = replace(box, size_m=tuple(np.maximum(box.size_m, _MIN_BOX_M).tolist())).corners_m
         scene, name = self._server.scene, f"/objects/{index}"
-        inside_m = np.clip(label_m, low, high)
-        edges_m = np.concatenate([_box_edges_m(low, high), np.stack([inside_m, label_m])[None].astype(np.float32)])
+        inside_m = np.clip(label_m, corners_m.min(axis=0), corners_m.max(axis=0))
+        edges_m = np.concatenate([corners_m[_EDGES], np.stack([inside_m, label_m])[None]]).astype(np.float32)
         # a label is drawn as text, never as HTML
         return [
             scene.add_line_segments(f"{name}/box", edges_m, colour, thickness=thickness_m),
@@ -249,13 +250,6 @@ class SceneMarkers:
             if handle.name not in kept:
                 handle.remove()
         self._drawn[kind] = handles
-
-
-def _box_edges_m(low: Float64[ndarray, "3"], high: Float64[ndarray, "3"]) -> Float32[ndarray, "12 2 3"]:
-    """Return the ends of a box's edges: the pairs of corners that differ along one axis."""
-    corners = list(product((0, 1), repeat=3))
-    pairs = [(a, b) for a, b in combinations(corners, 2) if sum(i != j for i, j in zip(a, b, strict=True)) == 1]
-    return np.where(np.array(pairs, bool), high, low).astype(np.float32)
 
 
 def _wxyz(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, "4"]:

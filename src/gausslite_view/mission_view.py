@@ -120,7 +120,7 @@ class MissionView:
         contents, view, keyframes = self._contents(), mapper.camera_view(), mapper.keyframes()
         self._pointing.show(view, mapper.objects)
         if view is not None:
-            self._camera.show(view, mapper.objects)
+            self._camera.show(view, contents)
             self._add_quality(now_s - self._started_s, keyframes[-1])
         if outcome.timing.seconds > 0:
             self._rate.add(now_s - self._started_s, [1 / outcome.timing.seconds])

@@ -14,13 +14,13 @@ from numpy import ndarray
 from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.codec.run_files import ViewImage, read_view_images
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import ObjectLandmark, OrientedBox
 from gausslite.evaluation.compare import TEAM_MAP
 from gausslite.evaluation.lpips import NAME as LPIPS_NAME
 from gausslite.mission.results import read_evaluation, read_report
 from gausslite.mission.schedule import read_timeline
 from gausslite.process import print_message, size_text
-from gausslite_view.contents import ViewContents, with_agents
+from gausslite_view.contents import ViewContents, object_boxes, with_agents
 from gausslite_view.report_elements import element, styled
 from gausslite_view.run_contents import read_contents
 
@@ -342,7 +342,12 @@ def task_column(run: RunResults) -> Element:
 
 def objects_table(runs: Sequence[RunResults]) -> Element | None:
     """Return the objects of all runs with their positions; None without any. Fused maps repeat those of the agents."""
-    rows = [_object_row(run.name, landmark) for run in runs if run.report for landmark in run.contents.objects]
+    rows = [
+        _object_row(run.name, *found)
+        for run in runs
+        if run.report
+        for found in zip(run.contents.objects, object_boxes(run.contents), strict=True)
+    ]
     return list_table(_OBJECT_HEADER, rows) if rows else None
 
 
@@ -401,11 +406,9 @@ def _relation(relation: Mapping[str, object]) -> Element:
     )
 
 
-def _object_row(run: str, landmark: ObjectLandmark) -> list[str]:
-    box = landmark.extent_m
-    sizes = (high - low for low, high in zip(box.min_m, box.max_m, strict=True))
+def _object_row(run: str, landmark: ObjectLandmark, box: OrientedBox) -> list[str]:
     centre = "  ".join(f"{value:.2f}" for value in landmark.centroid_m)
-    size = " × ".join(f"{value:.2f}" for value in sizes)
+    size = " × ".join(f"{value:.2f}" for value in box.size_m)
     return [run, landmark.object_id, str(landmark.role), centre, size, f"{landmark.confidence:.2f}"]
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
@@ -14,7 +15,8 @@ from numpy import ndarray
 from gausslite.codec.run_files import KeyframeView, ViewImage
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox
+from gausslite.domain.pose import upward_axis
 from gausslite.evaluation.metrics import psnr, ssim
 from gausslite.evaluation.pictures import (
     DIFFERENCE_GAIN,
@@ -25,7 +27,7 @@ from gausslite.evaluation.pictures import (
     to_uint8,
 )
 from gausslite.evaluation.views import MIN_ROI_PIXELS, MapViewer, view_map
-from gausslite_view.contents import ColourMode, ViewContents, colours_of, legend_of
+from gausslite_view.contents import ColourMode, ViewContents, colours_of, legend_of, object_boxes
 from gausslite_view.report_elements import element, picture, picture_url, styled
 from gausslite_view.report_parts import RunResults
 
@@ -91,8 +93,8 @@ def plan_view(contents: ViewContents, gaussians: Gaussians, plan: PlanCamera, ca
         "image", attributes={"href": picture_url(to_uint8(rendering.rgb)), "width": str(width), "height": str(height)}
     )
     parts = [image, *_path(contents, plan)]
-    for landmark in contents.objects:
-        parts += _marked_object(landmark, plan)
+    for landmark, box in zip(contents.objects, object_boxes(contents), strict=True):
+        parts += _marked_object(landmark, box, plan)
     drawing = element(
         "svg",
         *parts,
@@ -104,12 +106,8 @@ def plan_view(contents: ViewContents, gaussians: Gaussians, plan: PlanCamera, ca
 
 def _plan_axes(contents: Sequence[ViewContents]) -> Float64[ndarray, "3 3"]:
     """Return the plan's right, forward and up as rows: up is the world axis nearest to the cameras' mean up."""
-    cameras = [content.T_world_camera for content in contents if len(content.T_world_camera)]
-    mean_up = -np.concatenate(cameras)[:, :3, 1].mean(axis=0) if cameras else np.array((0.0, 0.0, 1.0))
-    axis = int(np.argmax(np.abs(mean_up)))
-    up = np.zeros(3)
-    up[axis] = -1.0 if mean_up[axis] < 0 else 1.0
-    right = np.eye(3)[1 if axis == 0 else 0]
+    up = np.array(upward_axis(np.concatenate([content.T_world_camera for content in contents])))
+    right = np.eye(3)[1 if up[0] else 0]
     return np.stack([right, np.cross(up, right), up])
 
 
@@ -140,17 +138,15 @@ def _path(contents: ViewContents, plan: PlanCamera) -> list[Element]:
     return [element("polyline", attributes=line), element("circle", element("title", "start"), attributes=start)]
 
 
-def _marked_object(landmark: ObjectLandmark, plan: PlanCamera) -> list[Element]:
+def _marked_object(landmark: ObjectLandmark, box: OrientedBox, plan: PlanCamera) -> list[Element]:
     """Return the object's box, seen from above, with its name over it."""
-    low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
-    corners = np.array([np.where(choice, high, low) for choice in np.ndindex(2, 2, 2)])
-    pixels = plan.project(corners)
-    (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
-    box = {"x": f"{left:.1f}", "y": f"{top:.1f}", "width": f"{right - left:.1f}", "height": f"{bottom - top:.1f}"}
-    name = {"class": "label", "x": f"{(left + right) / 2:.1f}", "y": f"{top - _LABEL_GAP_PX:.1f}"}
+    pixels = plan.project(box.corners_m)
+    outline = cv2.convexHull(pixels.astype(np.float32))[:, 0].tolist()
+    name = {"class": "label", "x": f"{pixels[:, 0].mean():.1f}", "y": f"{pixels[:, 1].min() - _LABEL_GAP_PX:.1f}"}
     role = "target" if landmark.role is ObjectRole.TARGET else "anchor"
-    outline = element("rect", element("title", landmark.object_id), attributes={"class": role, **box})
-    return [outline, element("text", landmark.object_id, attributes=name)]
+    corners = {"class": role, "points": " ".join(f"{x:.1f},{y:.1f}" for x, y in outline)}
+    polygon = element("polygon", element("title", landmark.object_id), attributes=corners)
+    return [polygon, element("text", landmark.object_id, attributes=name)]
 
 
 def _scale_bar(camera: Camera) -> list[Element]:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gausslite.domain.camera import Camera
+from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.relevance import DetectedBox, DetectedImage
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite_view.cameras import with_detections, with_objects, with_region
+from gausslite_view.contents import ViewContents
 
 CAMERA = Camera(100.0, 100.0, 60.0, 50.0, 120, 100)
 GREEN = np.array([60, 230, 90])
+
+
+def mapped(*objects: ObjectLandmark) -> ViewContents:
+    return replace(ViewContents.of_one_agent(Gaussians.empty()), objects=objects)
 
 
 def landmark(noun: str, z_m: float) -> ObjectLandmark:
@@ -40,7 +48,7 @@ def test_a_detection_is_outlined_and_a_weak_one_is_grey() -> None:
 
 
 def test_an_object_in_front_is_outlined_where_it_projects() -> None:
-    drawn = with_objects(np.zeros((100, 120, 3), np.uint8), [landmark("mug é", 1.0)], CAMERA, np.eye(4))
+    drawn = with_objects(np.zeros((100, 120, 3), np.uint8), mapped(landmark("mug é", 1.0)), CAMERA, np.eye(4))
     columns = np.nonzero((drawn == GREEN).all(axis=2).sum(axis=0) > 15)[0]
     # the near face, at 0.9 m
     assert abs(columns.min() - (60 - 22)) <= 1
@@ -49,7 +57,7 @@ def test_an_object_in_front_is_outlined_where_it_projects() -> None:
 
 def test_objects_behind_or_beside_the_camera_are_left_out() -> None:
     black = np.zeros((100, 120, 3), np.uint8)
-    assert not with_objects(black, [landmark("mug", -2.0), landmark("mug", 0.1)], CAMERA, np.eye(4)).any()
+    assert not with_objects(black, mapped(landmark("mug", -2.0), landmark("mug", 0.1)), CAMERA, np.eye(4)).any()
     T_world_camera = np.eye(4)
     T_world_camera[0, 3] = 50.0
-    assert not with_objects(black, [landmark("mug", 1.0)], CAMERA, T_world_camera).any()
+    assert not with_objects(black, mapped(landmark("mug", 1.0)), CAMERA, T_world_camera).any()

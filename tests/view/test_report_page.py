@@ -73,7 +73,7 @@ def test_the_default_page_is_in_the_folder_and_needs_no_other_file(tmp_path, cap
     assert all(address.startswith("data:image/jpeg;base64,") for address in page.addresses)
     assert not {"script", "iframe", "object", "embed", "link", "base", "form"} & set(page.tags)
     assert "url(" not in path.read_text(encoding="utf-8")
-    assert {"Pick up the mug on the table", "on", "mug-1", "0.25  0.50  1.00", "0.10 × 0.20 × 0.20"} <= set(page.texts)
+    assert {"Pick up the mug on the table", "on", "mug-1", "0.25  0.50  1.00", "0.20 × 0.10 × 0.20"} <= set(page.texts)
 
 
 def test_runs_are_side_by_side_at_the_same_views(tmp_path):

@@ -22,7 +22,8 @@ from gausslite.datasets.folder import read_pose_rows
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
+from gausslite.domain.objects import ObjectReport, OrientedBox, TeamObject, oriented_box
+from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import merge_objects
 from gausslite.mission.results import TRAJECTORY, as_text, read_report, stated_up
@@ -32,7 +33,6 @@ _NS_PER_S = 1e9
 _EPOCH_TIMES_S = 1e8
 """Larger times are counted from 1970."""
 _MAX_LISTED = 20
-_MIN_GAUSSIANS = 20
 
 
 def configure(parser: CommandParser) -> None:
@@ -57,7 +57,8 @@ class _Place:
     """The objects of a map, with notes; of a folder also its Gaussians and last camera pose, None if it has none."""
 
     objects: Sequence[TeamObject]
-    up_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    up_axis: UpAxis = (0.0, 0.0, 1.0)
+    targets: tuple[str, ...] = ()
     gaussians: Gaussians | None = None
     T_world_camera: Float64[ndarray, "4 4"] | None = None
     notes: tuple[str, ...] = ()
@@ -69,7 +70,10 @@ def run(options: argparse.Namespace) -> int:
     place = _read_folder(folder) if folder.is_dir() else _query(options)
     objects, notes = _select(place, options.question)
     notes = (*notes, *place.notes)
-    boxes = [oriented_box(team_object.landmark, place.gaussians, place.up_axis) for team_object in objects]
+    boxes = [
+        None if place.gaussians is None else oriented_box(found.landmark, place.gaussians, place.targets, place.up_axis)
+        for found in objects
+    ]
     if options.json:
         values = [_as_json(*pair) for pair in zip(objects, boxes, strict=True)]
         print(as_text({"count": len(objects), "objects": values, "notes": list(notes)}))
@@ -135,53 +139,11 @@ def _read_folder(folder: Path) -> _Place:
     poses = read_pose_rows(trajectory)[1] if trajectory.is_file() else np.zeros((0, 4, 4))
     return _Place(
         objects,
-        stated_up(report) or _up_axis(poses),
+        stated_up(report) or upward_axis(poses),
+        nouns,
         read_ply(map_file) if map_file.is_file() else None,
         poses[-1] if len(poses) else None,
     )
-
-
-def _up_axis(T_world_camera: Float64[ndarray, "t 4 4"]) -> tuple[float, float, float]:
-    """Return the axis of the world that is closest to up in the cameras' images; z without cameras."""
-    mean_up = -T_world_camera[:, :3, 1].mean(axis=0) if len(T_world_camera) else np.array((0.0, 0.0, 1.0))
-    axis = int(np.argmax(np.abs(mean_up)))
-    x, y, z = (math.copysign(1.0, mean_up[axis]) if i == axis else 0.0 for i in range(3))
-    return x, y, z
-
-
-@dataclass(frozen=True, slots=True)
-class OrientedBox:
-    """The smallest upright box of an object. yaw_rad: of its longer horizontal side, from the first horizontal axis.
-
-    size_m: along that side, across it, and upwards.
-    """
-
-    yaw_rad: float
-    size_m: tuple[float, float, float]
-
-
-def oriented_box(
-    landmark: ObjectLandmark, gaussians: Gaussians | None, up_axis: tuple[float, float, float]
-) -> OrientedBox | None:
-    """Return the smallest upright box of the map's Gaussians within the object's box; None with fewer than 20."""
-    if gaussians is None:
-        return None
-    import cv2
-
-    means_m, box = gaussians.means_m.astype(np.float64), landmark.extent_m
-    inside = box.contains(means_m)
-    points_m = (
-        means_m[inside & gaussians.active] if (inside & gaussians.active).sum() >= _MIN_GAUSSIANS else means_m[inside]
-    )
-    if len(points_m) < _MIN_GAUSSIANS:
-        return None
-    vertical = int(np.argmax(np.abs(up_axis)))
-    first, second = (axis for axis in range(3) if axis != vertical)
-    _, (width_m, depth_m), angle_deg = cv2.minAreaRect(points_m[:, [first, second]].astype(np.float32))
-    if width_m < depth_m:
-        width_m, depth_m, angle_deg = depth_m, width_m, angle_deg + 90.0
-    yaw_rad = math.radians((angle_deg + 90.0) % 180.0 - 90.0)
-    return OrientedBox(yaw_rad, (float(width_m), float(depth_m), float(np.ptp(points_m[:, vertical]))))
 
 
 def _as_json(team_object: TeamObject, box: OrientedBox | None) -> dict[str, object]:

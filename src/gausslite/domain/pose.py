@@ -111,6 +111,14 @@ def unit_up_axis(up_axis: UpAxis) -> UpAxis:
     return (x, y, z)
 
 
+def upward_axis(T_world_camera: Float64[ndarray, "t 4 4"]) -> UpAxis:
+    """Return the axis of the world that is closest to up in the cameras' images; z without cameras."""
+    mean_up = -T_world_camera[:, :3, 1].mean(axis=0) if len(T_world_camera) else np.array((0.0, 0.0, 1.0))
+    axis = int(np.argmax(np.abs(mean_up)))
+    x, y, z = (float(np.copysign(1.0, mean_up[axis])) if i == axis else 0.0 for i in range(3))
+    return x, y, z
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCorrection:
     """The latest correction of the odometry: T_map_camera = T_map_odometry · T_odometry_camera.
