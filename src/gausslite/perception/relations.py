@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.task import Predicate, Relation, Superlative, TaskGraph, noun_of
+from gausslite.domain.voxels import VoxelGrid
 from gausslite.perception.colours import ColourFilter
 from gausslite.perception.evidence import Evidence
 from gausslite.perception.object_map import Landmark, ObjectMap, Observation
@@ -176,7 +177,8 @@ class RelationFilter:
 class RelationGeometry:
     """Predicates between one target and one anchor, in a world with a known up axis.
 
-    near and on are the paper's. above equals on; under is its mirror image. inside: within the anchor's footprint and
+    near: the paper's, between surfaces instead of centroids, as a chair at the end of a long table is near it. on is the
+    paper's. above equals on; under is its mirror image. inside: within the anchor's footprint and
     height. The four sides are relative to the observing camera: behind is farther away than the anchor's nearest part.
     Without a camera, a side is evaluated as near.
     """
@@ -195,7 +197,7 @@ class RelationGeometry:
             return self._is_inside(observation.centroid_m, anchor)
         if predicate in _SIDES and observation.camera_m is not None:
             return self._is_on_side(predicate, observation.centroid_m, observation.camera_m, anchor)
-        return distance_m(observation.centroid_m, anchor.centroid_m) < self._settings.near_m
+        return self._gap_m(observation, anchor) < self._settings.near_m
 
     def is_at_distance(self, relation: Relation, observation: Observation, anchors: Sequence[Landmark]) -> bool:
         """Return True if the distance to the nearest anchor is within the relation's bounds; True without bounds.
@@ -213,13 +215,20 @@ class RelationGeometry:
         )
         return bool(low_m <= nearest_m <= high_m)
 
+    def _gap_m(self, observation: Observation, anchor: Landmark) -> float:
+        """Return the distance between the nearest cells of an object and an anchor."""
+        cells_m = VoxelGrid(observation.settings.cell_m).centres_m(observation.cells)
+        cells = _sample(cells_m, self._settings.max_sampled_cells)
+        footprint = anchor.footprint_m().astype(np.float64)
+        return min(float(np.linalg.norm(footprint - cell, axis=1).min()) for cell in cells)
+
     def with_reach(self, max_m: float | None) -> RelationGeometry:
         """Return these predicates, with sides that reach as far as a stated distance."""
         side_m = max(self._settings.side_m, (1.0 + self._settings.about_share) * (max_m or 0.0))
         return RelationGeometry(self._up, replace(self._settings, side_m=side_m))
 
     def between(self, observation: Observation, anchors: Sequence[Sequence[Landmark]]) -> bool | None:
-        """Return True within near_m of the line between two anchors of different groups; None with fewer than two."""
+        """Return True within between_m of the line between two anchors of different groups; None with fewer than two."""
         pairs = list(combinations(anchors[0], 2)) if len(anchors) == 1 else []
         for one, other in combinations(anchors, 2):
             pairs += product(one, other)
@@ -283,7 +292,7 @@ class RelationGeometry:
         line = b_m - a_m
         length2 = float(line @ line)
         share = float((point_m - a_m) @ line) / length2 if length2 > 0.0 else 0.0
-        return 0.0 < share < 1.0 and distance_m(point_m, a_m + share * line) < self._settings.near_m
+        return 0.0 < share < 1.0 and distance_m(point_m, a_m + share * line) < self._settings.between_m
 
     def _horizontal(self, offset_m: Float64[ndarray, "3"]) -> Float64[ndarray, "3"]:
         horizontal: Float64[ndarray, "3"] = offset_m - (offset_m @ self._up) * self._up

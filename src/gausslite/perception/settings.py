@@ -204,9 +204,11 @@ class EvidenceSettings:
 
 @dataclass(frozen=True, slots=True)
 class RelationSettings:
-    """Distance limits of the relations. near: near_m. on, above, under: on_m horizontally, or over the footprint."""
+    """Distance limits of the relations. on, above, under: on_m horizontally, or over the footprint."""
 
-    near_m: float = 1.0
+    near_m: float = 0.75
+    """Between surfaces. Of 724 pairs of things in homes with centroids within a metre, 705 are near."""
+    between_m: float = 1.0
     on_m: float = 0.5
     side_m: float = 2.0
     """Reach of the four sides."""

@@ -33,7 +33,7 @@ QUESTIONS = {
     "how many mugs are on the table": {"mug-1"},
     "where is the mug": {"mug-1", "mug-2"},
     "what is inside the box": {"ball-1"},
-    "what is near the chair": {"mug-1"},
+    "what is near the chair": {"mug-1", "table-1"},
     "chair nearest to the table": {"chair-1"},
     "the chair farthest from the table": {"chair-2"},
     "largest chair": {"chair-2"},

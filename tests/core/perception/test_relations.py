@@ -105,6 +105,14 @@ def test_a_side_without_a_camera_means_near():
     assert satisfies(Predicate.RIGHT_OF, unseen, TABLE)
 
 
+@pytest.mark.parametrize(("gap_m", "holds"), [(0.1, True), (0.6, True), (0.9, False)])
+def test_near_is_the_distance_of_surfaces(gap_m: float, holds: bool) -> None:
+    long_table = box("table", (0.0, 0.0, 0.0), (4.0, 0.6, 0.6))
+    stool = box("stool", (2.0 + gap_m + 0.2, 0.0, 0.0), (0.4, 0.4, 0.4))
+    assert satisfies(Predicate.NEAR, stool, long_table) is holds
+    assert satisfies(Predicate.NEAR, long_table, stool) is holds
+
+
 def test_between_needs_both_anchors_at_once():
     sofa, window = small_object("sofa", -2.0, 0.0, 0.0), small_object("window", 2.0, 0.0, 0.0)
     assert satisfies(Predicate.BETWEEN, small_object("plant", 0.5, 0.0, 0.3), sofa, window)
