@@ -177,9 +177,8 @@ class RelationFilter:
 class RelationGeometry:
     """Predicates between one target and one anchor, in a world with a known up axis.
 
-    near: the paper's, between surfaces instead of centroids, as a chair at the end of a long table is near it. on is the
-    paper's. above equals on; under is its mirror image. inside: within the anchor's footprint and
-    height. The four sides are relative to the observing camera: behind is farther away than the anchor's nearest part.
+    near: the paper's, between surfaces instead of centroids: a chair at the end of a long table is near it. on is the
+    paper's. above equals on; under is its mirror image. inside: within the anchor's footprint and height. The four sides are relative to the observing camera: behind is farther away than the anchor's nearest part.
     Without a camera, a side is evaluated as near.
     """
 
@@ -228,7 +227,7 @@ class RelationGeometry:
         return RelationGeometry(self._up, replace(self._settings, side_m=side_m))
 
     def between(self, observation: Observation, anchors: Sequence[Sequence[Landmark]]) -> bool | None:
-        """Return True within between_m of the line between two anchors of different groups; None with fewer than two."""
+        """Return True within between_m of the line between two anchors of different groups; None without two."""
         pairs = list(combinations(anchors[0], 2)) if len(anchors) == 1 else []
         for one, other in combinations(anchors, 2):
             pairs += product(one, other)
