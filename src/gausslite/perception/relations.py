@@ -178,8 +178,9 @@ class RelationGeometry:
     """Predicates between one target and one anchor, in a world with a known up axis.
 
     near: the paper's, between surfaces instead of centroids: a chair at the end of a long table is near it. on is the
-    paper's. above equals on; under is its mirror image. inside: within the anchor's footprint and height. The four sides are relative to the observing camera: behind is farther away than the anchor's nearest part.
-    Without a camera, a side is evaluated as near.
+    paper's. above equals on; under is its mirror image. inside: within the anchor's footprint and height. The four
+    sides are relative to the observing camera: behind is farther away than the anchor's nearest part. Without a camera,
+    a side is evaluated as near.
     """
 
     def __init__(self, up: Float64[ndarray, "3"], settings: RelationSettings) -> None:
