@@ -10,11 +10,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 from threading import Thread
 from types import SimpleNamespace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -426,38 +424,6 @@ def test_links_do_not_let_a_second_server_open_the_store(tmp_path: Path) -> None
     second = SqliteStore(path)
     assert second.agents() == ("ant",)
     second.close()
-
-
-def test_a_server_killed_while_it_creates_its_store_leaves_a_name_that_can_be_opened(tmp_path: Path) -> None:
-    path = tmp_path / "store.sqlite"
-    for step in ("connect", "renew_incarnation", "storage_errors"):
-        stopped = patch(f"gausslite.fusion.sqlite_store.{step}", side_effect=KeyboardInterrupt)
-        with stopped, pytest.raises(KeyboardInterrupt):
-            SqliteStore(path)
-        assert not path.exists()
-    store = SqliteStore(path)
-    # the file says what it is without its log
-    alone = tmp_path / "alone.sqlite"
-    alone.write_bytes(path.read_bytes())
-    SqliteStore(alone).close()
-    store.close()
-
-
-def test_the_log_is_copied_into_the_file_beside_the_commits_and_begins_anew(tmp_path: Path) -> None:
-    path = tmp_path / "store.sqlite"
-    with patch("gausslite.fusion.sqlite_store._CHECKPOINT_PERIOD_S", 0.01), closing(SqliteStore(path)) as store:
-        written = 0
-        # below what a commit itself would copy
-        while written < 200 << 20:
-            store.save_keyframe("ant", 1, bytes(1 << 20))
-            written += 1 << 20
-            if path.with_name("store.sqlite-wal").stat().st_size < written:
-                break
-        else:
-            pytest.fail("the log has never begun anew")
-        store.save_keyframe("ant", 2, b"last")
-    with closing(SqliteStore(path)) as store:
-        assert (store.keyframe("ant", 1), store.keyframe("ant", 2)) == (bytes(1 << 20), b"last")
 
 
 def test_a_full_disk_refuses_the_message_and_keeps_earlier_ones(tmp_path: Path) -> None:

@@ -1,10 +1,12 @@
-"""A damaged store is repaired, refused or restored, and never served silently."""
+"""The file of a store: created at once, its log copied; a damaged one is repaired, restored or refused."""
 
 from __future__ import annotations
 
 import contextlib
 import sqlite3
+from contextlib import closing
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from test_fusion_stores import make_subset
@@ -154,3 +156,35 @@ def test_a_damaged_backup_replaces_nothing(path: Path, tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="1 damaged"):
         restore(backup, path)
     assert verify(path).voxels == len(VOXELS)
+
+
+def test_a_server_killed_while_it_creates_its_store_leaves_a_name_that_can_be_opened(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    for step in ("connect", "renew_incarnation", "storage_errors"):
+        stopped = patch(f"gausslite.fusion.sqlite_store.{step}", side_effect=KeyboardInterrupt)
+        with stopped, pytest.raises(KeyboardInterrupt):
+            SqliteStore(path)
+        assert not path.exists()
+    store = SqliteStore(path)
+    # the file says what it is without its log
+    alone = tmp_path / "alone.sqlite"
+    alone.write_bytes(path.read_bytes())
+    SqliteStore(alone).close()
+    store.close()
+
+
+def test_the_log_is_copied_into_the_file_beside_the_commits_and_begins_anew(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    with patch("gausslite.fusion.sqlite_store._CHECKPOINT_PERIOD_S", 0.01), closing(SqliteStore(path)) as store:
+        written = 0
+        # below what a commit itself would copy
+        while written < 200 << 20:
+            store.save_keyframe("ant", 1, bytes(1 << 20))
+            written += 1 << 20
+            if path.with_name("store.sqlite-wal").stat().st_size < written:
+                break
+        else:
+            pytest.fail("the log has never begun anew")
+        store.save_keyframe("ant", 2, b"last")
+    with closing(SqliteStore(path)) as store:
+        assert (store.keyframe("ant", 1), store.keyframe("ant", 2)) == (bytes(1 << 20), b"last")
