@@ -37,8 +37,6 @@ _DOUBTFUL, _WRONG, _RIGHT = 0.15, 0.6, 0.3
 """Median error of the points' places, as a share of their motion. Right poses of real recordings have 0.02 to 0.13,
 also with unregistered depth; poses of another convention 0.16 to 1.8, and the right reading at most a third of it."""
 _CONVENTION_GAIN, _SCALE_GAIN = 0.4, 0.7
-_MOUNT_GAIN = 0.7
-"""A mount counts only if it leaves this share of the distances that other intrinsics leave: small ones look alike."""
 _LEAST_FACTOR = 1.5
 """Depth counts as wrong beyond this factor; right recordings reach 1.2."""
 _JUMP = 0.03
@@ -195,7 +193,7 @@ def _best_rig(source: Source, trajectory: Trajectory, pairs: Sequence[_Pair], er
     readings = [_Reading(words, axes @ motions @ axes.T) for words, axes in _axes()]
     nearest = readings[int(np.argmin(_errors(readings, pairs))) if error >= _DOUBTFUL else 0]
     mount = fit_mount(_point_motions(pairs, nearest.motions))
-    if mount is not None and (intrinsics is None or mount.distance < _MOUNT_GAIN * intrinsics.distance):
+    if mount is not None and mount.is_better_than(intrinsics):
         return f"{mount.words} with {nearest.words}," if mount.words and nearest.words else mount.words or None
     return None if intrinsics is None else intrinsics.words or None
 

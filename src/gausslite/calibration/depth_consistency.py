@@ -29,7 +29,7 @@ _LEAST_ERROR, _GAIN, _BETTER_PAIRS = 0.2, 0.8, 0.9
 needs. Wrong readings of right recordings have at least 1.6 times the disagreement, right ones of wrong recordings at
 most 0.67 times, from one frame of lag on."""
 _RANDOM_ERROR = 0.85
-"""Median disagreement of neighbours that no surface explains: two cameras in turn, bytes in another order."""
+"""Median disagreement of neighbours that no surface explains, as with bytes in another order."""
 _NO_READING = "no other time, side or distance"
 _MAX_LAG, _MAX_LAG_S = 15, 3.0
 
