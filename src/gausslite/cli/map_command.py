@@ -100,10 +100,10 @@ def tracking_text(report: Mapping[str, Any]) -> str:
     return f"tracking (frames): {counts}; ATE {1e3 * ate['rmse_m']:.1f} mm RMSE over {ate['poses']} poses"
 
 
-_SKIPPED = {
+_SKIPS = {
     NO_DEPTH: "without depth",
     ONE_COLOUR: "of one colour",
-    REPEATED: "with a repeated image",
+    REPEATED: "repeated",
     TRACKING_LOST: "lost by tracking",
 }
 _NOT_RESUMED = -1
@@ -340,11 +340,8 @@ class _Run:
     def print_results(self, result: MissionResult) -> None:
         """Print the figures and the notes of a complete run."""
         totals, report = result.totals, self._report
-        counts = (
-            *((totals.reasons[reason], words) for reason, words in _SKIPPED.items()),
-            (self._corrupt.count, "corrupt"),
-        )
-        skipped = ", ".join(f"{count} {reason}" for count, reason in counts if count)
+        counts = {words: totals.reasons[reason] for reason, words in _SKIPS.items()} | {"corrupt": self._corrupt.count}
+        skipped = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
         active = report["active_gaussians"]
         in_region = f" ({active:,} in the task's region)" if active or self._inputs.schedule.graphs() else ""
         print(
