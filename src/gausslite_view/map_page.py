@@ -220,7 +220,7 @@ def text_html(lines: Sequence[str]) -> str:
 
 
 def _paragraph(text: str) -> str:
-    return f'<div style="padding:0 0.75em;font-size:0.85em;overflow-wrap:anywhere">{html.escape(text)}</div>'
+    return f'<div style="padding:0 0.75em 0.4em;font-size:0.85em;overflow-wrap:anywhere">{html.escape(text)}</div>'
 
 
 def _count_text(shown: int, total: int) -> str:

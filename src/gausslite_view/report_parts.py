@@ -193,22 +193,6 @@ def as_decibels(value: float) -> str:
     return f"{value:.2f} dB"
 
 
-def _similarity(value: float) -> str:
-    return f"{value:.3f}"
-
-
-def _hertz(value: float) -> str:
-    return f"{value:.2f} Hz"
-
-
-def _metres(value: float) -> str:
-    return f"{value:.3f} m"
-
-
-def _mebibytes(value: float) -> str:
-    return f"{value:.0f} MiB"
-
-
 def _of_report(key: str) -> Callable[[RunResults], float | None]:
     return lambda run: number(run.report.get(key))
 
@@ -229,12 +213,12 @@ def _path_error_m(run: RunResults) -> float | None:
 
 SCORES = (
     Figure("region PSNR", _of_scores("roi_psnr"), as_decibels),
-    Figure("region SSIM", _of_scores("roi_ssim"), _similarity),
+    Figure("region SSIM", _of_scores("roi_ssim"), "{:.3f}".format),
     Figure("image PSNR", _of_scores("full_psnr"), as_decibels),
-    Figure("image SSIM", _of_scores("full_ssim"), _similarity),
-    Figure(f"region {LPIPS_NAME}", _of_scores("roi_lpips"), _similarity),
-    Figure("region depth error", _of_scores("roi_depth_l1_m"), _metres),
-    Figure("image depth error", _of_scores("full_depth_l1_m"), _metres),
+    Figure("image SSIM", _of_scores("full_ssim"), "{:.3f}".format),
+    Figure(f"region {LPIPS_NAME}", _of_scores("roi_lpips"), "{:.3f}".format),
+    Figure("region depth error", _of_scores("roi_depth_l1_m"), "{:.3f} m".format),
+    Figure("image depth error", _of_scores("full_depth_l1_m"), "{:.3f} m".format),
     Figure("region covered", _of_scores("roi_covered"), as_percent),
     Figure("scored views", _of_scores("n_views"), as_count),
     Figure("of them with the region", _of_scores("n_roi_views"), as_count),
@@ -253,14 +237,14 @@ TIMES = (
     Figure("frames skipped", _of_report("frames_skipped"), as_count),
     Figure("frames dropped", _of_report("frames_dropped"), as_count),
     Figure("frames corrupt", _of_report("frames_corrupt"), as_count),
-    Figure("frame rate", _of_report("hz"), _hertz),
+    Figure("frame rate", _of_report("hz"), "{:.2f} Hz".format),
     Figure("total time", _of_report("seconds"), as_seconds),
     Figure("frame age, median", _of_report("frame_age_p50_s"), as_seconds),
     Figure("frame age, 99th percentile", _of_report("frame_age_p99_s"), as_seconds),
     Figure("training iterations", _of_report("iterations"), as_count),
     Figure("region's share of the pixels, mean", _of_report("roi_share"), as_percent),
-    Figure("peak memory", _of_report("peak_rss_mib"), _mebibytes),
-    Figure("trajectory error (RMSE)", _path_error_m, _metres),
+    Figure("peak memory", _of_report("peak_rss_mib"), "{:.0f} MiB".format),
+    Figure("trajectory error (RMSE)", _path_error_m, "{:.3f} m".format),
 )
 SETTINGS = {
     "source": "source",

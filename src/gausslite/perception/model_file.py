@@ -56,7 +56,9 @@ def open_model(path: Path, threads: int | None = None) -> OpenModel:
     if threads is not None:
         options.intra_op_num_threads = threads
     try:
-        session = runtime.InferenceSession(str(path), options, providers=list(_providers()))
+        session = runtime.InferenceSession(
+            str(path), options, providers=list(choose_providers(runtime.get_available_providers()))
+        )
     except Exception as error:
         # the runtime's exception types have no common base
         raise ModelFileError(f"model {path}: expected a readable ONNX model, but {_first_line(error)}") from error
@@ -136,10 +138,6 @@ def _runtime() -> Any:
 
 
 @functools.cache
-def _providers() -> tuple[str, ...]:
-    return choose_providers(_runtime().get_available_providers())
-
-
 def _foreign_format(start: bytes) -> str:
     if start[4:8] == b"ORTM":
         return "a model in ORT format: use its original .onnx file"

@@ -57,7 +57,10 @@ def answer(
         left_out = _left_out(graph, target, mapped)
         seen = [landmark for landmark in mapped.seen(target) if landmark.number not in left_out]
         camera_m = None if T_world_camera is None else T_world_camera[:3, 3]
-        fitting = [landmark for landmark in seen if relations.satisfies(target, _observed(landmark, camera_m))]
+        observed = [replace(landmark.seen_from(np.zeros(3)), camera_m=camera_m) for landmark in seen]
+        fitting = [
+            thing for thing, seen_now in zip(seen, observed, strict=True) if relations.satisfies(target, seen_now)
+        ]
         superlative = superlatives.get(target)
         if fitting and superlative is not None:
             if superlative in _OF_A_VIEWPOINT and T_world_camera is None:
@@ -121,7 +124,3 @@ def _landmark(number: int, found: ObjectLandmark) -> Landmark:
     landmark = Landmark.from_observation(Observation.from_points(found.noun, points_m, score=found.confidence))
     landmark.number, landmark.centroid_m = number, np.array(found.centroid_m)
     return landmark
-
-
-def _observed(landmark: Landmark, camera_m: Float64[ndarray, "3"] | None) -> Observation:
-    return replace(landmark.seen_from(np.zeros(3)), camera_m=camera_m)

@@ -153,7 +153,6 @@ _PLAIN: Final = {
         r"\1 clear of"
     ),
     r"let (the [\w ]+?) (?:stay|be|remain)(?: where (?:it is|they are))?(?= and\b|$)": r"do not touch \1",
-    r"you (?:can|will|may|should)? ?find (?:her|him|it|them)": "it is",
     rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",
     rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? "
     r"(?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
@@ -178,7 +177,6 @@ _PLAIN: Final = {
     r"(?:until|till|so that|so) (the|an?) ([\w ]{2,30}?) is(?= (?:on|to|at) your| behind you| in front of you)": (
         r"and pass \1 \2"
     ),
-    r"(?:behind|in front of|ahead of|beside|next to) you(?! \w+ing)": "",
     r"with your (?:back|left|right)(?: side)? (?:to|towards?|against) (.{2,40}?),": r"pass \1;",
     r"so(?: that)? you(?: are)? fac(?:e|ing)": "; face",
     r"(?:is |are )?made (?:out )?of (?:(?:solid|dark|light) )?\w+": "",
@@ -194,7 +192,6 @@ _PLAIN: Final = {
     rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED}|{_VALUE} {_UNIT})\b)": (
         "and stop"
     ),
-    rf"with ((?!no)(?:\w+ ){{1,4}}?)(?:{_PLACED}|inside|around|over) (?:it|them)": r"holding \1",
     r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
     rf"where (the [\w ]+?) (?:is|are)(?: \w+(?:ed|ing)| kept)?{_END}": r"\1 with \2",
     r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)|(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
@@ -236,7 +233,6 @@ _PLAIN: Final = {
     r"not (?:\w+ )?far (?:away )?from": "near",
     r"(\w+) number (?:\d+|one|two|three|four|five)": r"\1",
     rf"(?:\w+ (?:floor|level|story))(?= (?:\w+room|{'|'.join(lexicon.ROOMS)})\b)": "",
-    r"(?:level|floor|storey) (?:one|two|three|four|\d)": "storey",
     r"(?:is|are|am|have run|has run|ran)(?: almost)? out of (?!the\b|my\b)\w+": "is empty",
     r"until you (?:see|find|spot|notice|come to|get to|hit)": "until you reach",
     r"(?:ground|first|second|third|top|upper|lower|next|\w+th|\d+(?:st|nd|rd)) (?:floor|level)\b"
