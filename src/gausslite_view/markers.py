@@ -173,7 +173,10 @@ class SceneMarkers:
         if views and self._switches["Trajectory"].value:
             points_m = np.array([view.T_world_camera[:3, 3] for view in views], np.float32)
             handles += self._line(f"{name}/line", points_m, colour)
-            handles.append(self._frustum(f"{name}/newest", views[-1].camera, views[-1].T_world_camera, colour, 0.16))
+            if self._is_clear(points_m[-1:]).all():
+                handles.append(
+                    self._frustum(f"{name}/newest", views[-1].camera, views[-1].T_world_camera, colour, 0.16)
+                )
             handles.append(self._server.scene.add_label(f"{name}/label", path.agent, position=points_m[-1]))
         return handles
 
