@@ -24,6 +24,8 @@ class Vocabulary:
     above: tuple[tuple[int, ...], ...]
     kinds: tuple[int, ...]
     """Number of sets below each set."""
+    doubtful: frozenset[str]
+    """The nouns whose main meaning is not here: a poster is no post horse."""
 
     def main(self, noun: str) -> int | None:
         """Return the set of the noun's main meaning; None for an unknown noun."""
@@ -62,7 +64,7 @@ def vocabulary() -> Vocabulary:
         for parent in above[at]:
             kinds[parent] += 1 + kinds[at]
     senses = {noun: (*main.get(noun, ()), *other.get(noun, ())) for noun in {**main, **other}}
-    return Vocabulary(senses, tuple(above), tuple(kinds))
+    return Vocabulary(senses, tuple(above), tuple(kinds), frozenset(other.keys() - main.keys()))
 
 
 def is_thing(noun: str) -> bool:
@@ -110,7 +112,9 @@ def kinds_of(noun: str, class_names: Iterable[str]) -> tuple[str, ...]:
     return tuple(
         name
         for name in class_names
-        if name == noun or known.steps(known.main(name), ours) or _is_compound_of(name, noun)
+        if name == noun
+        or (name not in known.doubtful and known.steps(known.main(name), ours))
+        or _is_compound_of(name, noun)
     )
 
 
