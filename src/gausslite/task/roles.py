@@ -23,7 +23,6 @@ _DESTINATION_RELATIONS: Final = word_set(
 _PAIRING_VERBS: Final = word_set("compare swap exchange")
 _PUSHED_TO: Final = word_set("near under behind in_front_of between left_of right_of")
 _ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
-# with a room: where the robot goes through
 _CROSSING_VERBS: Final = verbs.LEAVING_VERBS | (verbs.GO_VERBS - verbs.REACHING_VERBS - verbs.COVERING_VERBS)
 _PASSING_VERBS: Final = verbs.GO_VERBS - verbs.STOPPING_VERBS - word_set("park dock land")
 _GOING_ON: Final = verbs.TRAVEL_VERBS | {"keep", "turn", "pass"}
@@ -232,8 +231,7 @@ class RoleAssigner:
 
     def _keeps_away(self, pending: str) -> bool:
         """Return True if the clause moves to a place far from the noun, unlike "the chair far from the door"."""
-        clause = self.clause
-        moves = verbs.DELIVERY_VERBS | verbs.TRAVEL_VERBS | verbs.PUSHING_VERBS
+        clause, moves = self.clause, verbs.DELIVERY_VERBS | verbs.TRAVEL_VERBS | verbs.PUSHING_VERBS
         fetches = clause.verb in verbs.FETCHING_VERBS and not clause.places
         if clause.current_place or clause.statement or fetches or clause.verb not in moves:
             return False
@@ -286,10 +284,6 @@ class RoleAssigner:
         self._add_place(noun, TargetRole.DESTINATION, conjoined)
         self.clause.last_relation = "to"
 
-    def _add_tool(self, noun: NounPhrase, conjoined: bool = False) -> None:
-        self._add_place(noun, TargetRole.TOOL, conjoined)
-        self.clause.last_relation = "with"
-
     def _add_place(self, noun: NounPhrase, role: TargetRole, conjoined: bool) -> None:
         self._draft.add_target(noun.text, role)
         self.clause.places = [*self.clause.places, noun.text] if conjoined else [noun.text]
@@ -303,7 +297,8 @@ class RoleAssigner:
         """Assign the noun after "with": the hat of "find a man with a hat" is near him, a sponge is a tool."""
         clause = self.clause
         is_part = noun.head in lexicon.PARTS or noun.head in lexicon.CLOTHING
-        if clause.last_relation == "to" and clause.places and (is_part or not self._may_be_tool(noun)):
+        may_be_tool = clause.verb in verbs.TOOL_VERBS or noun.head in lexicon.HELD_TOOLS
+        if clause.last_relation == "to" and clause.places and (is_part or not may_be_tool):
             self._relations.relate_places(RelationTerms("near"), noun)
         elif (
             is_part
@@ -312,7 +307,8 @@ class RoleAssigner:
         ):
             self._relations.relate("near", noun)
         else:
-            self._add_tool(noun)
+            self._add_place(noun, TargetRole.TOOL, conjoined=False)
+            clause.last_relation = "with"
 
     def _describes_with(self, noun: NounPhrase) -> bool:
         verb = self.clause.verb
@@ -320,9 +316,6 @@ class RoleAssigner:
             return True
         handles = verb in verbs.FETCHING_VERBS | verbs.GIVING_VERBS | verbs.DELIVERY_VERBS
         return handles and noun.head not in lexicon.HELD_TOOLS
-
-    def _may_be_tool(self, noun: NounPhrase) -> bool:
-        return self.clause.verb in verbs.TOOL_VERBS or noun.head in lexicon.HELD_TOOLS
 
     def _assign_loaded(self, noun: NounPhrase) -> None:
         """Make the noun the object and the objects so far destinations: "load the van with boxes"."""
