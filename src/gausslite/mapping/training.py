@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol, TypeAlias, runtime_checkable
 
@@ -27,7 +27,7 @@ from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings, SaturationSettings
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mapping.view_rotation import ViewRotation, view_id
-from gausslite.render.rasterizer import Rasterizer, Subset, UpdateCounter
+from gausslite.render.rasterizer import AdamSettings, Rasterizer, Subset, UpdateCounter
 
 _HORIZON_VISITS = 32
 """Visits behind the running mean; before that many, the region counts as improving."""
@@ -228,6 +228,7 @@ class Trainer:
     ) -> None:
         self._settings = settings
         self._adam, self._loss = settings.adam, settings.optimization.loss
+        self._half_size_adam = _with_half_rates(settings.adam)
         self._table = table
         self._rasterizer = rasterizer
         self._rng = rng
@@ -363,12 +364,17 @@ class Trainer:
         self._since_densify += 1
 
     def _train_full_images(self, binding: _Binding, turns: Iterator[WindowView]) -> None:
-        """Train a view in full size, or four in half size: as many pixels."""
+        """Train a view in full size, or four in half size: as many pixels.
+
+        The four steps have half the rates: with full ones, scales of the background grow to metres in places.
+        """
         for _ in range(_HALF_SIZE_VIEWS):
             view = next(turns)
-            image = view.half_view or view.training_view
-            self._rasterizer.step(*binding.tables, image, view.T_camera_world, self._loss, self._adam)
-            if view.half_view is None:
+            image, adam = view.half_view, self._half_size_adam
+            if image is None:
+                image, adam = view.training_view, self._adam
+            self._rasterizer.step(*binding.tables, image, view.T_camera_world, self._loss, adam)
+            if image is view.training_view:
                 break
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
@@ -407,6 +413,11 @@ class Trainer:
             with scheduler.timing(Stage.DENSIFICATION):
                 densify(self._table, density, extent_m)
             self._since_densify = 0
+
+
+def _with_half_rates(adam: AdamSettings) -> AdamSettings:
+    rates = ("means", "log_scales", "quats", "opacity_logits", "rgb")
+    return replace(adam, **{name: 0.5 * getattr(adam, name) for name in rates})
 
 
 def _uniform_draws(rng: np.random.Generator) -> Iterator[float]:
