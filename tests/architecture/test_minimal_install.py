@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
 _SHARING = ("peers", "region_", "shared_")
 NEED_AN_EXTRA = {
-    "torch": ("gausslite.render.reference", "gausslite.render.cuda"),
+    "torch": ("gausslite.render.reference", "gausslite.render.cuda", "gausslite_bench.raster.gsplat_baseline"),
     "psycopg": ("gausslite.fusion.postgres_", *(f"gausslite_fusion_server.{name}" for name in _SHARING)),
     "rclpy": ("gausslite_ros.node",),
     "rospy": ("gausslite_ros.node_ros1",),

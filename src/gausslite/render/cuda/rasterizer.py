@@ -179,7 +179,8 @@ class CudaRasterizer:
     ) -> CudaView:
         """Copy an image to the device. Raises ShapeError, InvalidInputError if a weight is outside [0, 1]."""
         require_view(rgb, depth_m, camera, pixel_weights)
-        return CudaView.of(rgb, depth_m, camera, pixel_weights, self._kernels.device, motion, dilation_px2)
+        device = self._kernels.device
+        return CudaView.of(rgb, depth_m, camera, pixel_weights, device, motion=motion, dilation_px2=dilation_px2)
 
     def step(
         self,
