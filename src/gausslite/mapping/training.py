@@ -267,8 +267,8 @@ class Trainer:
         """Train on these views while the scheduler allows, and return the number of iterations.
 
         Warm-up and active iterations alternate in the ratio of the settings, warm-up first. Warm-up iterations replace
-        the active ones that a saturated region releases. If the frame has no time for another warm-up iteration, active
-        iterations replace it.
+        the active ones that a saturated region releases. An active iteration replaces a warm-up iteration for which the
+        frame has no time, if it has time for the active one.
         """
         turns = self._turns(views)
         done, frame_is_done = 0, False
@@ -323,8 +323,9 @@ class Trainer:
         per_frame = optimization.iterations
         warm_up = not roi_in_view or done % per_frame < optimization.warmup_iterations
         warm_up = warm_up or self._saturation.releases_next()
-        if roi_in_view and done > 0:
-            warm_up = warm_up and scheduler.has_time_for(Stage.WARM_UP)
+        if warm_up and roi_in_view and done > 0:
+            # if there is time for neither, the one that is due runs: active iterations may cost as much
+            warm_up = scheduler.has_time_for(Stage.WARM_UP) or not scheduler.has_time_for(Stage.ACTIVE)
         if warm_up and scheduler.trains_on(Stage.WARM_UP, per_frame):
             return Stage.WARM_UP
         return Stage.ACTIVE if roi_in_view and scheduler.trains_on(Stage.ACTIVE, per_frame) else None

@@ -86,6 +86,15 @@ def test_the_time_of_a_frame_includes_publishing() -> None:
     assert ticking_mapper(1e-6).process(wall_frame(0, SIZE)).iterations == 1
 
 
+def test_a_frame_of_short_time_keeps_its_warm_up_if_active_iterations_cost_as_much() -> None:
+    task_mapper = ticking_mapper(25.0)
+    for index in range(4):
+        timing = task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
+        assert timing.under_trained
+        # an iteration takes one second
+        assert (timing.stages_s[Stage.WARM_UP], timing.stages_s[Stage.ACTIVE] >= 2.0) == (2.0, True)
+
+
 def test_the_same_clock_gives_the_same_map() -> None:
     maps = []
     for _ in range(2):
