@@ -69,7 +69,7 @@ def test_components_are_enabled_one_by_one() -> None:
     label_textures = [variant.label for variant in variants]
     views = ["+long-term-keyframes", "+roi-context", "+depth-edge-mask"]
     others = ["+depth-fill", "+background-reserve", "+ema", "+lr-decay", "+saturation"]
-    training = ["+motion-mask", "+view-rotation", "+active-views"]
+    training = ["+motion-mask", "+view-rotation", "+active-views", "+half-size"]
     assert label_textures == ["none", "+SB", "+MVO", "+ROI", "+SIS", "+GFD", *views, *others, *training]
     off = [variant.disabled for variant in variants]
     assert all(len(a - b) == 1 and b < a for a, b in pairwise(off))

@@ -20,6 +20,7 @@ from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, MapSnapshot, write_keyframe_views, write_map_history
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.objects import OrientedBox
 from gausslite_view.contents import ColourMode, ViewContents, colours_of
 from gausslite_view.run_contents import read_contents, read_past
 
@@ -210,11 +211,12 @@ def test_only_the_own_page_on_a_loopback_name_is_served(host, origin, expected):
 
 
 def test_a_box_has_twelve_edges_along_its_axes():
-    from gausslite_view.markers import _box_edges_m
+    from gausslite_view.markers import _EDGES
 
-    low, high = np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 5.0])
-    edges_m = _box_edges_m(low, high)
-    lengths_m = np.abs(edges_m[:, 1] - edges_m[:, 0])
+    points_m = np.array([[0.0, 1.0, 2.0], [1.0, 3.0, 5.0], [0.0, 3.0, 2.0], [1.0, 1.0, 2.0]])
+    box = OrientedBox.enclosing(points_m, up_axis=(0.0, 0.0, 1.0))
+    edges_m = box.corners_m[_EDGES]
+    lengths_m = np.abs(edges_m[:, 1] - edges_m[:, 0]).round(6)
     assert (np.count_nonzero(lengths_m, axis=1) == 1).all()
     assert sorted(lengths_m.max(axis=1).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
 
