@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import write_json
 from gausslite.mission.settings import MAX_RATE_HZ, MIN_RATE_HZ
 from gausslite_bench.quality.scenes import Scene, UnseenRegionError

@@ -75,7 +75,7 @@ def test_black_images_give_no_estimate(tmp_path: Path) -> None:
         cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))
     estimate = estimate_camera(open_source(str(folder)), CameraCorrection())
     assert estimate.correction.is_identity
-    assert estimate.evidence == ("the images have no contrast, nothing can be compared",)
+    assert estimate.evidence == ("0 pairs of frames can be compared, expected at least 4",)
 
 
 def test_no_lens_is_estimated_from_tiny_images() -> None:
