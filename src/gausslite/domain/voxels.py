@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt32, UInt64
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt32, UInt64
 from numpy import ndarray
 from numpy.typing import NDArray
 

@@ -17,7 +17,7 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
