@@ -48,8 +48,8 @@ GAUSSLITE_INLINE void list_lanes(uint32_t* out, Pack16 numbers, uint32_t lanes) 
 }
 
 // Bounds of a splat in the image, from its mean and largest scale s alone. An isotropic splat of scale s has the image
-// covariance s^2 J J^T + d I (projection.h), which bounds that of the real splat in each direction. Alpha exceeds 1/255 within at
-// most 3.33 standard deviations. kMotion: whether the camera moves.
+// covariance s^2 J J^T + d I (projection.h), which bounds that of the real splat in each direction. Alpha exceeds 1/255
+// within at most 3.33 standard deviations. kMotion: whether the camera moves.
 template <bool kMotion>
 class CullingBounds {
  public:

@@ -184,17 +184,8 @@ def alignment_to_message(alignment: FrameAlignment) -> pb.FrameAlignment:
 
 
 _CONTRIBUTION = (
-    *(
-        "agent_id",
-        "joined",
-        "voxels",
-        "gaussians",
-        "kappa_sum",
-        "won_voxels",
-        "last_update_seq",
-        "keyframes",
-        "targets",
-    ),
+    *("agent_id", "joined", "last_update_seq", "keyframes", "targets"),
+    *("voxels", "gaussians", "kappa_sum", "won_voxels"),
 )
 
 

@@ -44,6 +44,11 @@ def _read_store(text: str) -> Path | str | None:
     return text if text.startswith(POSTGRES_SCHEME) else read_path(text)
 
 
+def _read_health(text: str) -> str:
+    host_and_port("health", text)
+    return text
+
+
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
     """Address, storage (a file, the URL of a PostgreSQL database, or memory) and limits of the server; the mission."""
@@ -93,7 +98,7 @@ class ServerSettings:
         None,
         "answer health checks also there, without encryption (default: no)",
         metavar="HOST:PORT",
-        convert=lambda text: host_and_port("health", text) and text,
+        convert=_read_health,
     )
 
 

@@ -17,7 +17,7 @@ from numpy import ndarray
 from gausslite.datasets.source import Source, downscaled_size
 from gausslite.domain.camera import Camera, lift
 from gausslite.domain.errors import DatasetError, PoseError
-from gausslite.domain.pose import Trajectory
+from gausslite.domain.pose import Trajectory, inverse
 
 _MAX_PAIRS, _MIN_PAIRS, _MIN_POINTS = 12, 4, 60
 _GRID_PX = 8
@@ -30,7 +30,7 @@ needs. Wrong readings of right recordings have at least 1.6 times the disagreeme
 most 0.67 times, from one frame of lag on."""
 _RANDOM_ERROR = 0.85
 """Median disagreement of neighbours that no surface explains, as with bytes in another order."""
-_NO_READING = "no other time, side or distance"
+_NO_READING = "no other reading of them"
 _MAX_LAG, _MAX_LAG_S = 15, 3.0
 
 
@@ -116,7 +116,7 @@ class _DepthPair:
         first, second = self.first - lag, self.second - lag
         if min(first, second) < 0 or max(first, second) >= len(T_world_camera):
             return None
-        motion: Float64[ndarray, "4 4"] = np.linalg.inv(T_world_camera[second]) @ T_world_camera[first]
+        motion: Float64[ndarray, "4 4"] = inverse(T_world_camera[second]) @ T_world_camera[first]
         return motion
 
     def read_by(self, read: Callable[[DepthImage, Camera], DepthImage]) -> _DepthPair:

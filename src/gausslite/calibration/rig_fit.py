@@ -136,7 +136,8 @@ def fit_mount(motions: Sequence[PointMotion]) -> RigFit | None:
     if distance is None:
         return None
     place = f"turned by {math.degrees(sizes[1]):.0f} degrees and {sizes[0]:.2f} m beside it"
-    return RigFit(f"poses of another link than the camera, which is {place}," * bool((sizes > limits).any()), distance)
+    words = f"poses of another link than the camera, which is {place},"
+    return RigFit(words if (sizes > limits).any() else "", distance)
 
 
 def _multiplied(change: float) -> str:

@@ -269,9 +269,7 @@ class ObjectLandmark:
     @property
     def corners_m(self) -> Float64[ndarray, "8 3"]:
         """Corners of the box."""
-        return np.where(
-            np.stack(np.unravel_index(range(8), (2, 2, 2)), axis=1) > 0, self.extent_m.max_m, self.extent_m.min_m
-        )
+        return np.where(_CORNERS > 0, self.extent_m.max_m, self.extent_m.min_m)
 
     @property
     def size_m(self) -> tuple[float, float, float]:

@@ -22,10 +22,6 @@ _log = logging.getLogger(__name__)
 _EARLIER_SUFFIX = ":earlier"
 
 
-Forget = Callable[[str], object]
-"""Deletes or forgets what a part of the engine holds of an agent."""
-
-
 def earlier_map_of(agent_id: str) -> str:
     """Return the name under which the agent's earlier map takes part in the vote."""
     return agent_id + _EARLIER_SUFFIX
@@ -39,6 +35,8 @@ def is_earlier_map(name: str) -> bool:
 class AgentData:
     """Deletes the agents' data in all parts of the engine. Not thread-safe; FusionEngine holds a lock.
 
+    delete_in_parts: deletes an agent's data in the parts that are not given themselves, each by its own call.
+
     An agent has at most two maps in the store: its own, and one merged from all before it ("earlier map"). The earlier
     map is in the fused frame and a source of the vote like any agent, so the agent's updates and tombstones do not
     change it. It wins a voxel until the agent's own Σkappa is higher. It is deleted when it wins no voxel.
@@ -51,11 +49,11 @@ class AgentData:
         maps: FusedMapLayers,
         alignments: FrameAlignments,
         aligner: FrameAligner,
-        parts: Sequence[Forget],
+        delete_in_parts: Sequence[Callable[[str], object]],
     ) -> None:
         self._store, self._votes, self._maps, self._alignments = store, votes, maps, alignments
         self._aligner = aligner
-        self._parts = alignments.remove_agent, aligner.remove_agent, *parts
+        self._delete_in_parts = alignments.remove_agent, aligner.remove_agent, *delete_in_parts
 
     def remove(self, agent_id: str) -> None:
         """Delete all data of the agent, with its earlier map. Raises StorageError."""
@@ -98,8 +96,8 @@ class AgentData:
 
     def _remove(self, name: str) -> None:
         # the store last: a part waits for the end of what it writes
-        for forget in self._parts:
-            forget(name)
+        for delete in self._delete_in_parts:
+            delete(name)
         self._maps.record(name, np.union1d(self._store.remove_agent(name), self._votes.remove_agent(name)))
 
     def _alignment_of_earlier(self, agent_id: str) -> FrameAlignment:

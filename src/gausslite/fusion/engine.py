@@ -103,8 +103,8 @@ class FusionEngine:
         refined = None if store.is_shared else load_refinement(store)
         self.maps = FusedMapLayers(self._votes, self._lock, self.grid, first, settings.max_removed_voxels, refined)
         parts = self._members.sessions, self._checks, self.traffic, self._keyframes, self._objects
-        forget = [part.remove_agent for part in parts]
-        self._agents = AgentData(store, self._votes, self.maps, self._alignments, self._aligner, forget)
+        delete_in_parts = [part.remove_agent for part in parts]
+        self._agents = AgentData(store, self._votes, self.maps, self._alignments, self._aligner, delete_in_parts)
         self._committer = UpdateCommitter(store, self._lock, self.grid, self._check_update, self._record_updates)
 
     @property

@@ -143,12 +143,10 @@ class KeyframeSettings:
     max_pixels: int = 160_000_000
 
     def __post_init__(self) -> None:
-        for name in ("every", "window", "buffer", "max_pixels"):
+        for name in ("every", "window", "buffer", "half_size_from_px", "max_pixels"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
         for name in ("long_term_keyframes", "roi_margin_px", "pose_updates_per_frame", "depth_edge_px"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
-        pixels = self.half_size_from_px
-        _require(pixels >= 1, "keyframes half_size_from_px", "at least 1", pixels)
         weight = self.roi_context_weight
         _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)
 
@@ -170,10 +168,9 @@ _BALANCED_LOSS = LossWeights(normalise_by_image=True)
 class OptimizationSettings:
     """Training of the map with one frame (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
 
-    active_views: views that an active iteration trains in
-    turn, if the tiles of their regions are together no more than one image; 1 is the paper's. loss: weights of Eq. (1).
-    By default they are normalised by the image size. Adam's steps with the small masks of the active phase are then
-    comparable to those with full images. adam: learning rates.
+    active_views: views that an active iteration trains in turn, if the tiles of their regions are together no more than
+    one image; 1 is the paper's. loss: weights of Eq. (1). By default they are normalised by the image size. Adam's
+    steps with the small masks of the active phase are then comparable to those with full images. adam: learning rates.
     decay_after_updates: updates of a Gaussian after which its learning rates decay, if `MapperSettings.pose_prior`
     allows an error; inf disables the decay. With constant rates, Gaussians would oscillate between views that
     contradict each other. isotropic: make Gaussians spheres after every frame. ema_updates: time constant, in updates,

@@ -349,12 +349,11 @@ class Trainer:
 
     def _iterate(self, binding: _Binding, stage: Stage, turns: Iterator[WindowView]) -> None:
         """Run one iteration: on whole images, or on the region in as many views as fit in the tiles of one image."""
-        optimization = self._settings.optimization
         if stage is Stage.WARM_UP:
             self._train_full_images(binding, turns)
         else:
             images = 0.0
-            for _ in range(optimization.active_views):
+            for _ in range(self._settings.optimization.active_views):
                 view = next(turns)
                 self._train_roi(binding, view)
                 images += view.roi_share

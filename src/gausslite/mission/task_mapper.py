@@ -16,7 +16,7 @@ from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounReport, ObjectLandmark
-from gausslite.domain.pose import rotation_angle_deg, translation_m
+from gausslite.domain.pose import require_rigid, rotation_angle_deg, translation_m
 from gausslite.domain.relevance import CameraView, DetectedImage, PointedObject, PointM, RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
@@ -84,10 +84,11 @@ class LastImage:
         return {"checksum": self._checksum, "pose": self._T_world_camera}
 
     def restore(self, state: State) -> None:
-        """Continue from a state, which runs of earlier versions do not have."""
-        if state:
-            self._checksum = get_array(state, "checksum", (1,), np.int64).copy()
-            self._T_world_camera = get_array(state, "pose", (4, 4), np.float64).copy()
+        """Continue from another object's state. Raises MapFileError, PoseError."""
+        T_world_camera = get_array(state, "pose", (4, 4), np.float64)
+        require_rigid("state last_image pose", T_world_camera)
+        self._checksum = get_array(state, "checksum", (1,), np.int64).copy()
+        self._T_world_camera = T_world_camera.copy()
 
 
 class TaskMapper:

@@ -130,7 +130,7 @@ class LossWeights:
     + ssim · (1 − Σ w SSIM / (3W))   11x11 Gaussian window, sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4
 
     normalise_by_image multiplies the loss by W / (number of pixels). A pixel of weight 1 then has the same gradient
-    with any mask. Without it, Adam, which normalises by recent gradients, hardly moves a region in whole images.
+    with any mask. Without it, masked steps have larger gradients, and Adam's steps on whole images hardly count.
     """
 
     colour: float = 0.8
