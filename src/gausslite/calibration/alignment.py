@@ -39,7 +39,7 @@ _NORMAL_WINDOW_PX = 5
 _NUISANCE_STD = 1.0
 """Prior of the global gain and offset that are fitted along with the pose and then dropped."""
 _CONVERGED = 1e-4
-"""Tracking ends a level when the pose changes by less than this, in metres and radians."""
+"""A level ends when the pose changes by less than this, in metres and radians."""
 _FIT_TRANSLATION_STD_M, _FIT_ROTATION_STD_DEG = 0.002, 0.1
 """Error of the fit itself on a map that still grows, measured where poses are exact.
 
@@ -123,11 +123,19 @@ def shrinkage(prior_std: float, fit_std: float) -> float:
     return prior_std**2 / (prior_std**2 + fit_std**2)
 
 
-def comparable_pixels(rendering: Rendering, frame: Frame) -> Int64[ndarray, " n"]:
-    """Return flat indices, on an even grid of at most 12 000 pixels, where both images show the same surface."""
-    depth_error_m = np.abs(rendering.expected_depth_m(OPAQUE_ALPHA) - frame.depth_m)
-    same_surface = depth_error_m < MAX_RELATIVE_DEPTH_ERROR * frame.depth_m
-    return np.flatnonzero(_grid(rendering, MAX_PIXELS) & (rendering.alpha > OPAQUE_ALPHA) & same_surface)
+def comparable_pixels(rendering: Rendering, frame: Frame, max_pixels: int = MAX_PIXELS) -> Int64[ndarray, " n"]:
+    """Return flat indices, on an even grid of at most so many pixels, where both images show the same surface."""
+    stride = _grid_stride(rendering, max_pixels)
+    grid = (slice(stride // 2, None, stride),) * 2
+    alpha, measured_m = rendering.alpha[grid], frame.depth_m[grid]
+    # |depth / alpha - measured| without the division
+    depth_error_m = np.abs(rendering.depth_m[grid] - alpha * measured_m)
+    same_surface = depth_error_m < MAX_RELATIVE_DEPTH_ERROR * alpha * measured_m
+    rows, columns = np.nonzero((alpha > OPAQUE_ALPHA) & same_surface)
+    pixels: Int64[ndarray, " n"] = (
+        (rows * stride + stride // 2) * rendering.alpha.shape[1] + columns * stride + stride // 2
+    )
+    return pixels
 
 
 def independent_share(rendering: Rendering, max_pixels: int = MAX_PIXELS) -> float:
@@ -137,17 +145,25 @@ def independent_share(rendering: Rendering, max_pixels: int = MAX_PIXELS) -> flo
 
 def blurred_luminance(rgb: UInt8[ndarray, "h w 3"], blur_px: float) -> Float32[ndarray, "h w"]:
     """Return the luminance from 0 to 1, blurred by a Gaussian of this deviation."""
-    luminance: Float32[ndarray, "h w"] = cv2.GaussianBlur(rgb @ (_LUMINANCE / np.float32(255.0)), (0, 0), blur_px)
-    return luminance
+    return _blurred(_luminance(rgb), blur_px)
 
 
 def rendered_luminance(
     rgb: Float32[ndarray, "h w 3"], pixels: Int64[ndarray, " n"], blurs_px: Sequence[float]
 ) -> tuple[Float64[ndarray, " n"], ...]:
     """Return the luminance of rendered colours at flat pixel indices, for each blur."""
-    luminance = rgb @ _LUMINANCE
-    blurred = (cv2.GaussianBlur(luminance, (0, 0), blur_px) for blur_px in blurs_px)
-    return tuple(image.ravel()[pixels].astype(np.float64) for image in blurred)
+    luminance: Float32[ndarray, "h w"] = cv2.transform(rgb, _LUMINANCE[None])
+    return tuple(_blurred(luminance, blur_px).ravel()[pixels].astype(np.float64) for blur_px in blurs_px)
+
+
+def _luminance(rgb: UInt8[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+    luminance: Float32[ndarray, "h w"] = cv2.transform(rgb.astype(np.float32), _LUMINANCE[None] / np.float32(255.0))
+    return luminance
+
+
+def _blurred(luminance: Float32[ndarray, "h w"], blur_px: float) -> Float32[ndarray, "h w"]:
+    blurred: Float32[ndarray, "h w"] = cv2.GaussianBlur(luminance, (0, 0), blur_px)
+    return blurred
 
 
 def with_gradients(luminance: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w 3"]:
@@ -174,12 +190,13 @@ class VisiblePoints:
         cls, points: Float64[ndarray, "n 3"], T_camera_rendered: Float64[ndarray, "4 4"], camera: Camera
     ) -> VisiblePoints:
         """Return the points inside the image, given in the rendered view."""
-        moved = points @ T_camera_rendered[:3, :3].T + T_camera_rendered[:3, 3]
-        z_m = np.maximum(moved[:, 2], NEAR_M)
-        u, v = (axis - 0.5 for axis in camera.pixels(moved[:, 0] / z_m, moved[:, 1] / z_m))
-        inside = (u >= 1) & (v >= 1) & (u <= camera.width_px - 2) & (v <= camera.height_px - 2) & (moved[:, 2] > NEAR_M)
+        # coordinates in rows: NumPy is twice as fast on them
+        moved = T_camera_rendered[:3, :3] @ points.T + T_camera_rendered[:3, 3:]
+        z_m = np.maximum(moved[2], NEAR_M)
+        u, v = (axis - 0.5 for axis in camera.pixels(moved[0] / z_m, moved[1] / z_m))
+        inside = (u >= 1) & (v >= 1) & (u <= camera.width_px - 2) & (v <= camera.height_px - 2) & (moved[2] > NEAR_M)
         index = np.flatnonzero(inside)
-        return cls(index, moved[index], np.stack([u[index], v[index]], axis=1))
+        return cls(index, moved[:, index].T, np.stack([u[index], v[index]]).T)
 
     def only(self, mask: Bool[ndarray, " m"]) -> VisiblePoints:
         """Return those of the mask."""
@@ -212,7 +229,7 @@ def luminance_residuals(
     by_x, by_y, by_z = camera.gradient_by_point(sampled[:, 1], sampled[:, 2], visible.points)
     x, y, z = visible.points.T
     rotation = [by_z * y - by_y * z, by_x * z - by_z * x, by_y * x - by_x * y]
-    jacobian = np.stack([by_x, by_y, by_z, *rotation, -model_luminance, -np.ones_like(x)], axis=1)
+    jacobian = np.stack([by_x, by_y, by_z, *rotation, -model_luminance, -np.ones_like(x)]).T
     return jacobian, sampled[:, 0] - model_luminance
 
 
@@ -263,17 +280,22 @@ def align_images(
 
 
 def fit_pose(
-    rendering: Rendering, T_rendered_world: Float64[ndarray, "4 4"], frame: Frame, prior: PoseExposurePrior
+    rendering: Rendering,
+    T_rendered_world: Float64[ndarray, "4 4"],
+    frame: Frame,
+    prior: PoseExposurePrior,
+    max_pixels: int = MAX_PIXELS,
 ) -> Float64[ndarray, "4 4"]:
     """Return T_world_camera of the frame, aligned to a rendering from a nearby pose.
 
     The search starts at the rendered pose; the prior is centred on frame.T_world_camera, the odometry's pose. Returns
     the odometry's pose if the prior allows no pose error or fewer than 200 pixels are comparable.
     """
-    pixels = comparable_pixels(rendering, frame)
+    pixels = comparable_pixels(rendering, frame, max_pixels)
     if not prior.has_pose_error or len(pixels) < MIN_PIXELS:
         return frame.T_world_camera
-    model = _Model.of_pixels(rendering, frame.camera, pixels, REFINEMENT)
+    share = independent_share(rendering, max_pixels)
+    model = _Model.of_pixels(rendering, frame.camera, pixels, REFINEMENT, share)
     prior_std = np.array([prior.translation_m] * 3 + [np.radians(prior.rotation_deg)] * 3)
     T_rendered_odometry = T_rendered_world @ frame.T_world_camera
     solution = _solve(model, frame, REFINEMENT, T_rendered_odometry, prior_std)
@@ -290,7 +312,8 @@ def luminance_residual(rendering: Rendering, frame: Frame, T_world_camera: Float
 
     rendering: from frame.T_world_camera; T_world_camera: the pose that the photograph is compared from.
     """
-    model = _Model.of_pixels(rendering, frame.camera, comparable_pixels(rendering, frame), REFINEMENT[-1:])
+    pixels = comparable_pixels(rendering, frame)
+    model = _Model.of_pixels(rendering, frame.camera, pixels, REFINEMENT[-1:])
     visible = VisiblePoints.of(model.points, inverse(T_world_camera) @ frame.T_world_camera, frame.camera)
     photograph = with_gradients(blurred_luminance(frame.rgb, REFINEMENT[-1].blur_px))
     jacobian, residual = luminance_residuals(model.luminance[0][visible.index], photograph, visible, frame.camera)
@@ -321,8 +344,9 @@ def _solve(
     """
     parameters_std = np.append(prior_std, (_NUISANCE_STD, _NUISANCE_STD))
     solution: _Solution | None = None
+    luminance = _luminance(frame.rgb)
     for i, level in enumerate(levels):
-        photograph = with_gradients(blurred_luminance(frame.rgb, level.blur_px))
+        photograph = with_gradients(_blurred(luminance, level.blur_px))
         for _ in range(level.steps):
             step = model.linearise(i, level, frame, photograph, T_camera_rendered)
             if step is None:
@@ -331,7 +355,7 @@ def _solve(
             update = step.equations.solve(deviation, parameters_std)
             T_camera_rendered = transform_of(update[:6]) @ T_camera_rendered
             solution = _Solution(T_camera_rendered, step.overlap, step.residual)
-            if level.max_depth_error is not None and np.abs(update[:6]).max() < _CONVERGED:
+            if np.abs(update[:6]).max() < _CONVERGED:
                 break
     return solution
 
@@ -357,12 +381,19 @@ class _Model:
 
     @classmethod
     def of_pixels(
-        cls, rendering: Rendering, camera: Camera, pixels: Int64[ndarray, " n"], levels: Sequence[PyramidLevel]
+        cls,
+        rendering: Rendering,
+        camera: Camera,
+        pixels: Int64[ndarray, " n"],
+        levels: Sequence[PyramidLevel],
+        share: float = 1.0,
     ) -> _Model:
         """Return the model of the luminance at these flat pixel indices."""
-        points = back_project(rendering.expected_depth_m(OPAQUE_ALPHA), camera).reshape(-1, 3)[pixels]
+        rows, columns = np.divmod(pixels, camera.width_px)
+        depth_m = rendering.depth_m.ravel()[pixels].astype(np.float64) / rendering.alpha.ravel()[pixels]
+        points = lift(np.stack([columns, rows], axis=1) + 0.5, depth_m, camera)
         luminance = rendered_luminance(rendering.rgb, pixels, [level.blur_px for level in levels])
-        return cls(points.astype(np.float64), luminance, independent_share(rendering))
+        return cls(points, luminance, share)
 
     @classmethod
     def of_surface(cls, rendering: Rendering, camera: Camera, levels: Sequence[PyramidLevel]) -> _Model | None:

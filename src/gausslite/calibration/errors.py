@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Float64, UInt8
+from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 from numpy import ndarray
 
 from gausslite.calibration.alignment import (
+    MAX_PIXELS,
     MIN_PIXELS,
     NormalEquations,
     comparable_pixels,
@@ -35,7 +36,7 @@ from gausslite.domain.pose import inverse, twist_of
 from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
 from gausslite.render.rasterizer import Rendering
 
-_BLUR_PX = 4.0
+_BLUR_PX = 15
 _FIT_GAIN_STD, _FIT_OFFSET_STD = 0.05, 0.015
 """Error of the fit itself on a map that still grows, measured where exposure is fixed."""
 
@@ -63,29 +64,31 @@ class AffineExposure:
 IDENTITY_EXPOSURE = AffineExposure(np.ones(3), np.zeros(3))
 
 
-def fit_exposure(rendering: Rendering, frame: Frame, prior: PoseExposurePrior) -> AffineExposure:
+def fit_exposure(
+    rendering: Rendering, frame: Frame, prior: PoseExposurePrior, max_pixels: int = MAX_PIXELS
+) -> AffineExposure:
     """Return the exposure that brings the rendering closest to the frame where the map covers the image.
 
     Returns IDENTITY_EXPOSURE if the prior allows no exposure error or fewer than 200 pixels are comparable.
     """
-    pixels = comparable_pixels(rendering, frame)
+    pixels = comparable_pixels(rendering, frame, max_pixels)
     if not prior.has_exposure_error or len(pixels) < MIN_PIXELS:
         return IDENTITY_EXPOSURE
     # without the blur, detail that the map lacks would pull the gain below 1
     model = _blurred(rendering.rgb)[pixels].astype(np.float64)
-    residual = _blurred(frame.rgb.astype(np.float32) / np.float32(255.0))[pixels] - model
+    residual = _blurred(frame.rgb)[pixels] / 255.0 - model
     prior_std, gain, offset = np.array([prior.gain, prior.offset]), np.ones(3), np.zeros(3)
     for channel in range(3):
         jacobian = -np.stack([model[:, channel], np.ones(len(model))], axis=1)
-        weights = independent_share(rendering) * robust_weights(residual[:, channel])
+        weights = independent_share(rendering, max_pixels) * robust_weights(residual[:, channel])
         change = NormalEquations.of(jacobian, residual[:, channel], weights).solve(np.zeros(2), prior_std)
         gain[channel] += change[0] * shrinkage(prior.gain, _FIT_GAIN_STD)
         offset[channel] += change[1] * shrinkage(prior.offset, _FIT_OFFSET_STD)
     return AffineExposure(gain, offset)
 
 
-def _blurred(image: Float32[ndarray, "h w 3"]) -> Float32[ndarray, "n 3"]:
-    blurred: Float32[ndarray, "n 3"] = cv2.GaussianBlur(image, (0, 0), _BLUR_PX).reshape(-1, 3)
+def _blurred(image: Shaped[ndarray, "h w 3"]) -> Float32[ndarray, "n 3"]:
+    blurred: Float32[ndarray, "n 3"] = cv2.boxFilter(image, cv2.CV_32F, (_BLUR_PX, _BLUR_PX)).reshape(-1, 3)
     return blurred
 
 

@@ -147,6 +147,7 @@ class GaussianMapper:
             self._skipped += 1
             return MappedFrame(frame.index, 0, 0, self.count, defect)
         self._refiner.history.begin(odometry or frame, self._keyframes.next_anchor)
+        self._refine_keyframes(scheduler)
         with scheduler.timing(Stage.VIEW_PREPARATION):
             view = self._prepare_view(frame, relevance)
         self._refiner.history.record(frame, view.keyframe.frame.T_world_camera)
@@ -378,9 +379,17 @@ class GaussianMapper:
         anchor = self._keyframes.next_anchor
         if not self._refiner.enabled or self._table.count == 0:
             return self._window_view(Keyframe(frame, relevance, anchor=anchor))
-        for view in self._refiner.next_views(self._keyframes.window):
-            self._keyframes.replace_view(self._window_view(self._refiner.refine_keyframe(view.keyframe)))
         return self._window_view(Keyframe(self._refiner.refine(frame), relevance, recorded=frame, anchor=anchor))
+
+    def _refine_keyframes(self, scheduler: StageScheduler) -> None:
+        """Refine the next keyframes against the map, while there is time and the prior allows an error."""
+        if not self._refiner.enabled or self._table.count == 0:
+            return
+        for keyframe in self._refiner.next_keyframes(self._keyframes.window):
+            if not scheduler.has_time_for(Stage.KEYFRAME_REFINEMENT):
+                return
+            with scheduler.timing(Stage.KEYFRAME_REFINEMENT):
+                self._keyframes.replace_view(self._window_view(self._refiner.refine_keyframe(keyframe)))
 
     def _close_loop(
         self, prior: Frame, keyframe: Keyframe, scheduler: StageScheduler

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -23,6 +23,8 @@ from gausslite.domain.state import State, add_prefix, get_array, get_counts, int
 from gausslite.mapping.keyframes import Keyframe, WindowView
 from gausslite.render.rasterizer import Rendering
 
+_MAX_PIXELS = 4_000
+"""Pixels that a fit compares: an evaluation gains from more, a map that still grows does not."""
 _MAX_POSES = 20_000
 """Beyond this number, every second pose of the older half is removed: 5 MB."""
 _RECENT_POSES = 32
@@ -247,13 +249,16 @@ class ViewRefiner:
         self._T_odometry_refined = inverse(recorded.T_world_camera) @ frame.T_world_camera
         return frame
 
-    def next_views(self, window: Sequence[WindowView]) -> list[WindowView]:
-        """Return the keyframes to refine with this frame, in rotation over the window."""
-        refinable = [view for view in window if view.keyframe.recorded is not None]
-        count = min(self._settings.keyframes_per_frame, len(refinable))
-        first = self._position + 1
-        self._position = (self._position + count) % max(len(refinable), 1)
-        return [refinable[position % len(refinable)] for position in range(first, first + count)]
+    def next_keyframes(self, window: Sequence[WindowView]) -> Iterator[Keyframe]:
+        """Yield the keyframes to refine with this frame, in rotation over the window.
+
+        The last one counts as refined when the next one is asked for.
+        """
+        refinable = [view.keyframe for view in window if view.keyframe.recorded is not None]
+        for _ in range(min(self._settings.keyframes_per_frame, len(refinable))):
+            position = (self._position + 1) % len(refinable)
+            yield refinable[position]
+            self._position = position
 
     def refine_keyframe(self, keyframe: Keyframe) -> Keyframe:
         """Return the keyframe with its pose and exposure refined against the current map."""
@@ -263,10 +268,10 @@ class ViewRefiner:
 
     def _fit(self, recorded: Frame, T_world_rendered: Float64[ndarray, "4 4"]) -> Frame:
         rendering = self._render(recorded.camera, T_world_rendered, recorded.motion)
-        T_world_camera = fit_pose(rendering, inverse(T_world_rendered), recorded, self._prior)
+        T_world_camera = fit_pose(rendering, inverse(T_world_rendered), recorded, self._prior, _MAX_PIXELS)
         if self._prior.has_pose_error:
             T_world_camera = self._anchored(recorded, T_world_camera)
-        exposure = fit_exposure(rendering, recorded, self._prior)
+        exposure = fit_exposure(rendering, recorded, self._prior, _MAX_PIXELS)
         return replace(recorded, rgb=exposure.to_map(recorded.rgb), T_world_camera=T_world_camera)
 
     def _anchored(self, recorded: Frame, T_world_camera: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:

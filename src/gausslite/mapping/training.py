@@ -115,6 +115,8 @@ class Stage(StrEnum):
     """Detect, track and decide which pixels are relevant to the task."""
     REEVALUATION = "reevaluation"
     """Evaluate earlier keyframes for a new task."""
+    KEYFRAME_REFINEMENT = "keyframe_refinement"
+    """Refine the pose and exposure of an earlier keyframe."""
     VIEW_PREPARATION = "view_preparation"
     """Refine the frame's pose and exposure and prepare the frame for training."""
     SEEDING = "seeding"

@@ -137,10 +137,20 @@ def test_keyframes_are_refined_equally_often(pose_updates_per_frame: int) -> Non
     window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
     refinement = RefinementSettings(LOOSE, pose_updates_per_frame, anchor_share=0.1)
     refiner = ViewRefiner(refinement, lambda camera, T_world_camera, motion: rendering_like(frames[0]))
-    rounds = [refiner.next_views(window) for _ in range(4)]
+    rounds = [list(refiner.next_keyframes(window)) for _ in range(4)]
     assert [len(turn) for turn in rounds] == [min(pose_updates_per_frame, 4)] * 4
-    fitted = Counter(view.keyframe.frame.index for turn in rounds for view in turn)
+    fitted = Counter(keyframe.frame.index for turn in rounds for keyframe in turn)
     assert fitted == Counter({frame.index: min(pose_updates_per_frame, 4) for frame in frames[1:]})
+
+
+def test_a_keyframe_for_which_a_frame_has_no_time_is_refined_with_the_next_one() -> None:
+    rasterizer, settings = CpuRasterizer(threads=1), KeyframeSettings()
+    keyframes = [Keyframe(f, middle_relevance(f), recorded=f) for f in (wall_frame(i, SIZE) for i in range(3))]
+    window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
+    refiner = ViewRefiner(
+        RefinementSettings(LOOSE, 2, anchor_share=0.1), lambda *_: rendering_like(keyframes[0].frame)
+    )
+    assert next(refiner.next_keyframes(window)) is next(refiner.next_keyframes(window))
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 0.02, 0.5])

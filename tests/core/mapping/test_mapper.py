@@ -10,6 +10,7 @@ import pytest
 from mapping_scenes import middle_relevance, wall_frame
 
 from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import select_prefix
 from gausslite.mapping.mapper import GaussianMapper
@@ -163,6 +164,18 @@ def test_a_scheduler_replaces_the_number_of_iterations_and_times_each_stage() ->
     assert timing.seconds <= 60.0 + 8.0
     assert timing.stages_s[Stage.WARM_UP] + timing.stages_s[Stage.ACTIVE] == outcome.iterations
     assert timing.stages_s[Stage.SEEDING] == timing.stages_s[Stage.VIEW_PREPARATION] == 1.0
+
+
+@pytest.mark.parametrize(("seconds_per_frame", "refined"), [(1.0, 0), (1000.0, 2)])
+def test_a_frame_without_time_refines_no_earlier_keyframe(seconds_per_frame: float, refined: int) -> None:
+    mapper = mapper_of(replace(SMALL, pose_prior=PoseExposurePrior(0.01, 0.1)))
+    map_wall(mapper, 4)
+    clock = itertools.count()
+    scheduler = FrameScheduler(SchedulerSettings(seconds_per_frame), clock=lambda: float(next(clock)))
+    frame = wall_frame(4, SIZE)
+    scheduler.begin()
+    mapper.map_frame(frame, middle_relevance(frame), scheduler)
+    assert scheduler.end().stages_s.get(Stage.KEYFRAME_REFINEMENT, 0.0) == refined
 
 
 def test_density_control_is_delayed_by_missing_time_but_not_forever() -> None:
