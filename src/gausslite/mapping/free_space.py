@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -29,21 +31,29 @@ _MIN_RATIO = 2
 """Views that see through a point must be at least three, and twice those that show a surface there."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+_Pixels: TypeAlias = tuple[Int64[ndarray, " m"], Int64[ndarray, " m"], Int64[ndarray, " m"]]
+"""Indices of points inside an image, and the rows and columns of their pixels."""
+
+
+@dataclass(frozen=True, eq=False)
 class DepthView:
-    """The nearest and the farthest depth around each pixel of a depth image; both are 0 beside unmeasured pixels."""
+    """A depth image, and the nearest depth around each pixel: 0 beside unmeasured pixels."""
 
     camera: Camera
     T_camera_world: Float64[ndarray, "4 4"]
+    depth_m: Float32[ndarray, "h w"]
     nearest_m: Float32[ndarray, "h w"]
-    farthest_m: Float32[ndarray, "h w"]
+
+    @cached_property
+    def farthest_m(self) -> Float32[ndarray, "h w"]:
+        """The farthest depth around each pixel, which `sees_through` does not need."""
+        farthest_m: Float32[ndarray, "h w"] = cv2.dilate(self.depth_m, _NEIGHBOURS)
+        return farthest_m
 
     @classmethod
     def of(cls, depth_m: Float32[ndarray, "h w"], camera: Camera, T_world_camera: Float64[ndarray, "4 4"]) -> DepthView:
         """Return the view of a depth image; depth 0 means no measurement."""
-        nearest_m = cv2.erode(depth_m, _NEIGHBOURS)
-        farthest_m = np.where(nearest_m > 0, cv2.dilate(depth_m, _NEIGHBOURS), np.float32(0.0))
-        return cls(camera, inverse(T_world_camera), nearest_m, farthest_m)
+        return cls(camera, inverse(T_world_camera), depth_m, cv2.erode(depth_m, _NEIGHBOURS))
 
     @classmethod
     def of_frame(cls, frame: Frame) -> DepthView:
@@ -54,31 +64,37 @@ class DepthView:
         self, points_m: Float32[ndarray, "n 3"], slack_m: float = _THROUGH_M, slack_share: float = _THROUGH_SHARE
     ) -> Bool[ndarray, " n"]:
         """Return the points that the camera sees through: depth around is farther by slack_m + slack_share · z."""
-        z_m, nearest_m, _ = self._depths(points_m)
-        through: Bool[ndarray, " n"] = z_m < nearest_m - (np.float32(slack_m) + np.float32(slack_share) * z_m)
-        return through
+        z_m, nearest_m, _ = self._locate(points_m)
+        return _is_before(z_m, nearest_m, slack_m, slack_share)
 
     def classify(self, points_m: Float32[ndarray, "n 3"]) -> tuple[Bool[ndarray, " n"], Bool[ndarray, " n"]]:
         """Return which points the camera sees through, and at which it sees a surface; all others are unknown."""
-        z_m, nearest_m, farthest_m = self._depths(points_m)
+        z_m, nearest_m, (ids, rows, columns) = self._locate(points_m)
+        farthest_m = np.zeros_like(nearest_m)
+        farthest_m[ids] = self.farthest_m[rows, columns]
         slack_m = np.float32(_SHOWN_M) + np.float32(_SHOWN_SHARE) * z_m
         shown = (nearest_m > 0) & (z_m >= nearest_m - slack_m) & (z_m <= farthest_m + slack_m)
-        return self.sees_through(points_m), shown
+        return _is_before(z_m, nearest_m, _THROUGH_M, _THROUGH_SHARE), shown
 
-    def _depths(
+    def _locate(
         self, points_m: Float32[ndarray, "n 3"]
-    ) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"], Float32[ndarray, " n"]]:
-        """Return each point's depth, and the nearest and farthest depth around its pixel; 0 outside the image."""
+    ) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"], _Pixels]:
+        """Return each point's depth and the nearest depth around its pixel, 0 outside the image; and the pixels."""
         points = transform_points(self.T_camera_world, points_m)
         ids, rows, columns = _pixels(points, self.camera)
-        nearest_m, farthest_m = (np.zeros(len(points), np.float32) for _ in range(2))
-        nearest_m[ids], farthest_m[ids] = self.nearest_m[rows, columns], self.farthest_m[rows, columns]
-        return np.maximum(points[:, 2], np.float32(0.0)), nearest_m, farthest_m
+        nearest_m = np.zeros(len(points), np.float32)
+        nearest_m[ids] = self.nearest_m[rows, columns]
+        return np.maximum(points[:, 2], np.float32(0.0)), nearest_m, (ids, rows, columns)
 
 
-def _pixels(
-    points_m: Float32[ndarray, "n 3"], camera: Camera
-) -> tuple[Int64[ndarray, " m"], Int64[ndarray, " m"], Int64[ndarray, " m"]]:
+def _is_before(
+    z_m: Float32[ndarray, " n"], nearest_m: Float32[ndarray, " n"], slack_m: float, slack_share: float
+) -> Bool[ndarray, " n"]:
+    before: Bool[ndarray, " n"] = z_m < nearest_m - (np.float32(slack_m) + np.float32(slack_share) * z_m)
+    return before
+
+
+def _pixels(points_m: Float32[ndarray, "n 3"], camera: Camera) -> _Pixels:
     """Return the indices of the points inside the image, in the camera's frame, and their pixels' rows and columns."""
     ids = np.flatnonzero(points_m[:, 2] > NEAR_M)
     columns, rows = np.floor(project(points_m[ids], camera)).astype(np.int64).T

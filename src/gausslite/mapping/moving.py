@@ -49,12 +49,11 @@ def moving_pixels(
     points = lift(
         np.stack([columns, rows], axis=1) * step + 0.5, depth_m[rows, columns].astype(np.float64), frame.camera
     )
-    p_world = transform_points(frame.T_world_camera, points)
+    p_world = transform_points(frame.T_world_camera, points).astype(np.float32)
     count = np.zeros(len(p_world), np.int64)
     for reference in earlier[-settings.references :]:
-        count += DepthView.of_frame(reference).sees_through(
-            p_world.astype(np.float32), settings.depth_slack_m, settings.depth_slack_share
-        )
+        view = DepthView.of_frame(reference)
+        count += view.sees_through(p_world, settings.depth_slack_m, settings.depth_slack_share)
     grid = np.zeros(depth_m.shape, np.uint8)
     grid[rows, columns] = count >= settings.min_references
     # single pixels are at depth edges

@@ -76,7 +76,7 @@ def test_the_time_of_a_frame_includes_publishing() -> None:
         budget = task_mapper.process(wall_frame(index, SIZE, shift_m=0.1 * index)).timing
         optional = {
             *(Stage.TRACKING, Stage.PRUNING, Stage.DENSIFICATION, Stage.RENDERING),
-            *(Stage.REEVALUATION, Stage.LOOP_CLOSURE),
+            *(Stage.REEVALUATION, Stage.LOOP_CLOSURE, Stage.KEYFRAME_REFINEMENT),
         }
         assert set(Stage) - optional <= set(budget.stages_s)
         # an iteration takes one second plus some clock readings
