@@ -147,9 +147,7 @@ def test_a_keyframe_for_which_a_frame_has_no_time_is_refined_with_the_next_one()
     rasterizer, settings = CpuRasterizer(threads=1), KeyframeSettings()
     keyframes = [Keyframe(f, middle_relevance(f), recorded=f) for f in (wall_frame(i, SIZE) for i in range(3))]
     window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
-    refiner = ViewRefiner(
-        RefinementSettings(LOOSE, 2, anchor_share=0.1), lambda *_: rendering_like(keyframes[0].frame)
-    )
+    refiner = ViewRefiner(RefinementSettings(LOOSE, 2, anchor_share=0.1), lambda *_: rendering_like(keyframes[0].frame))
     assert next(refiner.next_keyframes(window)) is next(refiner.next_keyframes(window))
 
 
