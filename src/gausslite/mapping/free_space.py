@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera, project
+from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.render.rasterizer import NEAR_M
@@ -96,10 +96,13 @@ def _is_before(
 
 def _pixels(points_m: Float32[ndarray, "n 3"], camera: Camera) -> _Pixels:
     """Return the indices of the points inside the image, in the camera's frame, and their pixels' rows and columns."""
-    ids = np.flatnonzero(points_m[:, 2] > NEAR_M)
-    columns, rows = np.floor(project(points_m[ids], camera)).astype(np.int64).T
-    inside = (rows >= 0) & (rows < camera.height_px) & (columns >= 0) & (columns < camera.width_px)
-    return ids[inside], rows[inside], columns[inside]
+    x_m, y_m, z_m = points_m.T
+    in_front = z_m > NEAR_M
+    inverse_z = 1.0 / np.where(in_front, z_m, np.float32(1.0))
+    columns, rows = camera.pixels(x_m * inverse_z, y_m * inverse_z)
+    inside = in_front & (rows >= 0) & (rows < camera.height_px) & (columns >= 0) & (columns < camera.width_px)
+    ids = np.flatnonzero(inside)
+    return ids, rows[ids].astype(np.int64), columns[ids].astype(np.int64)
 
 
 def view_counts(
