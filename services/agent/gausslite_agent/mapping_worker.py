@@ -88,8 +88,6 @@ class FrameQueue:
 
 
 _Result = TypeVar("_Result")
-
-
 _log = logging.getLogger(__name__)
 
 
@@ -108,14 +106,11 @@ class MappingWorker:
         keyframe_upload: KeyframeUpload | None = None,
         prior: PriorFrames | None = None,
     ) -> None:
-        """Reserve the map's memory.
-
-        build_estimator and on_change run on the worker thread, the latter after each mapped frame.
-        """
+        """build_estimator and on_change run on the worker thread, the latter after each mapped frame."""
         self._keyframe_upload = keyframe_upload
         self.prior = prior or PriorFrames(None)
-        self._settings, self._grid, self._build_estimator = settings, grid, build_estimator
-        self.uplink = uplink
+        self._settings, self._build_estimator = settings, build_estimator
+        self.grid, self.uplink = grid, uplink
         self._on_change = on_change
         self._load = load or LoadSettings()
         self._clock = clock
@@ -138,11 +133,6 @@ class MappingWorker:
             lambda: not self._queue.is_empty,
             self._schedule,
         )
-
-    @property
-    def grid(self) -> VoxelGrid:
-        """The voxel grid of the uplink."""
-        return self._grid
 
     def status(self) -> WorkerStatus:
         """Return a snapshot of the totals."""
@@ -227,7 +217,8 @@ class MappingWorker:
 
     def select_keyframes(self) -> Future[None]:
         """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""
-        return self.run(self._enqueue_all_keyframes)
+        upload = self._keyframe_upload
+        return self.run(lambda mapper: None if upload is None else upload.enqueue_all(mapper.keyframes()))
 
     def close(self) -> None:
         """End the worker after its current frame; waiting frames are dropped."""
@@ -303,7 +294,7 @@ class MappingWorker:
 
         Raises StorageError.
         """
-        batch = self._sent_voxels.exclude_frozen(group_by_voxel(gaussians, self._grid))
+        batch = self._sent_voxels.exclude_frozen(group_by_voxel(gaussians, self.grid))
         if self.uplink is None:
             return batch
         return self._sent_voxels.add_tombstones(batch, self.uplink.spooled_voxels(purpose))
@@ -383,21 +374,17 @@ class MappingWorker:
     def _insert_team_voxels(self, received: VoxelBatch) -> InsertedVoxels:
         if self._task_mapper is None:
             return InsertedVoxels(empty_batch(), 0)
-        inserted = self._task_mapper.insert_team_voxels(received, self._grid)
+        inserted = self._task_mapper.insert_team_voxels(received, self.grid)
         if inserted.gaussians:
             count = self.status().team_gaussians + inserted.gaussians
             self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
             self._on_change()
         return inserted
 
-    def _enqueue_all_keyframes(self, mapper: GaussianMapper) -> None:
-        if self._keyframe_upload is not None:
-            self._keyframe_upload.enqueue_all(mapper.keyframes())
-
     def _idle_step(self) -> bool:
         if self._task_mapper is None or not self._task_mapper.idle_step():
             return False
-        self._status.add_idle_iteration()
+        self._status.update(idle_iterations=self.status().idle_iterations + 1)
         return True
 
     def _publish_changes(self) -> None:

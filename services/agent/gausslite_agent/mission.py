@@ -242,10 +242,7 @@ class AgentMission:
         )
 
     def save(self) -> float:
-        """Save the mission after the current frame if there is a file for it; returns the seconds that it took.
-
-        Raises StorageError.
-        """
+        """Save the mission after the current frame, if to a file; returns the seconds taken. Raises StorageError."""
         settings = self._settings
         if settings.state is None:
             return 0.0
@@ -352,11 +349,9 @@ class AgentMission:
         report["notes"] = [*self._source_notes, *report["notes"]]
         prior, world_frame = self._worker.prior.run, self._settings.link.uplink.world_frame
         motion = None if prior is None else prior.motion
+        keyframes = self._worker.run(lambda mapper: mapper.keyframes()).result()
         if prior is not None:
-            objects, keyframes = (
-                self._worker.status().objects,
-                self._worker.run(lambda mapper: mapper.keyframes()).result(),
-            )
+            objects = self._worker.status().objects
             changes = prior.changes(gaussians, objects, keyframes)
             for change in changes:
                 _log.info("since the earlier map: %s", change.describe())
@@ -365,7 +360,7 @@ class AgentMission:
             world_frame = world_frame or ("" if motion is None else prior.saved.world_frame)
         write_results(folder, gaussians, report, world_frame)
         self._worker.run(lambda mapper: write_poses(folder, mapper.poses, motion)).result()
-        self._worker.run(lambda mapper: write_keyframes(folder, mapper.keyframes())).result()
+        write_keyframes(folder, keyframes)
         self._worker.write_history(folder).result()
 
     def _send_all(self, uplink: Uplink, request: EndRequest) -> None:

@@ -161,7 +161,9 @@ async def _serve(settings: AgentSettings) -> int:
     with ExitStack() as stack:
         parser = _open_parser(settings, stack)
         uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
-        prior = PriorFrames(None if saved is not None else _open_prior(settings))
+        prior = PriorFrames(None)
+        if saved is None and settings.prior is not None:
+            prior = PriorFrames(PriorRun(SavedMap.read(settings.prior), settings.mission))
         estimators = _estimators(settings, stream, prior)
         worker = MappingWorker(
             settings.mission,
@@ -221,11 +223,6 @@ def _report_source(settings: SourceSettings, source: Source) -> tuple[str, ...]:
     for note in notes:
         _log.warning("%s: %s", settings.spec, note)
     return notes
-
-
-def _open_prior(settings: AgentSettings) -> PriorRun | None:
-    """Read the map of the earlier run; None without one. Raises MapFileError."""
-    return None if settings.prior is None else PriorRun(SavedMap.read(settings.prior), settings.mission)
 
 
 def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: PriorFrames) -> EstimatorFactory:

@@ -39,7 +39,7 @@ from gausslite.wire.convert import (
     live_frame_from_message,
     transform_from_message,
 )
-from gausslite.wire.convert_task import AssignedTask, assigned_from_message, graph_to_message
+from gausslite.wire.convert_task import assigned_from_message, graph_to_message
 from gausslite.wire.map_changes import BLOCK_BYTES, EncodedPart, EncodedPartCache, Parts, encode_parts, follow
 from gausslite.wire.server import Service
 from gausslite.wire.update_sender import UplinkCounters
@@ -96,10 +96,7 @@ class MapChangeLog:
         self._log.record(signatures.keys[changed].tolist(), removed.tolist(), revision)
 
     def since(self, revision: int) -> MapChanges:
-        """Return updates of all voxels that changed after this revision; the whole map for 0.
-
-        Raises RevisionGoneError.
-        """
+        """Return updates of all voxels that changed after a revision; 0: the whole map. Raises RevisionGoneError."""
         return MapChanges(self._roi_only, revision, self.revision, self._batch_since(revision))
 
     def _batch_since(self, revision: int) -> VoxelBatch:
@@ -195,8 +192,11 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
     async def AssignTask(self, request: pb.AssignTaskRequest, _context: Any) -> pb.AssignTaskResponse:  # noqa: N802
         """Assign a task, given as text or as a graph, and what a person points at."""
-        graph = await self._newest_task.assign(lambda: self._mission.assign(self._read_task(request)))
-        return pb.AssignTaskResponse(graph=graph_to_message(graph))
+
+        def assign() -> TaskGraph:
+            return self._mission.assign(assigned_from_message(request, self._parser.parse))
+
+        return pb.AssignTaskResponse(graph=graph_to_message(await self._newest_task.assign(assign)))
 
     async def IngestFrames(  # noqa: N802
         self, request_iterator: AsyncIterator[pb.IngestFramesRequest], _context: Any
@@ -270,9 +270,6 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         blocks = follow(read, self._worker.revision, request.since_revision, self._changes, asyncio.to_thread)
         async for block in blocks:
             yield pb.WatchMapResponse(block=block)
-
-    def _read_task(self, request: pb.AssignTaskRequest) -> AssignedTask:
-        return assigned_from_message(request, self._parser.parse)
 
     async def _read_frames(
         self,

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,25 +59,8 @@ _MAX_KEYFRAMES = 10_000
 _IDLE_ITERATIONS = 64
 
 
-def _read_parser(text: str) -> str:
-    require_callable("parser", text)
-    return text
-
-
-def _read_fusion(text: str) -> str:
-    require_callable("fusion", text)
-    return text
-
-
-def _read_agent_id(text: str) -> str:
-    require_identifier("agent-id", text)
-    return text
-
-
 def _read_mission(text: str) -> str:
-    if text:
-        require_identifier("mission", text)
-    return text
+    return require_identifier("mission", text) if text else text
 
 
 def _keyframes_unless_set(options: argparse.Namespace) -> int:
@@ -101,10 +85,13 @@ class ConnectionSettings:
         None,
         "parser service (default: parse tasks in this process, by rules)",
         metavar="ADDRESS",
-        convert=_read_parser,
+        convert=partial(require_callable, "parser"),
     )
     fusion: str | None = option(
-        None, "fusion server (default: none; nothing is sent)", metavar="ADDRESS", convert=_read_fusion
+        None,
+        "fusion server (default: none; nothing is sent)",
+        metavar="ADDRESS",
+        convert=partial(require_callable, "fusion"),
     )
     mission_id: str = option(
         "", "mission to join (default: the server's)", key="mission", metavar="ID", convert=_read_mission
@@ -159,7 +146,9 @@ class AgentSettings:
     """All settings of one agent. source: the sequence that replaces the camera, None for frames by IngestFrames."""
 
     listen: str = option(AGENT_ADDRESS, "HOST:PORT or unix:PATH", metavar="ADDRESS")
-    agent_id: str = option("agent", "unique name of this agent", metavar="NAME", convert=_read_agent_id)
+    agent_id: str = option(
+        "agent", "unique name of this agent", metavar="NAME", convert=partial(require_identifier, "agent-id")
+    )
     task: str | None = option(None, "the robot's task (default: wait for the AssignTask call)", metavar="TEXT")
     perception: PerceptionSettings
     up_axis: UpAxis | None
@@ -207,12 +196,7 @@ PROGRAM = Program.of(
     *(AgentSettings, TlsFiles),
     flags="listen agent-id task source frames size detector parser fusion out state policy poses max-gaussians "
     "iterations rate exit-when-done frame prior",
-    defaults={
-        "source": None,
-        "keyframes": None,
-        "idle-iterations": None,
-        "save-interval": 60.0,
-    },
+    defaults={"source": None, "keyframes": None, "idle-iterations": None, "save-interval": 60.0},
     computed={"idle-iterations": _idle_iterations_unless_set},
     removed={
         **REMOVED,

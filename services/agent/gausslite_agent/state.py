@@ -58,10 +58,7 @@ class SavedMission:
 
     @classmethod
     def read(cls, path: Path, *settings: Any) -> SavedMission:
-        """Read a saved mission.
-
-        Raises MapFileError if the file is not one, MismatchError if it was saved with other settings.
-        """
+        """Read a saved mission. Raises MapFileError for another file, MismatchError for one of other settings."""
         run = SavedRun.read(path)
         run.require(*settings)
         try:
@@ -355,8 +352,3 @@ class StatusHolder:
         """Count what one mapped frame skipped, detected and re-evaluated."""
         with self._lock:
             self._status = self._status.with_outcome(outcome)
-
-    def add_idle_iteration(self) -> None:
-        """Count one idle iteration."""
-        with self._lock:
-            self._status = replace(self._status, idle_iterations=self._status.idle_iterations + 1)

@@ -36,7 +36,7 @@ class TeamRegion:
         """Return the region of the objects whose noun is a target of the task, with a margin."""
         found = [team_object.landmark for team_object in objects if team_object.landmark.noun in graph.targets]
         boxes = [(landmark.extent_m, graph.targets.index(landmark.noun)) for landmark in found]
-        return cls(tuple(sorted(((_grown(box), target) for box, target in boxes), key=lambda each: each[0].min_m)))
+        return cls(tuple(sorted(((_grown(box), target) for box, target in boxes), key=lambda grown: grown[0].min_m)))
 
     @property
     def bounds(self) -> AxisAlignedBox | None:

@@ -8,9 +8,10 @@ from contextlib import contextmanager
 from itertools import accumulate
 from typing import Any, NamedTuple
 
-from gausslite.domain.errors import InvalidInputError, UnavailableError
+from gausslite.domain.errors import UnavailableError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.traffic import ACKNOWLEDGEMENT_BOUNDS_S, Acknowledgements, AgentContribution, MissionStatus
+from gausslite.process import import_extra
 from gausslite.wire.channel import host_and_port
 
 _log = logging.getLogger(__name__)
@@ -107,24 +108,19 @@ def metrics_server(
 ) -> Iterator[int]:
     """Serve /metrics on HOST:PORT while the context is open, with the figures of the process; gives the actual port.
 
-    engine: returns the mission, or this server's part of it.
-
-    None serves nothing and gives 0. Raises InvalidInputError without prometheus-client or for another address,
-    UnavailableError if the address is in use.
+    engine: returns the mission, or this server's part of it. Without an address nothing is served, and the port is 0.
+    Raises InvalidInputError without prometheus-client or for another address, UnavailableError if it is in use.
     """
     if address is None:
         yield 0
         return
     host, port = host_and_port("--metrics", address)
-    try:
-        from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
-    except ImportError as error:
-        raise InvalidInputError("--metrics: needs prometheus-client; pip install 'gausslite[metrics]'") from error
-    registry = CollectorRegistry()
-    ProcessCollector(registry=registry)
+    prometheus = import_extra("prometheus_client", "metrics", "--metrics")
+    registry = prometheus.CollectorRegistry()
+    prometheus.ProcessCollector(registry=registry)
     registry.register(MissionCollector(engine, acknowledgements, counts))
     try:
-        server, thread = start_http_server(port, host.strip("[]"), registry)
+        server, thread = prometheus.start_http_server(port, host.strip("[]"), registry)
     except OSError as error:
         raise UnavailableError(f"--metrics {address}: {error.strerror or error}; choose another address") from error
     _log.info("metrics on http://%s:%d/metrics", host, server.server_port)

@@ -8,18 +8,18 @@ import dataclasses
 import gc
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
-from gausslite.domain.errors import GaussLiteError, InvalidInputError
+from gausslite.domain.errors import GaussLiteError
 from gausslite.fusion import store_maintenance
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fit_process import FitProcess
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import StoreReport
-from gausslite.process import Sibling, print_message, sibling
+from gausslite.process import Sibling, import_extra, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.process import LogFormat, log_to_stderr, run_service
@@ -42,10 +42,7 @@ _COLLECTION_THRESHOLDS = (2_000, 10, 100)
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run one of MAINTENANCE_COMMANDS and print what it did.
-
-    Returns 0, 1 for damaged rows, or 2 with one line on stderr.
-    """
+    """Run one of MAINTENANCE_COMMANDS, print what it did; return 0, 1 for damaged rows, 2 with one line on stderr."""
     options = parse_maintenance(arguments)
     try:
         return _run(options)
@@ -100,25 +97,14 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return run_service(PROGRAM, serve)
 
 
-@contextlib.contextmanager
-def _extra_needed() -> Iterator[None]:
-    try:
-        # psycopg is an extra
-        yield
-    except ImportError as error:
-        raise InvalidInputError(
-            f"--store {POSTGRES_SCHEME}...: expected the package 'psycopg'; install it with: "
-            "pip install 'gausslite[postgres]'"
-        ) from error
-
-
 def _open_store(settings: ServerSettings) -> FusionStore:
     """Return the store. Raises InvalidInputError, StorageError."""
     if settings.store is None:
         return MemoryStore()
     if isinstance(settings.store, str):
-        with _extra_needed():
-            from gausslite.fusion.postgres_store import PostgresStore
+        import_extra("psycopg", "postgres", f"--store {POSTGRES_SCHEME}...")
+        from gausslite.fusion.postgres_store import PostgresStore
+
         return PostgresStore(settings.store)
     return SqliteStore(settings.store, settings.store_max_bytes)
 
@@ -169,8 +155,9 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
 
 async def _serve_share(settings: ServerSettings, peer_address: str) -> None:
     """Serve a part of a mission, together with the other servers of the database."""
-    with _extra_needed():
-        from gausslite_fusion_server.shared_servicer import open_share
+    import_extra("psycopg", "postgres", f"--store {POSTGRES_SCHEME}...")
+    from gausslite_fusion_server.shared_servicer import open_share
+
     async with open_share(settings, peer_address) as share:
         metrics = metrics_server(settings.metrics, share.engine, share.sender.acknowledgements, share.counts)
         with metrics, _page(settings):

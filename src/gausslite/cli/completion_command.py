@@ -6,12 +6,11 @@ import argparse
 import importlib
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 from gausslite.cli.main import build_parser
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.values import read_path
-from gausslite.domain.errors import InvalidInputError
+from gausslite.process import import_extra
 
 _SHELLS = ("bash", "zsh", "fish")
 _GAUSSLITE = "gausslite"
@@ -39,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the script. Returns the exit code. Raises InvalidInputError if shtab is not installed."""
-    shtab = _import_shtab()
+    shtab = import_extra("shtab", "completion", "completion")
     parser = _parser_of(options.program)
     for action in _actions(parser):
         if action.type in (Path, read_path) or action.metavar in _FILE_METAVARS:
@@ -55,16 +54,6 @@ def _parser_of(program: str) -> CommandParser:
     module, function = _SERVICES[program]
     parser: CommandParser = getattr(importlib.import_module(module), function)()
     return parser
-
-
-def _import_shtab() -> ModuleType:
-    try:
-        import shtab
-    except ImportError:
-        raise InvalidInputError(
-            "completion: expected the package 'shtab'; install it with: pip install 'gausslite[completion]'"
-        ) from None
-    return shtab
 
 
 def _actions(parser: CommandParser) -> Iterator[argparse.Action]:

@@ -35,12 +35,7 @@ from gausslite.config.values import VOXEL_SIZE, read_text
 from gausslite.datasets.open import default_world_frame
 from gausslite.domain.checks import require_name
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.evaluation.compare import (
-    MAP_PURPOSES,
-    TeamScores,
-    score_team,
-    team_sentence,
-)
+from gausslite.evaluation.compare import MAP_PURPOSES, TeamScores, score_team, team_sentence
 from gausslite.evaluation.views import HeldOutView, view_maps
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import open_models
@@ -139,9 +134,7 @@ class DemoOptions:
     frames_a: str | None = option(None, "frames of agent-a (default: the first half)", metavar="START:STOP:STEP")
     frames_b: str | None = option(None, "frames of agent-b (default: the second half)", metavar="START:STOP:STEP")
     objects: tuple[str, ...] = option(
-        (),
-        "objects whose region of interest (ROI) is scored (default: the tasks' targets)",
-        metavar="A,B",
+        (), "objects whose region of interest (ROI) is scored (default: the tasks' targets)", metavar="A,B"
     )
     size: str | None = option(None, f"image size (default: the recorded size; {HOME_SIZE} in the home)", metavar="WxH")
     voxel_size: VoxelGrid = option(VoxelGrid(), "edge of the fusion's voxels", **VOXEL_SIZE)
@@ -182,13 +175,8 @@ def run(options: argparse.Namespace) -> int:
         require_no_demo(options.out)
     require_writable(options.out)
     scenario = simulated_scenario(options) if options.source is None else recorded_scenario(options)
-    plan = DemoPlan(
-        scenario.agents,
-        _shared_agent_options(options, scenario),
-        options.voxel_size.size_m,
-        options.refine_iterations,
-        options.seed,
-    )
+    shared = _shared_agent_options(options, scenario)
+    plan = DemoPlan(scenario.agents, shared, options.voxel_size.size_m, options.refine_iterations, options.seed)
     remove_results(options.out)
     with running_services(plan, options.out.absolute()) as services:
         with _page(options, services.fusion_address):

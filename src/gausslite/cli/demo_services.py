@@ -16,15 +16,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 
 from gausslite.cli.progress import MappingBar, progress_bar
-from gausslite.cli.source_options import (
-    calibrate_with_messages,
-    open_recorded,
-    report_region_file,
-    stated_values,
-)
+from gausslite.cli.source_options import calibrate_with_messages, open_recorded, report_region_file, stated_values
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import Plain, to_toml
 from gausslite.config.program import without_options
@@ -135,10 +129,7 @@ def simulated_scenario(options: argparse.Namespace) -> Scenario:
 
 
 def recorded_scenario(options: argparse.Namespace) -> Scenario:
-    """Return the two halves of one sequence; every eighth frame of each is held out.
-
-    Raises DatasetError, InvalidInputError.
-    """
+    """Return the halves of one sequence; every eighth frame is held out. Raises DatasetError, InvalidInputError."""
     recorded = open_recorded(options.source, None)
     middle = recorded.indices()[len(recorded) // 2]
     first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
@@ -208,11 +199,6 @@ class ServiceProcess:
         if code not in (None, 0):
             raise UnavailableError(f"{self.name} ended with code {code}: {self.last_line()} (see {self.log})")
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait until the process ends, at most this long."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(timeout_s)
-
     def last_line(self) -> str:
         """Return the last line of the log."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
@@ -251,9 +237,7 @@ class ProcessGroup:
             self.services.append(service)
         return service
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         running = [service.process for service in reversed(self.services) if service.process.poll() is None]
         deadline = time.monotonic() + _TERMINATION_TIMEOUT_S
         try:
@@ -399,7 +383,8 @@ def _failure_from_log(service: ServiceProcess) -> Iterator[None]:
     try:
         yield
     except UnavailableError:
-        service.wait(_END_TIMEOUT_S)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            service.process.wait(_END_TIMEOUT_S)
         service.require_alive()
         raise
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -138,15 +139,11 @@ _SERVICES = {
 
 def machine_checks(out: Path) -> Iterator[Check]:
     """Yield the checks of the machine. out: the folder in which runs write; it need not exist."""
-    yield _python()
+    yield Check("python", "ok", f"{sys.version.split()[0]} at {sys.executable}")
     yield _memory()
     yield from _disk_and_clock(_existing(out))
     for program, address in _SERVICES.items():
         yield _port(program, address)
-
-
-def _python() -> Check:
-    return Check("python", "ok", f"{sys.version.split()[0]} at {sys.executable}")
 
 
 def _memory() -> Check:
@@ -262,7 +259,8 @@ def rasterizer_checks() -> Iterator[Check]:
     yield _instruction_sets()
     yield _threads()
     yield _gpu()
-    yield _torch()
+    torch = _installed_version(Requirement("torch"))
+    yield Check("torch", "ok", torch or "not installed; only the backends cuda and reference need it")
     yield _backend()
 
 
@@ -304,13 +302,6 @@ def _gpu() -> Check:
     return Check("gpu", "ok", "no NVIDIA GPU; none is needed")
 
 
-def _torch() -> Check:
-    try:
-        return Check("torch", "ok", version("torch"))
-    except PackageNotFoundError:
-        return Check("torch", "ok", "not installed; only the backends cuda and reference need it")
-
-
 def _backend() -> Check:
     try:
         rasterizer, reason = choose_with_reason()
@@ -332,7 +323,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Print the checks. Returns 1 if one is an error, else 0."""
     checks = []
-    for check in _all_checks(options):
+    parts = machine_checks(options.out), rasterizer_checks(), model_checks(options.folder), extra_checks()
+    for check in chain(*parts):
         checks.append(check)
         if not options.json:
             print(printable(check.line()), flush=True)
@@ -340,10 +332,3 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"ok": not has_error, "checks": [asdict(check) for check in checks]}))
     return int(has_error)
-
-
-def _all_checks(options: argparse.Namespace) -> Iterator[Check]:
-    yield from machine_checks(options.out)
-    yield from rasterizer_checks()
-    yield from model_checks(options.folder)
-    yield from extra_checks()

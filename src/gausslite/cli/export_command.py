@@ -31,24 +31,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=formats)
     add("--out", metavar="FILE", type=Path, help="the file to write (default: RUN/map with the format's suffix)")
     add("--region", choices=("roi", "all"), help="only the task's region, or all (default: depends on the format)")
-    add(
-        "--voxel",
-        metavar="M",
-        type=bounded(float, 0.001, 10),
-        help="voxel size in metres (default: 0.05; mesh: 0.01)",
-    )
-    add(
-        "--min-opacity",
-        metavar="A",
-        type=bounded(float, 0, 1),
-        help=f"for octomap and nav2 (default: {_MIN_OPACITY:g})",
-    )
-    add(
-        "--seconds",
-        metavar="S",
-        type=bounded(float, 0.1, 600),
-        help=f"length of a video (default: {_VIDEO_S:g})",
-    )
+    voxel_help = f"voxel size in metres (default: {_OCCUPANCY_VOXEL_M:g}; mesh: {_MESH_VOXEL_M:g})"
+    add("--voxel", metavar="M", type=bounded(float, 0.001, 10), help=voxel_help)
+    opacity_help = f"for octomap and nav2 (default: {_MIN_OPACITY:g})"
+    add("--min-opacity", metavar="A", type=bounded(float, 0, 1), help=opacity_help)
+    add("--seconds", metavar="S", type=bounded(float, 0.1, 600), help=f"length of a video (default: {_VIDEO_S:g})")
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)

@@ -40,8 +40,7 @@ def run(options: argparse.Namespace) -> int:
     """Fuse and write the maps; if scores are equal, the map given first wins. Returns the exit code."""
     if len(options.maps) < 2:
         raise InvalidInputError(f"maps: expected at least two files to fuse, got {len(options.maps)}")
-    _require_separate_output(options.maps, options.out)
-    _require_different_files(options.maps)
+    _require_separate(options.maps, options.out)
     frames = {path: read_world_frame(path) for path in options.maps}
     world_frame = _common_world_frame(frames)
     prepare_file(options.out.absolute(), MAP_FILE)
@@ -60,20 +59,16 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _require_different_files(maps: Sequence[Path]) -> None:
-    """Raise InvalidInputError if two inputs are the same file, also through a link or another path."""
+def _require_separate(maps: Sequence[Path], out: Path) -> None:
+    """Raise InvalidInputError if two inputs are one file, or one is the output, also through a link or other path."""
+    for path in maps:
+        if _is_same_file(path, out):
+            raise InvalidInputError(f"--out {out}: expected a file that is not an input, got the input {path}")
     for first, second in itertools.combinations(maps, 2):
         if _is_same_file(first, second):
             raise InvalidInputError(
                 f"maps: expected different files, got {first} and {second}, which are the same file"
             )
-
-
-def _require_separate_output(maps: Sequence[Path], out: Path) -> None:
-    """Raise InvalidInputError if the output file is one of the inputs, also through a link or another path."""
-    for path in maps:
-        if _is_same_file(path, out):
-            raise InvalidInputError(f"--out {out}: expected a file that is not an input, got the input {path}")
 
 
 def _is_same_file(a: Path, b: Path) -> bool:

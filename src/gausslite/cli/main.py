@@ -34,7 +34,7 @@ SUMMARIES = {
     "evict": "delete the data of an agent from a fusion server, and keep it out on request",
     "unban": "let a banned agent join a fusion server again",
     "objects": "print where objects are, or which ones a question means, from a fusion server or the results of a run",
-    "models": "list, download, verify and inspect model files for detection and segmentation",
+    "models": "list the model files for detection and segmentation, print how each is made, and inspect one",
     "completion": "print the completion of commands and options for a shell",
     "doctor": "check the machine and the installation: CPU, GPU, memory, disk, clock, ports, models, extras",
     "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",

@@ -76,10 +76,7 @@ class RecordingOptions:
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True) -> Source:
-    """Open a sequence without registration; report the topics of a bag, and the source's notes.
-
-    Raises DatasetError, InvalidInputError.
-    """
+    """Open a sequence as recorded; report a bag's topics and all notes. Raises DatasetError, InvalidInputError."""
     source = open_source(spec, up_axis, require_poses=require_poses)
     if isinstance(source, sibling(Sibling.BAGS).BagSource):
         print_message(f"{spec}: {source.description}")

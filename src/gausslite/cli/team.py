@@ -28,11 +28,6 @@ def add_address(parser: CommandParser, service: str) -> None:
     add_flags(parser, TlsFiles)
 
 
-def add_json(parser: CommandParser) -> None:
-    """Add --json."""
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
-
-
 def fusion_client(options: argparse.Namespace) -> FusionClient:
     """Return a client of the fusion server at the address. Raises InvalidInputError."""
     require_callable("address of the fusion server", options.address)
@@ -196,7 +191,7 @@ _STATE_PREFIX = "AGENT_STATE_"
 def configure_status(parser: CommandParser) -> None:
     """Add the options of `gausslite status`."""
     add_address(parser, "an agent or a fusion server")
-    add_json(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run_status)
 
 

@@ -59,13 +59,14 @@ def require_name(field: str, name: str) -> None:
         raise InvalidInputError(f"{field}: expected no line breaks or control characters, got {quote_name(name)}")
 
 
-def require_identifier(field: str, name: str) -> None:
-    """Raise InvalidInputError unless the name is safe in logs, file names, labels and shells; empty is refused."""
+def require_identifier(field: str, name: str) -> str:
+    """Return the name. Raises InvalidInputError if it is empty or not safe in logs, file names, labels and shells."""
     if not _IDENTIFIER.fullmatch(name):
         raise InvalidInputError(
             f"{field}: expected 1 to {MAX_IDENTIFIER_CHARACTERS} letters, digits and . _ -, beginning with a letter or "
             f"a digit, got {quote_name(name)}"
         )
+    return name
 
 
 def quote_name(name: str) -> str:

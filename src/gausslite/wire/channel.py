@@ -108,10 +108,7 @@ KEEPALIVE_S = 15.0
 
 
 def connection_options(keepalive_s: float) -> tuple[tuple[str, int], ...]:
-    """Return the gRPC options of either end.
-
-    Without pings, a watcher that only receives would not notice a lost network.
-    """
+    """Return the gRPC options of either end; without pings, a watcher would not notice a lost network."""
     return (
         ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
         ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
@@ -135,6 +132,8 @@ _RETRY_POLICY = {
     "backoffMultiplier": 2,
     "retryableStatusCodes": ["UNAVAILABLE"],
 }
+_METHODS = [{"service": service, "method": name} for service, names in _RETRIED_METHODS.items() for name in names]
+_SERVICE_CONFIG = json.dumps({"methodConfig": [{"name": _METHODS, "retryPolicy": _RETRY_POLICY}]})
 _Client = TypeVar("_Client", bound="ServiceChannel")
 _Response = TypeVar("_Response")
 
@@ -155,12 +154,8 @@ class ServiceChannel:
         self.address = address
         self._closed = False
         self._deadline_s, self._tls = deadline_s, tls
-        methods = [
-            {"service": service, "method": name} for service, names in _RETRIED_METHODS.items() for name in names
-        ]
-        config = {"methodConfig": [{"name": methods, "retryPolicy": _RETRY_POLICY}]}
         options = (
-            ("grpc.service_config", json.dumps(config)),
+            ("grpc.service_config", _SERVICE_CONFIG),
             *connection_options(self.keepalive_s),
             ("grpc.max_reconnect_backoff_ms", 2000),
         )
@@ -269,10 +264,7 @@ def require_serving(address: str, tls: Tls | None) -> None:
 
 
 def is_agent(address: str, tls: Tls | None) -> bool:
-    """Return True for an agent's address, False for a fusion server's.
-
-    Raises UnavailableError, InvalidInputError if it is neither.
-    """
+    """Return True for an agent's address, False for a fusion server's. Raises UnavailableError, InvalidInputError."""
     require_callable("address", address)
     for name in ("Agent", "Fusion"):
         if _status(address, f"gausslite.v1.{name}Service", tls) == _SERVING:

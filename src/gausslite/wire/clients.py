@@ -45,8 +45,6 @@ _WATCH_LIMITS = CodecLimits(max_bytes=MAX_MESSAGE_BYTES, max_voxels=2_000_000, m
 
 FrameOutcome = agent_pb.FrameOutcome
 """Names the outcomes of `AgentClient.ingest`: `FrameOutcome.Name(result.outcome)`."""
-
-
 Session = pb.JoinSessionResponse
 """The fusion server's answer to a joining agent."""
 

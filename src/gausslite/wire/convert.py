@@ -247,10 +247,7 @@ def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False
 
 
 def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
-    """Decode a frame whose images have the camera's size and no lens distortion.
-
-    Raises InvalidInputError and subclasses.
-    """
+    """Decode a frame without lens distortion, whose images have the camera's size. Raises InvalidInputError."""
     if message.HasField("lens"):
         raise InvalidInputError("frame lens: expected an undistorted image; only an agent's IngestFrames takes a lens")
     return _decode_images(message)
@@ -319,10 +316,7 @@ def box_from_message(message: geometry_pb2.Box) -> AxisAlignedBox:
 
 
 def map_update_from_message(message: gaussians_pb2.MapBlock, limits: CodecLimits, first: bool) -> MapUpdate:
-    """Decode a block of a map; `first` marks the first block of a revision.
-
-    Raises CodecError, ChecksumError, InvalidInputError.
-    """
+    """Decode a block of a map; first: of its revision. Raises CodecError, ChecksumError, InvalidInputError."""
     batch, grid = None, None
     if message.subset:
         subset, grid = decode_subset(message.subset, limits)

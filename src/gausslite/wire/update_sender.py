@@ -160,10 +160,7 @@ class UpdateSender:
         return list(self._requests(due, session, sent)), sent
 
     def send(self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, SentPart]) -> None:
-        """Send the messages on one stream and handle their outcomes.
-
-        Raises the last error that needs a retry, UnavailableError.
-        """
+        """Send the messages on one stream and handle their outcomes. Raises the last error that needs a retry."""
         error_to_retry: GaussLiteError | None = None
         try:
             for response in self._client.contribute(requests, self._deadline_s):

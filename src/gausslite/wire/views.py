@@ -180,16 +180,15 @@ def stored_keyframe_from_message(message: pb.GetKeyframeResponse) -> StoredKeyfr
     """Decode a keyframe; None if the server has none of the agent. Raises InvalidInputError, PoseError."""
     if not message.colour:
         return None
-    camera = convert.camera_from_message(message.camera)
-    has_pose = message.HasField("t_world_camera")
+    camera, pose = convert.camera_from_message(message.camera), None
+    if message.HasField("t_world_camera"):
+        pose = convert.transform_from_message("keyframe t_world_camera", message.t_world_camera)
     return StoredKeyframe(
         index=message.index,
         capture_time_ns=message.capture_time_ns,
         rgb=convert.decode_colour(message.colour, camera.width_px, camera.height_px),
         camera=camera,
-        T_world_camera=convert.transform_from_message("keyframe t_world_camera", message.t_world_camera)
-        if has_pose
-        else None,
+        T_world_camera=pose,
         indices=tuple(message.indices),
         roi=region_from_png(message.region_png, camera),
     )
