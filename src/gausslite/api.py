@@ -91,10 +91,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class CalibratedSequence:
-    """A sequence with registered depth, and the pose and exposure errors that mapping should correct.
-
-    notes: one line per estimate, for the operator.
-    """
+    """A sequence with registered depth, the pose and exposure errors to correct, and a line for each estimate."""
 
     source: Source
     pose_prior: PoseExposurePrior
@@ -193,10 +190,7 @@ def _require_regions(regions: object) -> list[Region]:
 
 
 def _without_task(settings: MissionSettings) -> MissionSettings:
-    """Return settings for a mission without a task; the default policy becomes "uniform".
-
-    Raises InvalidInputError for other policies that follow a task.
-    """
+    """Return settings without a task: the default policy becomes "uniform". Raises InvalidInputError for others."""
     if not settings.follows_task:
         return settings
     if settings.policy != default_policy(has_roi=True):

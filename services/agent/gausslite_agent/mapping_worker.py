@@ -177,10 +177,7 @@ class MappingWorker:
         return self._submit(lambda: None if self._task_mapper is None else self._task_mapper.camera_view())
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
-        """Queue a frame and return the future of its report.
-
-        Raises MismatchError if there is no task yet, UnavailableError after `close`.
-        """
+        """Queue a frame; return the future of its report. Raises MismatchError without a task, UnavailableError."""
         if self.status().graph is None:
             raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
         queued = QueuedFrame(frame, self._clock())
@@ -290,10 +287,7 @@ class MappingWorker:
         self._on_change()
 
     def _voxels_to_send(self, gaussians: Gaussians, purpose: Purpose | None = None) -> VoxelBatch:
-        """Return updates of these Gaussians' voxels, and tombstones of the voxels sent for this purpose beyond them.
-
-        Raises StorageError.
-        """
+        """Return updates of these voxels, and tombstones of others sent for this purpose. Raises StorageError."""
         batch = self._sent_voxels.exclude_frozen(group_by_voxel(gaussians, self.grid))
         if self.uplink is None:
             return batch

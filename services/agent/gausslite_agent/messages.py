@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.convert import encode_colour, encode_depth, transform_to_message
+from gausslite.wire.convert import encode_colour, encode_depth, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
 from gausslite.wire.update_sender import UplinkCounters
 from gausslite_agent.mission import AgentMission
@@ -35,13 +35,8 @@ _OUTCOMES = {
 def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:
     """Encode the outcome of one frame."""
     return pb.IngestFramesResponse(
-        index=report.index,
+        **values_of(report, ("index", "reason", "iterations", "gaussians", "roi_share", "seconds")),
         outcome=_OUTCOMES[report.outcome],
-        reason=report.reason,
-        iterations=report.iterations,
-        gaussians=report.gaussians,
-        roi_share=report.roi_share,
-        seconds=report.seconds,
         age_seconds=report.age_s,
     )
 
@@ -67,26 +62,9 @@ def status_to_message(
         agent_id=agent_id,
         state=_STATES[mission.state],
         graph=None if status.graph is None else graph_to_message(status.graph),
-        map_revision=status.map_revision,
-        gaussians=status.gaussians,
-        frames_mapped=status.mapped,
-        frames_skipped=status.skipped,
-        frames_dropped=status.dropped,
-        frames_rejected=status.rejected,
-        hz=status.hz,
-        roi_share=status.roi_share,
-        uplink=pb.UplinkStatus(
-            connected=uplink.connected,
-            stopped_because=uplink.stopped_because,
-            bytes_sent=uplink.bytes_sent,
-            gaussians_sent=uplink.gaussians_sent,
-            voxels_sent=uplink.voxels_sent,
-            voxels_waiting=uplink.voxels_waiting,
-            subsets_rejected=uplink.subsets_rejected,
-            keyframes_sent=uplink.keyframes_sent,
-            keyframes_waiting=uplink.keyframes_waiting,
-            keyframe_bytes=uplink.keyframe_bytes,
-        ),
+        **values_of(status, ("map_revision", "gaussians", "hz", "roi_share")),
+        **{f"frames_{outcome}": getattr(status, outcome) for outcome in ("mapped", "skipped", "dropped", "rejected")},
+        uplink=pb.UplinkStatus(**values_of(uplink, pb.UplinkStatus.DESCRIPTOR.fields_by_name)),
         age_p50_seconds=status.age_s(50),
         age_p99_seconds=status.age_s(99),
         map_to_odom=_correction_to_message(status),

@@ -19,6 +19,7 @@ from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
 from gausslite.task.grounding import TaskParser
+from gausslite.wire.convert import values_of
 from gausslite.wire.convert_task import AssignedTask
 from gausslite.wire.spool import Purpose
 from gausslite.wire.update_sender import UplinkCounters
@@ -33,6 +34,11 @@ from gausslite_agent.state import (
     MissionStateMachine,
     MissionSummary,
     WorkerStatus,
+)
+
+_OF_UPLINK = (
+    *("handover_bytes", "keyframe_bytes", "keyframes_sent", "keyframes_waiting", "gaussians_sent"),
+    *("voxels_sent", "subsets_sent", "subsets_rejected", "voxels_waiting"),
 )
 
 
@@ -66,15 +72,7 @@ def mission_report(
         "active_gaussians": active,
         "roi_share": status.roi_share,
         "bytes_sent": uplink.roi_bytes,
-        "handover_bytes": uplink.handover_bytes,
-        "keyframe_bytes": uplink.keyframe_bytes,
-        "keyframes_sent": uplink.keyframes_sent,
-        "keyframes_waiting": uplink.keyframes_waiting,
-        "gaussians_sent": uplink.gaussians_sent,
-        "voxels_sent": uplink.voxels_sent,
-        "subsets_sent": uplink.subsets_sent,
-        "subsets_rejected": uplink.subsets_rejected,
-        "voxels_waiting": uplink.voxels_waiting,
+        **values_of(uplink, _OF_UPLINK),
         "uplink_stopped_because": uplink.stopped_because,
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),

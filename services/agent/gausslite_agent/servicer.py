@@ -141,10 +141,7 @@ _OUTCOMES_AHEAD = 16
 
 
 class NewestTask:
-    """Assigns one task at a time on a thread of its own; of the calls that wait, a newer one supersedes the older.
-
-    Use it on the event loop.
-    """
+    """Assigns one task at a time, in a thread; of calls that wait, the newest counts. Use it on the event loop."""
 
     def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1, "task")

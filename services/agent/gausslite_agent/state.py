@@ -129,10 +129,7 @@ class MissionSummary:
 
 
 class MissionState(Enum):
-    """State of a mission.
-
-    DRAINING sends the pending updates of the task's region and the pending keyframes, HANDING_OVER the rest of the map.
-    """
+    """State of a mission. DRAINING sends the region's updates and the keyframes, HANDING_OVER the rest of the map."""
 
     WAITING_FOR_TASK = "waiting for task"
     MAPPING = "mapping"

@@ -43,9 +43,7 @@ class TeamRegion:
         """The box around all boxes; None without any."""
         if not self.boxes:
             return None
-        low_x, low_y, low_z = np.min([box.min_m for box, _ in self.boxes], axis=0).tolist()
-        high_x, high_y, high_z = np.max([box.max_m for box, _ in self.boxes], axis=0).tolist()
-        return AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z))
+        return AxisAlignedBox.around(np.array([corner for box, _ in self.boxes for corner in (box.min_m, box.max_m)]))
 
     def select(self, batch: VoxelBatch, grid: VoxelGrid) -> VoxelBatch:
         """Return the voxels of the region; their Gaussians are active for the target in whose box the voxel is."""
@@ -61,8 +59,7 @@ class TeamRegion:
 
 
 def _grown(box: AxisAlignedBox) -> AxisAlignedBox:
-    low, high = (np.array(corner) + side * _MARGIN_M for corner, side in ((box.min_m, -1), (box.max_m, 1)))
-    return AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    return AxisAlignedBox.around(np.array([np.array(box.min_m) - _MARGIN_M, np.array(box.max_m) + _MARGIN_M]))
 
 
 _log = logging.getLogger(__name__)

@@ -79,10 +79,7 @@ def _print(options: MaintenanceSettings, text: str, values: dict[str, object]) -
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Serve until a signal arrives, or run a maintenance command.
-
-    Returns the exit code: 0, or 2 with one line on stderr if the server fails.
-    """
+    """Serve until a signal arrives, or run a maintenance command; return 0, or 2 with one line on stderr."""
     given = sys.argv[1:] if arguments is None else arguments
     if given and given[0] in MAINTENANCE_COMMANDS:
         return run_command(given)

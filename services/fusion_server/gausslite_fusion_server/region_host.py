@@ -31,10 +31,7 @@ _Value = TypeVar("_Value")
 
 
 class RegionHost:
-    """Owns the slots and the open engine with its servicer. Use it on the event loop.
-
-    create_servicer: serves an engine that has just been opened.
-    """
+    """Owns the slots and the open engine, served by what create_servicer returns. Use it on the event loop."""
 
     def __init__(
         self, slots: SharedSlots, settings: FusionSettings, create_servicer: Callable[[FusionEngine], FusionServicer]

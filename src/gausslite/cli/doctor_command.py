@@ -227,10 +227,7 @@ def _level(amount: float, low: float, too_low: float) -> Status:
 
 
 def model_checks(folder: Path) -> Iterator[Check]:
-    """Yield one check for each model file in the folder, or one that there is none.
-
-    Files in ONNX format are read completely and opened by ONNX Runtime.
-    """
+    """Yield a check for each model file in the folder, ONNX files read completely and opened, or one for none."""
     present = [entry for entry in CATALOGUE if (folder / entry.file_name).exists()]
     for entry in present:
         yield _model(entry, folder / entry.file_name)

@@ -161,10 +161,7 @@ def mission_settings(options: argparse.Namespace) -> MissionSettings:
 
 
 def parse_task(options: argparse.Namespace) -> TaskGraph | None:
-    """Return the task of the options; None for regions of space, and for a uniform map.
-
-    Raises InvalidInputError for options that contradict each other, TaskError.
-    """
+    """Return the task; None for regions and a uniform map. Raises InvalidInputError for a contradiction, TaskError."""
     regions = has_regions(options)
     if options.task is not None and regions:
         raise InvalidInputError("--task: give either a task, or regions with --roi, --objects or target-at, not both")

@@ -61,10 +61,7 @@ def configure_end(parser: CommandParser) -> None:
 
 
 def run_end(options: argparse.Namespace) -> int:
-    """End the mission and print what was sent and left. Returns 0 if nothing was left, 1 otherwise.
-
-    Raises MismatchError before the first task, UnavailableError.
-    """
+    """End the mission and print what was sent and left. Returns 1 if something was left. Raises GaussLiteError."""
     with agent_client(options) as client:
         response = client.end_mission(options.handover, options.drain_timeout)
     print(response.summary)
@@ -99,11 +96,7 @@ def configure_unban(parser: CommandParser) -> None:
 
 
 def run_unban(options: argparse.Namespace) -> int:
-    """Lift the ban. Returns the exit code.
-
-    Raises InvalidInputError if the agent is not banned, NotPermittedError unless the caller is an operator,
-    UnavailableError.
-    """
+    """Lift the ban. Returns the exit code. Raises InvalidInputError if there is none, NotPermittedError."""
     require_identifier("AGENT", options.agent)
     with fusion_client(options) as client:
         client.unban(options.agent)

@@ -52,10 +52,7 @@ _PRINTABLE = "".join(chr(code) for code in range(0x20, 0x7F) if chr(code) != "%"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredMap:
-    """The content of a PLY file.
-
-    left_out: why rows are left out, in words, and how many; both are empty for a whole file.
-    """
+    """The content of a PLY file. left_out: how many rows are left out, and why in words; empty for a whole file."""
 
     gaussians: Gaussians
     world_frame: str

@@ -26,10 +26,7 @@ _FILE = "keyframes.json"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeView:
-    """One keyframe's camera in its refined pose, without the images.
-
-    index: the frame's index in its sequence. roi_pixels: number of pixels in the task's region.
-    """
+    """A keyframe's camera in its refined pose, with its index in the sequence and the pixels of the task's region."""
 
     index: int
     capture_time_ns: int
@@ -54,10 +51,7 @@ def write_keyframe_views(folder: Path, views: Sequence[KeyframeView]) -> None:
 
 
 def read_keyframe_views(folder: Path) -> list[KeyframeView]:
-    """Read keyframes.json, oldest keyframe first; an empty list if the folder has none.
-
-    Raises MapFileError if the file is not one that `write_keyframe_views` writes.
-    """
+    """Read keyframes.json, oldest first; empty without it. Raises MapFileError for another file of this name."""
     path = folder / _FILE
     if not path.exists():
         return []

@@ -30,10 +30,7 @@ def split_names(text: str) -> tuple[str, ...]:
 
 
 def read_plain(kind: Any, value: object, *, is_toml: bool = False) -> Any:
-    """Return the value of a type from text or, with is_toml, from a value of TOML.
-
-    Raises InvalidInputError with what was expected; the caller adds the name.
-    """
+    """Return a value from text or, with is_toml, from TOML. Raises InvalidInputError without the option's name."""
     if kind is bool:
         return _read_bool(value, is_toml)
     if kind in (int, float):

@@ -255,10 +255,7 @@ class Program:
             parser.error(f"the following arguments are required: {', '.join(missing)}")
 
     def _require_effect(self, options: Namespace, given: _Layer) -> None:
-        """Raise InvalidInputError for an option that has no effect without another one.
-
-        The default itself is accepted, because --print-config prints it.
-        """
+        """Raise InvalidInputError for an option, not at its default, without effect beside the others."""
         for key, source in given.items():
             declared = self.options[key]
             needed, _, values = declared.option.needs.partition("=")

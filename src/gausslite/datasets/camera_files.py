@@ -125,10 +125,7 @@ def read_json_camera(path: Path) -> FolderCamera:
 
 
 def read_camera_info(path: Path) -> FolderCamera:
-    """Return the camera of a ROS camera_info file (YAML): image_width, camera_matrix, distortion_coefficients.
-
-    Raises DatasetError.
-    """
+    """Return the camera of a ROS camera_info file (YAML). Raises DatasetError."""
     import yaml
 
     try:

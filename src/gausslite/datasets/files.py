@@ -39,10 +39,7 @@ class DepthUnits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdImage:
-    """A colour and a depth image of the same size, with the camera for this size.
-
-    recorded_rgb: the colour image before it was made smaller, see Frame.
-    """
+    """A colour and a depth image of one size, with their camera; recorded_rgb: as in Frame."""
 
     rgb: UInt8[ndarray, "h w 3"]
     depth_m: Float32[ndarray, "h w"]
@@ -97,10 +94,7 @@ def first_readable_size(paths: Iterable[Path]) -> tuple[int, int]:
 
 
 def read_depth(path: Path, units: DepthUnits) -> Float32[ndarray, "h w"]:
-    """Return depth in metres, 0 if invalid, of a 16-bit image or of a .npy file of float32 in the same units.
-
-    Raises DatasetError with the file name.
-    """
+    """Return depth in metres, 0 if invalid, of a 16-bit image or a float32 .npy in these units. Raises DatasetError."""
     if path.suffix == ".npy":
         depth_m = (_read_npy(path) / np.float32(units.per_metre)).astype(np.float32, copy=False)
         depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
@@ -242,10 +236,7 @@ _SEPARATORS = re.compile(r"[\s,;\"']+")
 
 
 def read_text(path: Path) -> str:
-    """Return the whole file without a byte-order mark: UTF-8, UTF-16 with a mark (PowerShell), or else Latin-1.
-
-    Raises DatasetError if it is missing or not text.
-    """
+    """Return the text of UTF-8, of UTF-16 with a mark (PowerShell), or else of Latin-1. Raises DatasetError."""
     try:
         data = path.read_bytes()
         if data.startswith(_GZIP):

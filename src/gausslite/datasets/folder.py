@@ -262,10 +262,7 @@ class FolderSource:
 
 
 class NumberedFolderSource(FolderSource, ABC):
-    """A folder whose image files are numbered, with times at 30 Hz.
-
-    Frames without a pose are excluded if poses are required; otherwise they have the identity.
-    """
+    """Numbered image files at 30 Hz. Frames without a pose are excluded, or have the identity if none is required."""
 
     _colours: dict[int, Path]
     _numbers: list[int]

@@ -119,10 +119,7 @@ def _project_image(
     colour_camera: Camera,
     T_colour_depth: Float64[ndarray, "4 4"],
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """Return column, row and depth of each depth pixel's centre in the colour camera.
-
-    The depth is infinite without a reading and for points behind the colour camera.
-    """
+    """Return column, row and depth of each depth pixel in the colour camera; infinite depth without a reading."""
     # separate coordinate planes are three times faster than an array of points
     height, width = depth_m.shape
     slopes = depth_camera.slopes((np.arange(width) + 0.5)[None, :], (np.arange(height) + 0.5)[:, None])

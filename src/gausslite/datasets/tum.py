@@ -185,10 +185,7 @@ def _file_name(folder: Path, text: str) -> str | None:
 
 
 def _read_poses(path: Path, required: bool) -> PoseTrack | None:
-    """Return the poses of rows of: time tx ty tz qx qy qz qw. Raises DatasetError, PoseError.
-
-    Returns None for fewer than two poses that are not required.
-    """
+    """Return the poses, None for fewer than two that are not required. Raises DatasetError, PoseError."""
     rows = read_rows(path)
     meaning = "time tx ty tz qx qy qz qw"
     table = np.array([parse_numbers(location, fields, 8, meaning) for location, fields in rows])

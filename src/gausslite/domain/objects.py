@@ -6,7 +6,7 @@ import functools
 import math
 import tomllib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from importlib import resources
 from typing import Any
@@ -20,7 +20,7 @@ from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.nouns import are_one_kind, is_thing, kinds_among, nearest_above, synonymous_classes
-from gausslite.domain.pose import UpAxis
+from gausslite.domain.pose import UpAxis, transform_points
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
 
@@ -277,6 +277,12 @@ class ObjectLandmark:
         low, high = self.extent_m.min_m, self.extent_m.max_m
         return high[0] - low[0], high[1] - low[1], high[2] - low[2]
 
+    def moved(self, T: Float64[ndarray, "4 4"]) -> ObjectLandmark:
+        """Return the landmark after a rigid motion; its box contains the moved box. Raises InvalidInputError."""
+        points_m = transform_points(T, np.vstack([self.corners_m, self.centroid_m]))
+        x, y, z = points_m[-1].tolist()
+        return replace(self, centroid_m=(x, y, z), extent_m=AxisAlignedBox.around(points_m[:-1]))
+
     def distance_m(self, point_m: Iterable[float]) -> float:
         """Return the distance of a point to the box; 0 inside."""
         low, high = self.extent_m.min_m, self.extent_m.max_m
@@ -324,10 +330,7 @@ class TeamObject:
 
 @dataclass(frozen=True, slots=True)
 class OrientedBox:
-    """An upright box. yaw_rad: of its longer horizontal side, from the first horizontal axis.
-
-    size_m: along that side, across it, and along the world's axis `vertical`.
-    """
+    """An upright box. yaw_rad: of its longer level side, from the first level axis; size_m: along, across and up."""
 
     centre_m: tuple[float, float, float]
     yaw_rad: float

@@ -235,10 +235,7 @@ class Trajectory:
         return bool(gaps_s.min() >= _MIN_BASELINE_S and gaps_s.max() <= _MAX_GAP_RATIO * gaps_s.min())
 
     def is_steady(self, i: int) -> bool:
-        """True if the velocities before and after pose i are similar: only then do the poses state the velocity there.
-
-        False for the first and the last pose.
-        """
+        """True if the velocities before and after pose i are similar: only then do poses state the velocity there."""
         if not 0 < i < len(self.times_s) - 1:
             return False
         before, after = (self._mean_velocity(first) for first in (i - 1, i))

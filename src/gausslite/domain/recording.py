@@ -42,10 +42,7 @@ class CameraCorrection:
 
     @classmethod
     def parse(cls, text: str) -> CameraCorrection:
-        """Return the correction of "lens=MODEL:K1,...;readout=S;offset=S;exposure=S", each part optional.
-
-        Raises InvalidInputError.
-        """
+        """Return the correction of "lens=MODEL:K1,...;readout=S;offset=S;exposure=S". Raises InvalidInputError."""
         parts: dict[str, str] = {}
         for part in text.split(";"):
             name, equals, value = part.strip().partition("=")
@@ -113,10 +110,7 @@ class DepthRegistration:
 
     @classmethod
     def parse(cls, text: str) -> DepthRegistration:
-        """Return the registration of FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]] in pixels, metres, degrees.
-
-        Raises InvalidInputError.
-        """
+        """Return the registration of FX,FY,CX,CY[,TX,TY,TZ[,RX,RY,RZ]] (px, m, deg). Raises InvalidInputError."""
         try:
             values = [float(part) for part in text.split(",")]
         except ValueError:

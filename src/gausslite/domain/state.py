@@ -49,10 +49,7 @@ class EvenHistory(Generic[_State]):
         return tuple(self._states)
 
     def is_due(self, time_ns: int) -> bool:
-        """Return True if a state of this time would be evenly spaced: a state costs time to take.
-
-        An earlier time than the newest one belongs to a new history.
-        """
+        """Return True if a state of this time would be evenly spaced, or begins a new history with an earlier time."""
         if not self._times_ns or time_ns < self._times_ns[-1]:
             return True
         gap_ns, span_ns = time_ns - self._times_ns[-1], self._times_ns[-1] - self._times_ns[0]

@@ -14,10 +14,7 @@ _NUMBER_SUFFIX: Final = re.compile(r"_\d+$")
 
 
 class Predicate(StrEnum):
-    """Spatial predicates of the relation filter; the paper has the first two.
-
-    BETWEEN has one entry per anchor: between(t, a) and between(t, b) form one relation.
-    """
+    """Predicates of the relation filter, the first two of the paper. between(t, a) and (t, b) form one relation."""
 
     NEAR = "near"
     ON = "on"
@@ -196,10 +193,7 @@ def require_task_text(text: str, limits: TaskLimits = LIMITS) -> None:
 
 
 def require_graph(graph: TaskGraph, limits: TaskLimits = LIMITS) -> None:
-    """Raise TaskError unless the graph is within the limits and its relations join listed nouns.
-
-    The text is empty if the graph was not parsed from a sentence.
-    """
+    """Raise TaskError unless the graph, which may lack a text, is within the limits and relates listed nouns."""
     if graph.text:
         require_task_text(graph.text, limits)
     if not graph.targets:

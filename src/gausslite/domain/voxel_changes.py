@@ -100,10 +100,7 @@ def _keys_after(revisions: dict[int, int], revision: int) -> Iterator[int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TileDigests:
-    """For each tile of 16 x 16 x 16 voxels the sum, modulo 2^64, of the hashes of its (voxel key, update_seq).
-
-    tiles are ascending; tile_of names them.
-    """
+    """The sums, modulo 2^64, of the hashes of (voxel key, update_seq) in each tile; tiles (see tile_of) ascend."""
 
     tiles: Int64[ndarray, " t"]
     hashes: UInt64[ndarray, " t"]
@@ -136,10 +133,7 @@ def _sum_by_tile(tiles: Int64[ndarray, " k"], hashes: UInt64[ndarray, " k"]) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelSignatures:
-    """Three numbers for each voxel that change with its contents: Σkappa, number of Gaussians, hash of their values.
-
-    keys are strictly ascending.
-    """
+    """Σkappa, number and hash of the Gaussians of each voxel: what changes with its contents. keys are ascending."""
 
     keys: Int64[ndarray, " v"]
     values: UInt64[ndarray, "v 3"]

@@ -172,6 +172,12 @@ class AxisAlignedBox:
         if not np.isfinite(corners).all() or not (corners[0] <= corners[1]).all():
             raise InvalidInputError(f"box: expected finite min <= max, got {self.min_m} and {self.max_m}")
 
+    @classmethod
+    def around(cls, points_m: Float[ndarray, "n 3"]) -> AxisAlignedBox:
+        """Return the smallest box with these points. Raises InvalidInputError if one is not finite."""
+        (x, y, z), (right, back, top) = points_m.min(axis=0).tolist(), points_m.max(axis=0).tolist()
+        return cls((x, y, z), (right, back, top))
+
     def contains(self, points_m: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Return True for each point in the box or on its faces."""
         low, high = np.array(self.min_m), np.array(self.max_m)
@@ -243,10 +249,7 @@ class VoxelIndex:
 
 
 def group_by_voxel(gaussians: Gaussians, grid: VoxelGrid) -> VoxelBatch:
-    """Return the batch of all voxels of these Gaussians (Sec. III-E); their order within a voxel is kept.
-
-    Raises InvalidInputError for means outside the grid's range.
-    """
+    """Return the batch of all voxels of these Gaussians (Sec. III-E), in their order. Raises InvalidInputError."""
     voxels = VoxelIndex.from_points(gaussians.means_m, grid)
     return VoxelBatch(
         voxels.keys, voxels.sums(gaussians.kappa), voxels.counts.astype(np.uint32), gaussians.take(voxels.rows)

@@ -60,10 +60,7 @@ def largest_roi_views(views: Sequence[HeldOutView], count: int) -> set[int]:
 
 
 def largest_roi_per_segment(roi_pixels: Sequence[int], count: int) -> set[int]:
-    """Return the position of the largest region in each of `count` segments.
-
-    Regions below MIN_ROI_PIXELS are skipped unless all are below.
-    """
+    """Return the place of the largest region in each of `count` segments; of small ones only if all are small."""
     if count < 1:
         return set()
     pixels = np.array(roi_pixels)

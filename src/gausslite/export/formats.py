@@ -42,10 +42,7 @@ _LAS_STEP_M = 1e-4
 
 
 def write_pcd(path: Path, gaussians: Gaussians) -> None:
-    """Write a binary PCD file (version 0.7) with position, rgb, opacity, kappa, target and active flag.
-
-    Raises StorageError.
-    """
+    """Write a binary PCD file (0.7): position, rgb, opacity, kappa, target, active flag. Raises StorageError."""
     rows = np.zeros(len(gaussians), _PCD_ROW)
     rows["mean_m"] = gaussians.means_m
     rows["bgra"][:, :3] = np.clip(np.round(gaussians.rgb[:, ::-1] * 255), 0, 255)
@@ -64,10 +61,7 @@ def write_pcd(path: Path, gaussians: Gaussians) -> None:
 
 
 def write_las(path: Path, gaussians: Gaussians) -> None:
-    """Write a LAS 1.4 file (point format 7) with position, rgb, kappa and target.
-
-    Raises InvalidInputError without the laspy package, StorageError.
-    """
+    """Write a LAS 1.4 file (point format 7): position, rgb, kappa, target. Raises InvalidInputError, StorageError."""
     laspy = import_extra("laspy", "export", "LAS files")
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.scales = np.full(3, _LAS_STEP_M)
@@ -142,10 +136,7 @@ class Format:
     is_upright: bool = False
 
     def files(self, out: Path) -> tuple[Path, ...]:
-        """Return the files that are written for this path. Raises InvalidInputError for the suffix of another format.
-
-        Other tools choose the reader by the suffix.
-        """
+        """Return the files written for this path. Raises InvalidInputError for the suffix of another format."""
         suffixes = (".yaml", ".yml") if self.suffix == ".yaml" else (Path(f"x{self.suffix}").suffix,)
         if out.suffix.lower() not in suffixes:
             expected = " or ".join(suffixes)
@@ -194,10 +185,7 @@ def read_map(
 
 
 def upright(content: MapContent) -> MapContent:
-    """Return the map turned so that its z axis points up, with a note; the same map if it does, or states no direction.
-
-    Raises InvalidInputError.
-    """
+    """Return the map turned so that z points up, with a note, if its up is stated. Raises InvalidInputError."""
     up = np.array(stated_up(content.report) or (0.0, 0.0, 1.0))
     axis = np.array((up[1], -up[0], 0.0))
     length = float(np.linalg.norm(axis))

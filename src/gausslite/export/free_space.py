@@ -64,10 +64,7 @@ def _carve(
 def points_before_surface(
     camera: Camera, depth_m: Float32[ndarray, "h w"], T_world_camera: Float64[ndarray, "4 4"], voxel_m: float
 ) -> Iterator[Float64[ndarray, "c 3"]]:
-    """Yield the points of all rays at the same distance, in steps of half a voxel, up to the measured surface.
-
-    A ray without depth (0) has none.
-    """
+    """Yield the points of all rays at one distance, in steps of half a voxel, up to the measured surface."""
     rows, columns = np.nonzero(depth_m > 0)
     x, y = camera.slopes(columns + 0.5, rows + 0.5)
     rays = np.stack([x, y, np.ones(len(x))], axis=1)

@@ -155,10 +155,7 @@ class FusionEngine:
             )
 
     def begin_elsewhere(self, agent_id: str, fresh_map: bool) -> int:
-        """Note that the agent has joined at another server of the store; returns its highest update_seq here.
-
-        fresh_map: as in `join`. Raises StorageError.
-        """
+        """Note that the agent has joined at another server; return its highest update_seq here. Raises StorageError."""
         with self._committer.committing, self._lock:
             self._members.sessions.forget_elsewhere(agent_id)
             if fresh_map:

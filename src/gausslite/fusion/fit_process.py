@@ -34,10 +34,7 @@ _FIT, _FIND = b"fit", b"find"
 
 
 class FitProcess:
-    """Calls `fit_frame` and `find_frame` in a process that starts with the first call.
-
-    Call it from one thread; `close` from any.
-    """
+    """Calls `fit_frame` and `find_frame` in a process, from one thread; the first call starts it."""
 
     def __init__(self, command: Sequence[str] = _COMMAND, longest_s: float = _LONGEST_S) -> None:
         """longest_s: a process that has not answered by then is killed."""

@@ -268,10 +268,7 @@ class FusedMapLayers:
             return self._voted_log.revisions.changed_since(revision)
 
     def refined_map(self) -> VoxelBatch:
-        """Return the refined map; voxels that changed after the refinement started show the newer vote.
-
-        Raises MismatchError before the first refinement.
-        """
+        """Return the refined map, with the newer vote in changed voxels. Raises MismatchError before a refinement."""
         if self._refined is None:
             raise MismatchError("refined map: expected a refinement first, got none yet; see `gausslite refine`")
         return merge_batches(*(won.batch for won in self._read_tiles(MapLayer.REFINED)))

@@ -22,10 +22,6 @@ MAX_REFINE_ITERATIONS = 30_000
 _CORRECT, _TRUST = "correct", "trust"
 
 
-def _read_alignment(text: str) -> AlignmentSettings | None:
-    return AlignmentSettings() if text == _CORRECT else None
-
-
 @dataclass(frozen=True, slots=True)
 class Quotas:
     """Upper limits of one mission. voxels_per_agent includes tombstones, because the store keeps them.
@@ -78,7 +74,7 @@ class FusionSettings:
         key="frame-alignment",
         choices=(_CORRECT, _TRUST),
         plain_type=str,
-        convert=_read_alignment,
+        convert=lambda text: AlignmentSettings() if text == _CORRECT else None,
         to_plain=lambda _: _CORRECT,
     )
     lease_s: float = DEFAULT_LEASE_S

@@ -117,10 +117,7 @@ class SessionRegistry:
         self._token_hashes[session.agent_id] = _hash(token)
 
     def known(self, session_id: str) -> SessionRecord | None:
-        """Return the session if it was opened here, and renew its lease, or if it was found in the store before.
-
-        Any thread may call it, without the lock.
-        """
+        """Return the session if it is known without the store, and renew its lease; in any thread, without lock."""
         session = self._sessions.get(session_id)
         if session is None:
             return self._elsewhere.get(session_id)
@@ -162,10 +159,7 @@ class SessionRegistry:
         self._lease_ends_s.pop(agent_id, None)
 
     def end_unused(self, kept: Collection[str]) -> list[str]:
-        """End the sessions whose lease has ended, except for the agents in `kept`; returns these agents.
-
-        Raises StorageError.
-        """
+        """End the sessions whose lease has ended, except those of `kept`; return their agents. Raises StorageError."""
         ended = [
             agent_id for agent_id in self._lease_ends_s if agent_id not in kept and self._remaining_s(agent_id) <= 0
         ]

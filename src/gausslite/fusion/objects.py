@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from threading import Lock
 
@@ -28,7 +29,6 @@ from gausslite.domain.objects import (
     TeamObject,
     same_kind,
 )
-from gausslite.domain.pose import transform_points
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.store import FusionStore
@@ -83,11 +83,6 @@ def merge_objects(
     pairs = _matching_pairs([member.landmark for member in observed], np.array(owner, np.int64))
     merged = [_merge([observed[i] for i in sorted(cluster)]) for cluster in _clusters(pairs, owner)]
     return tuple(sorted(merged, key=lambda member: (-member.landmark.confidence, member.landmark.object_id)))
-
-
-def team_object_id(agent_id: str, object_id: str) -> str:
-    """Return the id of a team object: its earliest observer and the id there, shortened to the limit of names."""
-    return f"{agent_id}/{object_id}".encode()[:MAX_NAME_BYTES].decode(errors="ignore")
 
 
 def _clusters(pairs: Int64[ndarray, "p 2"], owner: Sequence[int]) -> list[list[int]]:
@@ -182,7 +177,8 @@ def _halves(low: Float64[ndarray, "n d"], high: Float64[ndarray, "n d"]) -> tupl
 def _merge(cluster: Sequence[_Observed]) -> TeamObject:
     """Return one object of the members, the earliest first."""
     landmarks = [member.landmark for member in cluster]
-    object_id = team_object_id(cluster[0].agent_id, landmarks[0].object_id)
+    # that of the earliest observer, shortened to the limit of names
+    object_id = f"{cluster[0].agent_id}/{landmarks[0].object_id}".encode()[:MAX_NAME_BYTES].decode(errors="ignore")
     observers = tuple(
         ObjectObserver(
             member.agent_id,
@@ -208,14 +204,12 @@ def _merge_landmarks(landmarks: Sequence[ObjectLandmark]) -> ObjectLandmark:
         sum(w * landmark.centroid_m[axis] for w, landmark in zip(weights, landmarks, strict=True)) / sum(weights)
         for axis in range(3)
     )
-    low_x, low_y, low_z = (min(landmark.extent_m.min_m[axis] for landmark in landmarks) for axis in range(3))
-    high_x, high_y, high_z = (max(landmark.extent_m.max_m[axis] for landmark in landmarks) for axis in range(3))
     is_target = any(landmark.role is ObjectRole.TARGET for landmark in landmarks)
     return replace(
         landmarks[0],
         role=ObjectRole.TARGET if is_target else ObjectRole.ANCHOR,
         centroid_m=(x, y, z),
-        extent_m=AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z)),
+        extent_m=AxisAlignedBox.around(np.vstack([landmark.corners_m for landmark in landmarks])),
         confidence=1.0 - math.prod(1.0 - landmark.confidence for landmark in landmarks),
         first_seen_ns=min(landmark.first_seen_ns for landmark in landmarks),
         last_seen_ns=max(landmark.last_seen_ns for landmark in landmarks),
@@ -313,19 +307,8 @@ def find_objects(objects: Sequence[TeamObject], noun: str = "") -> tuple[TeamObj
 
 
 def _moved(report: ObjectReport, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectReport:
-    moved = (_move(landmark, T_fused_agent) for landmark in report.objects)
-    return replace(report, objects=tuple(landmark for landmark in moved if landmark is not None))
-
-
-def _move(landmark: ObjectLandmark, T_fused_agent: Float64[ndarray, "4 4"]) -> ObjectLandmark | None:
-    """Return the landmark in the fused frame, None if it is out of range; its box contains the moved box."""
-    low, high = np.array(landmark.extent_m.min_m), np.array(landmark.extent_m.max_m)
-    corners = np.array([np.where([bit & 1, bit & 2, bit & 4], high, low) for bit in range(8)])
-    points = transform_points(T_fused_agent, np.vstack([corners, landmark.centroid_m]))
-    if not (np.abs(points) <= MAX_OBJECT_COORDINATE_M).all():
-        return None
-    low_x, low_y, low_z = points[:8].min(axis=0).tolist()
-    high_x, high_y, high_z = points[:8].max(axis=0).tolist()
-    x, y, z = points[8].tolist()
-    box = AxisAlignedBox((low_x, low_y, low_z), (high_x, high_y, high_z))
-    return replace(landmark, centroid_m=(x, y, z), extent_m=box)
+    objects = []
+    for landmark in report.objects:
+        with suppress(InvalidInputError):  # out of range
+            objects.append(landmark.moved(T_fused_agent))
+    return replace(report, objects=tuple(objects))

@@ -74,10 +74,7 @@ class PostgresConnection:
         self._open()
 
     def run(self, work: Callable[[Database], _Result]) -> _Result:
-        """Return the result of the work. It runs again if the connection is lost, so it must be safe to repeat.
-
-        Raises StorageError.
-        """
+        """Return the result of the work, which must be safe to repeat after a lost connection. Raises StorageError."""
         with self._lock:
             try:
                 return self._run(work)

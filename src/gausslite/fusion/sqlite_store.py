@@ -187,10 +187,7 @@ class _Checkpoints:
                         self._copy(db)
 
     def _copy(self, db: sqlite3.Connection) -> None:
-        """Copy the log, then what was committed meanwhile, until little is left for a moment without commits.
-
-        The log begins anew only when all of it is in the file.
-        """
+        """Copy the log in rounds, the last one without commits: it begins anew only when all of it is in the file."""
         for _ in range(_FREE_ROUNDS):
             db.execute(_CHECKPOINT)
         with self._write_lock:

@@ -282,9 +282,8 @@ class FusionStore(ABC):
 
     def find_record(self, agent_id: str, name: str) -> bytes:
         """Return a named record of an agent; empty if it does not exist. Raises StorageError for a damaged one."""
-        return self._intact(name, self._read(f"{_SELECT_RECORDS} AND agent_id = ?", (name, agent_id))).get(
-            agent_id, b""
-        )
+        rows = self._read(f"{_SELECT_RECORDS} AND agent_id = ?", (name, agent_id))
+        return self._intact(name, rows).get(agent_id, b"")
 
     def _intact(self, name: str, rows: Iterable[tuple[Any, ...]]) -> dict[str, bytes]:
         """Return the record of each agent. Raises StorageError for a damaged row."""

@@ -35,10 +35,7 @@ _SECONDS = struct.Struct("<d")
 
 
 def decode_own(message: bytes, agent_id: str, grid: VoxelGrid) -> StoredSubset:
-    """Return an agent's encoded message as a store keeps it.
-
-    Raises CodecError, ChecksumError, NotPermittedError (another agent's name), MismatchError (another grid).
-    """
+    """Return an agent's message as a store keeps it. Raises CodecError, ChecksumError and as `require_own`."""
     subset, own_grid = decode_stored(message)
     require_own(agent_id, subset.agent_id, own_grid, grid)
     return subset

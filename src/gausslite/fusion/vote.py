@@ -115,10 +115,7 @@ def union_maps(batch_by_agent: Mapping[str, VoxelBatch]) -> VoxelBatch:
 
 
 def _stack(batch_by_agent: Mapping[str, VoxelBatch]) -> tuple[VoxelScoreTable, Gaussians, Int64[ndarray, " w"]]:
-    """Return all updates as one table, all Gaussians as one array, and the first Gaussian's place for each update.
-
-    An update's row in the table is its number, from 0.
-    """
+    """Return the table of all updates, their Gaussians, and the first Gaussian's place for each row of the table."""
     agents = tuple(sorted(batch_by_agent))
     batches = [batch_by_agent[agent_id] for agent_id in agents]
     agent_index = np.repeat(np.arange(len(agents), dtype=np.int32), [len(batch) for batch in batches])

@@ -151,10 +151,7 @@ class FrameScheduler:
         return self._clock() + needed_s < self._training_deadline_s
 
     def trains_on(self, stage: Stage, iterations_per_frame: int) -> bool:
-        """Return True while another iteration fits (without settings: while iterations_per_frame are not done).
-
-        The first of the min_iterations is always trained.
-        """
+        """Return True for the first of min_iterations, and while another one fits (or is left, without settings)."""
         if self._settings is None or iterations_per_frame == 0:
             return self._iterations < iterations_per_frame
         below_minimum = self._iterations < self._settings.min_iterations

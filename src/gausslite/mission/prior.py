@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +17,8 @@ from gausslite.domain.errors import CodecError, MapFileError, MismatchError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.objects import ObjectLandmark
-from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, transform_points, translation_m
+from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, translation_m
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.evaluation.views import MapViewer, view_map
 from gausslite.mapping.free_space import DepthView
 from gausslite.mission.map_diff import Change, Visit, compare_visits
@@ -83,7 +81,7 @@ class SavedMap:
     def moved(self, T: Float64[ndarray, "4 4"]) -> SavedMap:
         """Return the map after a rigid motion; each object's box is the axis-aligned one around its moved corners."""
         keyframes = [replace(view, T_world_camera=orthonormal(T @ view.T_world_camera)) for view in self.keyframes]
-        objects = tuple(_moved_object(landmark, T) for landmark in self.objects)
+        objects = tuple(landmark.moved(T) for landmark in self.objects)
         return replace(self, gaussians=move_gaussians(self.gaussians, T), keyframes=keyframes, objects=objects)
 
     def depth_views(self, viewer: MapViewer) -> list[DepthView]:
@@ -97,16 +95,6 @@ class SavedMap:
         for keyframe in self.keyframes:
             places.add_rendered(keyframe.camera, keyframe.T_world_camera)
         return places
-
-
-def _moved_object(landmark: ObjectLandmark, T: Float64[ndarray, "4 4"]) -> ObjectLandmark:
-    box = landmark.extent_m
-    corners_m = transform_points(T, np.array(list(itertools.product(*zip(box.min_m, box.max_m, strict=True)))))
-    low, high, centre = (
-        (float(point[0]), float(point[1]), float(point[2]))
-        for point in (corners_m.min(axis=0), corners_m.max(axis=0), transform_points(T, np.array(landmark.centroid_m)))
-    )
-    return replace(landmark, centroid_m=centre, extent_m=AxisAlignedBox(low, high))
 
 
 class SequenceLocaliser:

@@ -43,16 +43,15 @@ def write_keyframes(folder: Path, keyframes: Sequence[Keyframe]) -> None:
     views = [_view(keyframe) for keyframe in keyframes]
     write_keyframe_views(folder, views)
     chosen = sorted(largest_roi_per_segment([view.roi_pixels for view in views], _PHOTOGRAPHS))
-    write_view_images(folder, [_photograph(keyframes[i]) for i in chosen])
+    photographed = [keyframes[i] for i in chosen]
+    write_view_images(
+        folder, [ViewImage(kept.frame.index, kept.frame.rgb, kept.relevance.roi) for kept in photographed]
+    )
 
 
 def _view(keyframe: Keyframe) -> KeyframeView:
     frame, pixels = keyframe.frame, int(np.count_nonzero(keyframe.relevance.roi))
     return KeyframeView(frame.index, frame.capture_time_ns, frame.camera, frame.T_world_camera, pixels)
-
-
-def _photograph(keyframe: Keyframe) -> ViewImage:
-    return ViewImage(keyframe.frame.index, keyframe.frame.rgb, keyframe.relevance.roi)
 
 
 MAP, _REPORT = "map.ply", "report.json"
@@ -117,10 +116,7 @@ def require_writable(folder: Path) -> None:
 
 
 def prepare_file(path: Path, kind: FileKind | None = None) -> None:
-    """Create the folder of a file and check that files can be written there. Raises StorageError.
-
-    kind: an earlier file must be empty or of this kind.
-    """
+    """Create a file's folder and check that a file of this kind can be written there. Raises StorageError."""
     if path.is_dir():
         raise StorageError(f"{path}: expected the name of a file, got a folder")
     if kind is not None:
@@ -209,10 +205,7 @@ def stated_up(report: Mapping[str, object]) -> UpAxis | None:
 
 
 def read_evaluation(folder: Path) -> Mapping[str, object]:
-    """Return the content of evaluation.json, see `write_evaluation`; empty if there is none.
-
-    Raises MapFileError for a damaged file.
-    """
+    """Return the content of evaluation.json; empty without it. Raises MapFileError for a damaged file."""
     scores = _read_json(folder / EVALUATION)
     if not scores and (folder / EVALUATION).exists():
         raise MapFileError(f"{folder / EVALUATION}: expected the scores of `gausslite eval`, got something else")
@@ -259,10 +252,7 @@ def _rounded(value: object) -> object:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Hold the folder for this run; it is created, and removed if it is empty at the end.
-
-    Raises StorageError if another run holds it.
-    """
+    """Hold the folder for this run, and remove it if it stays empty. Raises StorageError if another run holds it."""
     prepare_folder(folder)
     handle = os.open(folder, os.O_RDONLY)
     try:

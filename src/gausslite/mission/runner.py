@@ -57,10 +57,7 @@ class FrameStream:
 
     @classmethod
     def select(cls, source: Source, settings: SourceSettings) -> FrameStream:
-        """Return the frames that the settings select, without the frames kept for evaluation.
-
-        Raises DatasetError if there are none, InvalidInputError.
-        """
+        """Return the selected frames without those held out. Raises DatasetError for none, InvalidInputError."""
         positions: Sequence[int] = select_frames(source, settings.frames)
         if settings.test_every is not None:
             positions, _ = HeldOutSplit(settings.test_every).split(positions)
@@ -75,11 +72,7 @@ class FrameStream:
         return replace(self, positions=[position for position in self.positions if indices[position] > index])
 
     def frames(self, on_corrupt: OnCorrupt | None = None) -> Iterator[Frame]:
-        """Yield each frame, read on request.
-
-        Frames that cannot be read are skipped and passed to on_corrupt. Without on_corrupt they raise DatasetError or
-        PoseError.
-        """
+        """Yield each frame, read on request; errors of unreadable ones go to on_corrupt, or are raised without it."""
         for position in self.positions:
             try:
                 frame = self.source.frame(position, self.size)

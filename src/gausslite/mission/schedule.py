@@ -31,10 +31,7 @@ _MAX_SNAPSHOTS, _LEAST_GAP_NS = 48, 250_000_000
 
 @dataclass(slots=True)
 class MapRecorder:
-    """Keeps at most 48 snapshots, at most 11 MB.
-
-    One takes about 25 ms. There are at most four a second of the recording, fewer in a longer mission.
-    """
+    """Keeps at most 48 snapshots (25 ms and 230 kB each), four a second of the recording at most."""
 
     _snapshots: EvenHistory[MapSnapshot] = field(default_factory=lambda: EvenHistory(_MAX_SNAPSHOTS, _LEAST_GAP_NS))
 
@@ -159,10 +156,7 @@ _MAX_ROWS = 100_000
 
 @dataclass(slots=True)
 class Timeline:
-    """The rows of one run; frames that were skipped have none.
-
-    An agent may run for weeks: whenever there are max_rows rows, every second one is removed.
-    """
+    """The rows of the mapped frames of one run; every second one is removed whenever there are max_rows."""
 
     max_rows: int = _MAX_ROWS
     _rows: list[tuple[float, ...]] = field(default_factory=list)

@@ -13,10 +13,7 @@ from gausslite.domain.errors import InvalidInputError
 
 
 def to_plain(value: object) -> Any:
-    """Return a settings object as JSON values: dataclasses as dicts, sets as sorted lists, paths and enums as text.
-
-    Raises TypeError if a field has another type.
-    """
+    """Return settings as JSON values, sets sorted, paths and enums as text. Raises TypeError for other types."""
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Enum):

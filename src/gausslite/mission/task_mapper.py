@@ -139,10 +139,7 @@ class TaskMapper:
     def point_at(
         self, masks: Iterable[tuple[str, Bool[ndarray, "h w"], Frame]], excluded_m: Iterable[PointM] = ()
     ) -> None:
-        """Add the objects that a person points at, with noun, mask and frame of each, and leave out those at points.
-
-        Raises InvalidInputError.
-        """
+        """Add what a person points at (noun, mask, frame), leave out what is at points. Raises InvalidInputError."""
         for noun, mask, frame in masks:
             self._estimator.point_at(noun, mask, frame)
         for point_m in excluded_m:
@@ -216,10 +213,7 @@ class TaskMapper:
         return self._mapper.keyframes()
 
     def pointed_masks(self, pointed: Iterable[PointedObject]) -> list[tuple[str, Bool[ndarray, "h w"], Frame]]:
-        """Return noun, mask and frame of each object that a person points at, on a keyframe that is kept or was shown.
-
-        Raises InvalidInputError.
-        """
+        """Return noun, mask and frame of each object pointed at on a known keyframe. Raises InvalidInputError."""
         frames = [*self._shown, *(keyframe.as_recorded for keyframe in self._mapper.keyframes())]
         return pointed_masks(pointed, sorted(frames, key=lambda frame: frame.capture_time_ns))
 
@@ -239,10 +233,7 @@ class TaskMapper:
         }
 
     def restore(self, state: State) -> None:
-        """Continue from the state of a TaskMapper with the same settings and task.
-
-        Raises MapFileError, InvalidInputError.
-        """
+        """Continue from a state with the same settings and task. Raises MapFileError, InvalidInputError."""
         self._mapper.restore(select_prefix(state, "mapper"))
         self._estimator.restore(select_prefix(state, "estimator"))
         sent_voxels = select_prefix(state, "sent_voxels")

@@ -161,10 +161,7 @@ def _joined(name: str) -> str:
 
 
 def read_noun_vectors(folder: Path) -> tuple[dict[str, int], Float32[ndarray, "n d"]] | None:
-    """Return the row of each noun and the unit vectors in a model's folder; None without the files.
-
-    Raises ModelFileError.
-    """
+    """Return each noun's row and the unit vectors in a folder; None without the files. Raises ModelFileError."""
     vectors_path, names_path = folder / NOUN_VECTORS_FILE, folder / NOUN_NAMES_FILE
     if not (vectors_path.is_file() and names_path.is_file()):
         return None

@@ -183,10 +183,7 @@ class ColourFilter:
         return " ".join(filter(None, (self._colours.get(name), noun_of(name))))
 
     def notes(self, seen: Sequence[tuple[str, Float64[ndarray, "balances ranges"]]]) -> tuple[str, ...]:
-        """Return one line for each colour that could not decide about all of these objects, or that left some out.
-
-        seen: noun and counts of each object.
-        """
+        """Return a line for each colour that was doubtful or left objects out; seen: their nouns and counts."""
         lines = [self._describe(name, seen) for name in self._names]
         for noun, colour in self._excluded:
             matches = [match_colour(colour, counts, self._settings) for other, counts in seen if other == noun]

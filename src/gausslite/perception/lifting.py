@@ -131,10 +131,7 @@ def _own_pixels(
 def foreground_mask(
     mask: Bool[ndarray, "h w"], depth_m: Float32[ndarray, "h w"], settings: LiftingSettings
 ) -> Bool[ndarray, "h w"]:
-    """Return the nearest depth layer with a sufficient share of the mask; pixels without depth are kept.
-
-    Layers are separated by adjacent, almost empty bins of depth.
-    """
+    """Return the nearest layer of depth with enough of the mask, between almost empty bins; unmeasured pixels stay."""
     known = mask & (depth_m > 0)
     log_depths = np.log(depth_m[known])
     if len(log_depths) < settings.min_pixels:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import os
 from collections.abc import Sequence
@@ -66,10 +65,7 @@ def open_model(path: Path, threads: int | None = None) -> OpenModel:
 
 
 def run_once(model: OpenModel, inputs: dict[str, Any]) -> list[Any]:
-    """Return all outputs for these inputs, to check dynamic shapes and damage that loading does not detect.
-
-    Raises ModelFileError.
-    """
+    """Return all outputs for these inputs: loading does not detect all damage. Raises ModelFileError."""
     try:
         outputs: list[Any] = model.session.run(None, inputs)
     except Exception as error:
@@ -78,10 +74,7 @@ def run_once(model: OpenModel, inputs: dict[str, Any]) -> list[Any]:
 
 
 def choose_providers(available: Sequence[str]) -> tuple[str, ...]:
-    """Return CUDA or TensorRT, if available, and the CPU for unsupported operators.
-
-    CUDA is preferred: TensorRT compiles a network for minutes before the first image.
-    """
+    """Return CUDA, or else TensorRT (which compiles for minutes), if available, and the CPU for other operators."""
     gpu_providers = [name for name in _PROVIDERS[:-1] if name in available][:1]
     return (*gpu_providers, _PROVIDERS[-1])
 
@@ -137,7 +130,6 @@ def _runtime() -> Any:
     return onnxruntime
 
 
-@functools.cache
 def _foreign_format(start: bytes) -> str:
     if start[4:8] == b"ORTM":
         return "a model in ORT format: use its original .onnx file"

@@ -228,8 +228,7 @@ class Landmark:
     def box_m(self) -> AxisAlignedBox:
         """Return the axis-aligned box of the footprint's cells."""
         centres_m, half_m = self.footprint_m().astype(np.float64), 0.5 * self.settings.cell_m
-        low, high = centres_m.min(axis=0) - half_m, centres_m.max(axis=0) + half_m
-        return AxisAlignedBox((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        return AxisAlignedBox.around(np.vstack([centres_m - half_m, centres_m + half_m]))
 
     def footprint_m(self) -> Float32[ndarray, "k 3"]:
         """Return the centres of the cells that are observed often, or of all cells if those are few."""
@@ -304,10 +303,7 @@ class ObjectMap:
         return first
 
     def _add_weak(self, weak: Observation, observed: list[Landmark]) -> None:
-        """Count a weak observation for the nearest landmark that it shows, unless this frame already shows one.
-
-        Its mask may cover several objects, so it merges none.
-        """
+        """Count a weak observation for the nearest landmark without one in this frame; it merges none."""
         matches = self._matches(weak)
         if not matches or any(landmark is other for landmark in matches for other in observed):
             return

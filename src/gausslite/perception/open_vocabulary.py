@@ -160,10 +160,7 @@ def phrase_scores(
 
 
 def corners_px(boxes_cxcywh: Float32[ndarray, "q 4"], size_px: tuple[int, int]) -> Float32[ndarray, "q 4"]:
-    """Convert relative boxes (centre x, y, width, height) to corners in pixels of an image of size_px (width, height).
-
-    The corners are clipped to the image.
-    """
+    """Return relative boxes (centre x, y, width, height) as corners in pixels, clipped to size_px (width, height)."""
     half = boxes_cxcywh[:, 2:] / 2
     corners = np.concatenate([boxes_cxcywh[:, :2] - half, boxes_cxcywh[:, :2] + half], axis=1)
     size = np.array([*size_px, *size_px], np.float32)

@@ -111,10 +111,7 @@ def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tup
 def pointed_masks(
     pointed: Iterable[PointedObject], keyframes: Sequence[Frame]
 ) -> list[tuple[str, Bool[ndarray, "h w"], Frame]]:
-    """Return noun, mask and frame of each object that a person points at; the keyframes are given oldest first.
-
-    Raises InvalidInputError.
-    """
+    """Return noun, mask and frame of each object pointed at; keyframes: oldest first. Raises InvalidInputError."""
     masks = []
     for shown in pointed:
         if shown.point_m is not None:
@@ -167,10 +164,7 @@ def _in_box(frame: Frame, box: tuple[float, float, float, float], settings: Poin
 def _seen(
     frame: Frame, point_m: tuple[float, float, float], settings: PointingSettings
 ) -> tuple[tuple[int, float], tuple[int, int]] | None:
-    """Return (steps between the point and the measured depth, distance), and the pixel (row, column) of the point.
-
-    None if the frame does not show the point.
-    """
+    """Return (steps to the measured depth, distance) and the pixel (row, column) of a point; None if not shown."""
     p_camera = transform_points(inverse(frame.T_world_camera), np.array([point_m]))
     z_m = float(p_camera[0, 2])
     if z_m < _NEAR_M:

@@ -344,10 +344,7 @@ def select_extreme(
     up: Float64[ndarray, "3"],
     T_world_camera: Float64[ndarray, "4 4"],
 ) -> Landmark:
-    """Return the landmark with the extreme value. landmarks: at least one, all of one noun.
-
-    T_world_camera: the viewpoint of nearest, farthest, leftmost and rightmost.
-    """
+    """Return the landmark, of at least one of a noun, with the extreme value, seen from T_world_camera if needed."""
     measure, sign = _MEASURES[superlative]
     return max(landmarks, key=lambda landmark: sign * measure(landmark, up, T_world_camera))
 

@@ -22,10 +22,7 @@ _SHARES = ("_share", "_score", "_iou", "_fraction", "_similarity", "_margin")
 
 
 def require_plausible(section: str, settings: DataclassInstance, names: Iterable[str] | None = None) -> None:
-    """Raise InvalidInputError for a share outside 0 to 1, and for another number that is not positive.
-
-    names: the fields to check, by default all.
-    """
+    """Raise InvalidInputError for one of these fields, or of all, that is a share outside 0 to 1 or not positive."""
     for name in names or [declared.name for declared in fields(settings)]:
         value = getattr(settings, name)
         if isinstance(value, bool) or not isinstance(value, int | float):

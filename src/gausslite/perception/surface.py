@@ -233,10 +233,7 @@ def _is_member(keys: Int64[ndarray, " n"], ascending: Int64[ndarray, " m"]) -> B
 def snapped_to_edges(
     mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"], settings: SurfaceSettings
 ) -> Bool[ndarray, "h w"]:
-    """Return the mask with the pixels near its outline assigned to the side that has their colour.
-
-    A guided filter finds the side (He et al., PAMI 2013).
-    """
+    """Return the mask with pixels at its outline on the side of their colour (guided filter, He et al., 2013)."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if len(rows) == 0:
         return mask
@@ -263,10 +260,7 @@ def _guided_filter(
     wanted: Bool[ndarray, "h w"],
     settings: SurfaceSettings,
 ) -> Float32[ndarray, "h w"]:
-    """Return the values as locally linear functions of the guide's three channels, fitted in each window.
-
-    Only the wanted pixels are filled.
-    """
+    """Return the wanted pixels' values as linear functions, fitted in each window, of the guide's three channels."""
     window = _edge_window(settings)
     guide_mean, value_mean = cv2.blur(guide, window), cv2.blur(values, window)
     products = cv2.blur(guide * values[..., None], window) - guide_mean * value_mean[..., None]
@@ -384,10 +378,7 @@ def _box_window(box_px: tuple[float, float, float, float]) -> Window:
 def window_points_m(
     frame: Frame, window: Window, step: int = 1
 ) -> tuple[Float64[ndarray, "n 3"], Bool[ndarray, "h w"]]:
-    """Return the world points of the window's pixels with depth, and which pixels these are.
-
-    step: use every step-th pixel of every step-th row.
-    """
+    """Return the world points of the window's pixels with depth, every step-th, and which pixels these are."""
     depth_m = frame.depth_m[window]
     is_known = np.zeros(depth_m.shape, np.bool_)
     is_known[::step, ::step] = depth_m[::step, ::step] > 0

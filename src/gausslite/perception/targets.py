@@ -62,10 +62,7 @@ class TargetSelector:
         return next(sure, names[0])
 
     def notes(self, T_world_camera: Float64[ndarray, "4 4"] | None) -> tuple[str, ...]:
-        """Return what colours and heights decided, different things, low scores, and anchors not seen yet.
-
-        T_world_camera: the latest viewpoint, None before any.
-        """
+        """Return what colours, heights and scores decided, and unseen anchors; T_world_camera: the latest viewpoint."""
         objects = self._objects.object_map.objects
         confirmed = self._objects.evidence.confirmed(objects)
         rivals = ((landmark.phrase, self._objects.evidence.rival(landmark)) for landmark in objects)

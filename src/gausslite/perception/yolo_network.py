@@ -235,10 +235,7 @@ def class_names(session: Any) -> tuple[str, ...]:
 
 
 def _output_order(path: Path, outputs: list[Float32[ndarray, "..."]], classes: int) -> tuple[int, int | None]:
-    """Return the indices of boxes and prototypes among the outputs; None without masks.
-
-    classes 0 accepts any number of classes, but only with masks.
-    """
+    """Return which outputs are boxes and prototypes; None without masks. classes 0: any number, only with masks."""
     if len(outputs) == 1 and classes and outputs[0].ndim == 3 and outputs[0].shape[:2] == (1, 4 + classes):
         return 0, None
     received = " and ".join(str(list(output.shape)) for output in outputs)

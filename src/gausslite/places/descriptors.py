@@ -39,10 +39,7 @@ _MIN_CONTRAST = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceDescriptor:
-    """What one image shows, as bytes: counts of hashed features, then thumbnails of Lab colour and of log depth.
-
-    Raises ShapeError.
-    """
+    """What an image shows: counts of hashed features, thumbnails of Lab colour and of log depth. Raises ShapeError."""
 
     values: UInt8[ndarray, "448"]
 

@@ -229,10 +229,7 @@ class ServiceChannel:
 
 
 class _RequestReader:
-    """The requests of a call, and the thread in which gRPC reads them.
-
-    A process that ends while this thread runs is aborted by gRPC, so the end of a call waits for it.
-    """
+    """The requests of a call; its end waits for the thread that reads them, or gRPC may abort the ending process."""
 
     def __init__(self, requests: Iterable[Any]) -> None:
         self._requests = requests

@@ -124,10 +124,7 @@ class AgentClient(ServiceChannel):
         return self._exchange(self._stub.IngestFrames, requests)
 
     def end_mission(self, handover: bool | None = None, drain_s: float | None = None) -> agent_pb.EndMissionResponse:
-        """End the mission and return what was sent and left; None: as the agent's options.
-
-        Raises MismatchError before the first task, UnavailableError.
-        """
+        """End the mission; return what was sent and left. None: as the agent's options. Raises MismatchError."""
         request = agent_pb.EndMissionRequest(handover=handover, drain_seconds=drain_s)
         # after sending, the agent also writes its results
         deadline_s = MAX_END_S if drain_s is None else drain_s + 10 * self._deadline_s
@@ -295,10 +292,7 @@ class FusionClient(ServiceChannel):
         selected: Sequence[int] = (),
         deadline_s: float | None = None,
     ) -> pb.ContributeKeyframesResponse:
-        """Send encoded keyframes; the server deletes this agent's others that are not `selected`, if it is not empty.
-
-        Raises QuotaError, SessionUnknownError.
-        """
+        """Send encoded keyframes; the server keeps only the `selected` others, if any. Raises QuotaError."""
         requests = (
             pb.ContributeKeyframesRequest(session_id=session_id, keyframe=keyframe, selected=selected)
             for keyframe in keyframes
@@ -372,10 +366,7 @@ class FusionClient(ServiceChannel):
         return tuple(map(team_object_from_message, self._call(self._stub.QueryObjects, request).objects))
 
     def keyframe(self, agent_id: str, index: int | None = None) -> StoredKeyframe | None:
-        """Return the agent's keyframe of this frame index, or the newest one; None if the server has none of it.
-
-        Raises InvalidInputError if it has others only.
-        """
+        """Return the keyframe of this index, else the newest; None without any. Raises InvalidInputError."""
         request = pb.GetKeyframeRequest(mission_id=self.mission_id, agent_id=agent_id, index=index)
         return stored_keyframe_from_message(self._call(self._stub.GetKeyframe, request))
 

@@ -95,10 +95,7 @@ def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
 
 @dataclass(frozen=True, slots=True)
 class AssignedTask:
-    """What an AssignTask call states: a graph, objects that a person points at, and points on excluded ones.
-
-    Without a graph, the current task stays.
-    """
+    """An AssignTask call: a graph (None: the current task), objects pointed at, and points on excluded ones."""
 
     graph: TaskGraph | None
     pointed: tuple[PointedObject, ...] = ()

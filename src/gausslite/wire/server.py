@@ -235,10 +235,7 @@ _ARITY = {False: "unary", True: "stream"}
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
-    """Check the caller's role and limits, and end a call with the status of the error that its method raised.
-
-    Unexpected errors are INTERNAL and logged.
-    """
+    """Check role and limits of a call, and end it with its error's status; unexpected ones are INTERNAL and logged."""
 
     def __init__(self, usage: security.CallUsage, watches: Sequence[ReadinessWatch] = ()) -> None:
         self._usage, self._watches = usage, watches
