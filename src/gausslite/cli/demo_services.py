@@ -28,7 +28,7 @@ from gausslite.datasets.source import HeldOutSplit, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region
-from gausslite.mission.results import REPORT_PAGE, require_absent, require_no_map
+from gausslite.mission.results import MAP, REPORT_PAGE, require_absent
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import SceneInfo
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
@@ -43,10 +43,8 @@ _AGENTS = ("agent-a", "agent-b")
 
 def require_no_demo(out: Path) -> None:
     """Raise StorageError if the folder holds results of a demo, also of one that did not end."""
-    for name in (_REPORT, STORE):
+    for name in (_REPORT, STORE, *(f"{agent_id}/{MAP}" for agent_id in _AGENTS)):
         require_absent(out / name)
-    for agent_id in _AGENTS:
-        require_no_map(out / agent_id)
 
 
 def remove_results(out: Path) -> None:

@@ -45,12 +45,13 @@ from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.map_diff import Change
 from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import (
+    MAP,
     PREVIEW,
     locked_folder,
     peak_rss_mib,
     prepare_folder,
+    require_absent,
     require_additional_file,
-    require_no_map,
     write_keyframes,
     write_poses,
     write_results,
@@ -173,7 +174,7 @@ def run(options: argparse.Namespace) -> int:
         raise InvalidInputError("--prior: expected it without resume; a saved run knows the map that it continues")
     require_other_folder(options.prior, options.out)
     if options.resume is None and not options.overwrite:
-        require_no_map(options.out)
+        require_absent(options.out / MAP)
     with locked_folder(options.out):
         return _map(options)
 

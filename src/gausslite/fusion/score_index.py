@@ -56,7 +56,7 @@ class ScoreIndex:
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
         wanted = None if keys is None else np.unique(keys)
-        holders = -1 if wanted is None else self._holders_of(wanted)
+        holders = -1 if wanted is None else reduce(or_, map(self._holders.get, wanted.tolist(), repeat(0)), 0)
         present = [index for index, agent_id in enumerate(self.agents) if self._bits[agent_id] & holders]
         parts = [self._rows[self.agents[index]].sorted_scores(wanted) for index in present]
         agent_index = np.repeat(np.array(present, np.int32), [len(part) for part in parts])
@@ -94,9 +94,6 @@ class ScoreIndex:
             else:
                 del self._holders[key]
         return keys
-
-    def _holders_of(self, keys: Int64[ndarray, " k"]) -> int:
-        return reduce(or_, map(self._holders.get, keys.tolist(), repeat(0)), 0)
 
 
 def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadVoxels) -> Bool[ndarray, " v"]:

@@ -114,7 +114,10 @@ def compare_visits(before: Visit, after: Visit) -> list[Change]:
     explained = [
         landmark.extent_m
         for landmark in (*before.objects, *after.objects)
-        if any(_is_of(change, landmark) for change in named)
+        if any(
+            landmark.noun == change.noun and landmark.centroid_m in (change.before_m, change.after_m)
+            for change in named
+        )
     ]
     gone = list(_surfaces(before, after.views, explained))
     new = list(_surfaces(after, before.views, explained))
@@ -188,10 +191,6 @@ def _apart_m(a: ObjectLandmark, b: ObjectLandmark) -> float:
 
 def _is_same_place(a: ObjectLandmark, b: ObjectLandmark) -> bool:
     return a.noun == b.noun and _apart_m(a, b) < max(_SAME_PLACE_M, 0.5 * max(a.size_m))
-
-
-def _is_of(change: Change, landmark: ObjectLandmark) -> bool:
-    return landmark.noun == change.noun and landmark.centroid_m in (change.before_m, change.after_m)
 
 
 def _empty_share(points_m: Float32[ndarray, "n 3"], views: Sequence[DepthView]) -> float:

@@ -136,11 +136,6 @@ def require_additional_file(path: Path, results_folder: Path) -> None:
     require_writable(path.parent)
 
 
-def require_no_map(folder: Path) -> None:
-    """Raise StorageError if the folder holds a map already."""
-    require_absent(folder / MAP)
-
-
 def require_absent(path: Path) -> None:
     """Raise StorageError if the file exists."""
     if path.exists():

@@ -121,7 +121,8 @@ class YoloDetector:
 
     def matches(self, queries: Sequence[str]) -> tuple[NounMatch, ...]:
         """Return the network's classes that match each query."""
-        return tuple(self._match(query) for query in queries)
+        how = self._settings.class_match
+        return tuple(match_noun(query, self.class_names, self._embeddings, how) for query in queries)
 
     def detect(self, frame: Frame, queries: Sequence[str]) -> list[Detection]:
         """Return all instances of each query with masks, best first, without boxes too large for their class."""
@@ -200,9 +201,6 @@ class YoloDetector:
             if index not in classes and not is_generic(query) and not same_kind(query, name):
                 return Rival(name, float(overlapping.scores[row]))
         return None
-
-    def _match(self, query: str) -> NounMatch:
-        return match_noun(query, self.class_names, self._embeddings, self._settings.class_match)
 
 
 def load_yolo(model: OpenModel, accept_similar: bool = False) -> YoloDetector:
