@@ -41,6 +41,7 @@ from gausslite.mission.results import (
     MAP_TO_ODOM,
     TRAJECTORY,
     as_text,
+    map_file,
     prepare_folder,
     read_corrections,
     read_report,
@@ -59,7 +60,7 @@ _PICTURES = 8
 class EvalOptions:
     """The options of `gausslite eval` beside those of the source and the regions."""
 
-    map: Path = option(MISSING, "a PLY file", metavar="MAP")
+    map: Path = option(MISSING, "a PLY file, or the results folder of a run", metavar="MAP")
     strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
     test_every: int | None = option(
         None,
@@ -99,6 +100,7 @@ def configure(parser: CommandParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Render the map from every selected frame with depth, and print the mean scores. Returns the exit code."""
+    options.map = map_file(options.map)
     viewer = view_map(read_ply(options.map, print_message), threads=options.threads)
     conditions = _Conditions.of(options)
     recorded = open_recorded(options.source, options.up, require_poses=conditions.trajectory is None)

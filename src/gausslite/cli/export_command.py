@@ -13,7 +13,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.evaluation.views import view_map
 from gausslite.export.formats import FORMATS, ExportSettings, MapContent, read_map, upright
 from gausslite.export.occupancy import OccupancySettings
-from gausslite.mission.results import as_text, prepare_folder, read_report, require_absent
+from gausslite.mission.results import as_text, map_file, prepare_folder, read_report, require_absent
 from gausslite.process import print_message, size_text
 
 _MESH_VOXEL_M, _OCCUPANCY_VOXEL_M, _MIN_OPACITY, _VIDEO_S = 0.01, 0.05, 0.3, 12.0
@@ -97,7 +97,7 @@ def _default_file(source: Path, suffix: str) -> Path:
 
 def _require_separate(out: Path, source: Path) -> None:
     """Raise InvalidInputError if the output is the map that is read, also through a link."""
-    file = source / "map.ply" if source.is_dir() else source
+    file = map_file(source)
     if out.resolve() == file.resolve() or (out.exists() and out.samefile(file)):
         raise InvalidInputError(f"--out {out}: expected a file that is not the input")
 

@@ -13,14 +13,18 @@ from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError, MismatchError
 from gausslite.domain.voxels import MAX_VOXEL_M, MIN_VOXEL_M, VoxelGrid
 from gausslite.fusion.vote import fuse_maps
-from gausslite.mission.results import MAP_FILE, as_text, prepare_file
+from gausslite.mission.results import MAP_FILE, as_text, map_file, prepare_file
 from gausslite.process import print_message
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite fuse`."""
     parser.add_argument(
-        "maps", metavar="MAP", type=read_path, nargs="+", help="two or more PLY files in one world frame"
+        "maps",
+        metavar="MAP",
+        type=read_path,
+        nargs="+",
+        help="two or more PLY files or results folders in one world frame",
     )
     parser.add_argument(
         "--out", metavar="FILE.ply", type=read_path, required=True, help="the fused map; not an input file"
@@ -40,12 +44,13 @@ def run(options: argparse.Namespace) -> int:
     """Fuse and write the maps; if scores are equal, the map given first wins. Returns the exit code."""
     if len(options.maps) < 2:
         raise InvalidInputError(f"maps: expected at least two files to fuse, got {len(options.maps)}")
-    _require_separate(options.maps, options.out)
-    frames = {path: read_world_frame(path) for path in options.maps}
+    files = [map_file(path) for path in options.maps]
+    _require_separate(files, options.out)
+    frames = {path: read_world_frame(path) for path in files}
     world_frame = _common_world_frame(frames)
     prepare_file(options.out.absolute(), MAP_FILE)
     # the vote's last tie-break is the lower id: number the files in the given order
-    maps = {f"{i:03d} {path}": read_ply(path, print_message) for i, path in enumerate(options.maps)}
+    maps = {f"{i:03d} {path}": read_ply(path, print_message) for i, path in enumerate(files)}
     fused = fuse_maps(maps, VoxelGrid(options.voxel_size))
     write_ply(options.out, fused.gaussians, world_frame)
     _print_unnamed(frames, world_frame)

@@ -31,7 +31,7 @@ from gausslite.export.occupancy import (
 )
 from gausslite.export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
 from gausslite.export.video import write_video
-from gausslite.mission.results import stated_up
+from gausslite.mission.results import map_file, stated_up
 from gausslite.process import import_extra
 
 _PCD_ROW = np.dtype(
@@ -158,7 +158,7 @@ def read_map(
     report.json. Gaussians with a coordinate or a standard deviation above max_extent_m are left out. Raises
     MapFileError; InvalidInputError if nothing is left to write.
     """
-    folder, file = (path, path / "map.ply") if path.is_dir() else (None, path)
+    folder, file = path if path.is_dir() else None, map_file(path)
     if not file.is_file():
         raise MapFileError(f"{path}: expected a results folder with map.ply, or a PLY file, got neither")
     stored = read_stored_map(file)

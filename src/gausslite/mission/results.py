@@ -94,6 +94,11 @@ STATE_FILE = FileKind("a saved run", STATE_FORMAT.encode())
 CALIBRATION_FILE = FileKind("a calibration", b"# gausslite calibrate")
 
 
+def map_file(path: Path) -> Path:
+    """Return the map of a results folder; the path itself if it is no folder."""
+    return path / MAP if path.is_dir() else path
+
+
 def prepare_folder(folder: Path) -> None:
     """Create the folder and check that files can be written there. Raises StorageError.
 

@@ -66,6 +66,17 @@ def test_the_fused_map_names_the_world_frame_of_its_maps(
     assert not capsys.readouterr().err
 
 
+def test_a_results_folder_stands_for_its_map(
+    maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run").mkdir()
+    maps[0].rename(tmp_path / "run" / "map.ply")
+    assert fuse(tmp_path / "run", maps[1], tmp_path / "run" / "map.ply") == 2
+    assert "expected a file that is not an input" in capsys.readouterr().err
+    assert fuse(tmp_path / "run", maps[1], tmp_path / "fused.ply") == 0
+    assert f"{tmp_path / 'run' / 'map.ply'} won " in capsys.readouterr().out
+
+
 def test_the_same_file_twice_is_refused(maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "link.ply").symlink_to(maps[0])
     for same in (maps[0], tmp_path / "link.ply"):

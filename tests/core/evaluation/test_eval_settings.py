@@ -61,8 +61,8 @@ def test_eval_scores_the_frames_that_were_held_out(
     capsys.readouterr()
     assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json", "--test-every", "5"]) == 0
     assert json.loads(capsys.readouterr().out)["n_views"] == 2
-    # without the option the report next to the map decides; 1 asks for all
-    assert main(["eval", str(map_path), str(kitchen), "--set", "threads=1", "--json"]) == 0
+    # without the option the report next to the map decides; 1 asks for all. A results folder stands for its map
+    assert main(["eval", str(map_path.parent), str(kitchen), "--set", "threads=1", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["n_views"] == 2
     assert "from the report next to map.ply: --test-every 5\n" in captured.err
