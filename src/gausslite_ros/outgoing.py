@@ -23,7 +23,11 @@ OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
 """Levels of diagnostic_msgs/DiagnosticStatus, whose field is a byte."""
 _ADD, _DELETE_ALL = 0, 3
 _CUBE, _TEXT = 1, 9
-_COLOURS = {ObjectRole.TARGET: (0.1, 0.8, 0.2), ObjectRole.ANCHOR: (0.2, 0.5, 1.0)}
+_COLOURS = {
+    ObjectRole.TARGET: (0.1, 0.8, 0.2),
+    ObjectRole.ANCHOR: (0.2, 0.5, 1.0),
+    ObjectRole.OTHER: (0.6, 0.6, 0.6),
+}
 _MIN_SIDE_M = 0.01
 _TEXT_HEIGHT_M = 0.08
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gausslite.domain.objects import ObjectRole
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.perception.colours import ColourFilter
@@ -37,6 +38,9 @@ class ObservedObjects:
     @property
     def notes(self) -> tuple[str, ...]:
         return self._targets.notes(np.eye(4))
+
+    def roles(self) -> list[ObjectRole]:
+        return [self._targets.role(landmark) for landmark in self._object_map.objects]
 
     def observe(self, observations: Sequence[Observation]) -> None:
         self._object_map.observe(observations)

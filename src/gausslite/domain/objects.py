@@ -225,10 +225,11 @@ _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 
 
 class ObjectRole(StrEnum):
-    """Role of an object in a task graph."""
+    """Role of an object in a task graph; OTHER: a target's noun, but not the place or colour that the task states."""
 
     TARGET = "target"
     ANCHOR = "anchor"
+    OTHER = "other"
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,7 +378,7 @@ def oriented_box(
     indexes; without them, the whole region's Gaussians count within the landmark's box.
     """
     box, own = landmark.extent_m, gaussians.active
-    if targets or landmark.role is ObjectRole.ANCHOR:
+    if targets or landmark.role is not ObjectRole.TARGET:
         indices = [index for index, name in enumerate(targets) if landmark.noun in (name, noun_of(name))]
         own = own & np.isin(gaussians.target, indices)
     points_m = gaussians.means_m[own].astype(np.float64)

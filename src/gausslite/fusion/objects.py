@@ -204,10 +204,9 @@ def _merge_landmarks(landmarks: Sequence[ObjectLandmark]) -> ObjectLandmark:
         sum(w * landmark.centroid_m[axis] for w, landmark in zip(weights, landmarks, strict=True)) / sum(weights)
         for axis in range(3)
     )
-    is_target = any(landmark.role is ObjectRole.TARGET for landmark in landmarks)
     return replace(
         landmarks[0],
-        role=ObjectRole.TARGET if is_target else ObjectRole.ANCHOR,
+        role=min((landmark.role for landmark in landmarks), key=list(ObjectRole).index),
         centroid_m=(x, y, z),
         extent_m=AxisAlignedBox.around(np.vstack([landmark.corners_m for landmark in landmarks])),
         confidence=1.0 - math.prod(1.0 - landmark.confidence for landmark in landmarks),

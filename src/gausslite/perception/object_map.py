@@ -11,7 +11,6 @@ from numpy import ndarray
 
 from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark, ObjectRole
 from gausslite.domain.relevance import Rival
-from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.perception.colours import no_colours
 from gausslite.perception.settings import ObjectMapSettings
@@ -312,20 +311,20 @@ class ObjectMap:
         observed.append(nearest)
 
 
-def describe_landmarks(landmarks: Sequence[Landmark], graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
-    """Return the landmarks as values for a report: the targets before the anchors, the most confident ones first."""
-    described = [describe_landmark(landmark, graph) for landmark in landmarks]
-    described.sort(key=lambda landmark: (landmark.role is not ObjectRole.TARGET, -landmark.confidence))
+def describe_landmarks(landmarks: Sequence[tuple[Landmark, ObjectRole]]) -> tuple[ObjectLandmark, ...]:
+    """Return the landmarks as values for a report: targets, anchors, others; the most confident ones first."""
+    roles = list(ObjectRole)
+    described = [_describe(landmark, role) for landmark, role in landmarks]
+    described.sort(key=lambda landmark: (roles.index(landmark.role), -landmark.confidence))
     return tuple(described[:MAX_OBJECTS_PER_AGENT])
 
 
-def describe_landmark(landmark: Landmark, graph: TaskGraph) -> ObjectLandmark:
-    """Return a landmark as a value."""
+def _describe(landmark: Landmark, role: ObjectRole) -> ObjectLandmark:
     x, y, z = (float(value) for value in landmark.centroid_m)
     return ObjectLandmark(
         object_id=f"{landmark.phrase}-{landmark.number}",
         noun=landmark.phrase,
-        role=ObjectRole.TARGET if landmark.phrase in map(noun_of, graph.targets) else ObjectRole.ANCHOR,
+        role=role,
         centroid_m=(x, y, z),
         extent_m=landmark.box_m(),
         confidence=landmark.confidence,

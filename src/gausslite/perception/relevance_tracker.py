@@ -82,9 +82,10 @@ class RelevanceTracker:
 
     @property
     def objects(self) -> tuple[ObjectLandmark, ...]:
-        """The confirmed objects of the task, targets before anchors, the most confident first."""
+        """The confirmed objects of the task by their roles, the most confident first."""
         confirmed = self._evidence.confirmed(self.landmarks)
-        return describe_landmarks([found for found in confirmed if not self._targets.is_excluded(found)], self._graph)
+        kept = (found for found in confirmed if not self._targets.is_excluded(found))
+        return describe_landmarks([(found, self._targets.role(found)) for found in kept])
 
     def report(self, match: NounMatch) -> NounReport:
         """Return what has been detected of a noun so far."""

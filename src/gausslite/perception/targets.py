@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.domain.objects import ObjectRole
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.colours import ColourMatch
 from gausslite.perception.object_map import Landmark, Observation
@@ -60,6 +63,18 @@ class TargetSelector:
             return None
         sure = (name for name in names if colours.match(name, observation.colours) is ColourMatch.YES)
         return next(sure, names[0])
+
+    def role(self, landmark: Landmark) -> ObjectRole:
+        """Return what an object is to the task, by all that was seen so far.
+
+        An object that was marked before its anchor was seen may turn out to be another one than the task means. Without
+        a viewpoint, sides are evaluated as near.
+        """
+        observation = replace(landmark.seen_from(np.zeros(3)), camera_m=None)
+        if self._given_name(landmark) or self.target_of(observation) is not None:
+            return ObjectRole.TARGET
+        is_anchor = landmark.phrase in map(noun_of, self._graph.anchors) or landmark.phrase not in self._names
+        return ObjectRole.ANCHOR if is_anchor else ObjectRole.OTHER
 
     def notes(self, T_world_camera: Float64[ndarray, "4 4"] | None) -> tuple[str, ...]:
         """Return what colours, heights and scores decided, and unseen anchors; T_world_camera: the latest viewpoint."""

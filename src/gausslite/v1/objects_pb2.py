@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from gausslite.v1 import geometry_pb2 as gausslite_dot_v1_dot_geometry__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agausslite/v1/objects.proto\x12\x0cgausslite.v1\x1a\x1bgausslite/v1/geometry.proto\"\x92\x02\n\x0eObjectLandmark\x12\n\n\x02id\x18\x01 \x01(\t\x12\x0c\n\x04noun\x18\x02 \x01(\t\x12&\n\x04role\x18\x03 \x01(\x0e\x32\x18.gausslite.v1.ObjectRole\x12\'\n\ncentroid_m\x18\x04 \x01(\x0b\x32\x13.gausslite.v1.Point\x12#\n\x08\x65xtent_m\x18\x05 \x01(\x0b\x32\x11.gausslite.v1.Box\x12\x12\n\nconfidence\x18\x06 \x01(\x01\x12\x15\n\rfirst_seen_ns\x18\x07 \x01(\x03\x12\x14\n\x0clast_seen_ns\x18\x08 \x01(\x03\x12/\n\tobservers\x18\t \x03(\x0b\x32\x1c.gausslite.v1.ObjectObserver\"\x86\x01\n\x0eObjectObserver\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\x11\n\tobject_id\x18\x02 \x01(\t\x12\x0e\n\x06target\x18\x03 \x01(\x05\x12\x12\n\nconfidence\x18\x04 \x01(\x01\x12\x15\n\rfirst_seen_ns\x18\x05 \x01(\x03\x12\x14\n\x0clast_seen_ns\x18\x06 \x01(\x03*Y\n\nObjectRole\x12\x1b\n\x17OBJECT_ROLE_UNSPECIFIED\x10\x00\x12\x16\n\x12OBJECT_ROLE_TARGET\x10\x01\x12\x16\n\x12OBJECT_ROLE_ANCHOR\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agausslite/v1/objects.proto\x12\x0cgausslite.v1\x1a\x1bgausslite/v1/geometry.proto\"\x92\x02\n\x0eObjectLandmark\x12\n\n\x02id\x18\x01 \x01(\t\x12\x0c\n\x04noun\x18\x02 \x01(\t\x12&\n\x04role\x18\x03 \x01(\x0e\x32\x18.gausslite.v1.ObjectRole\x12\'\n\ncentroid_m\x18\x04 \x01(\x0b\x32\x13.gausslite.v1.Point\x12#\n\x08\x65xtent_m\x18\x05 \x01(\x0b\x32\x11.gausslite.v1.Box\x12\x12\n\nconfidence\x18\x06 \x01(\x01\x12\x15\n\rfirst_seen_ns\x18\x07 \x01(\x03\x12\x14\n\x0clast_seen_ns\x18\x08 \x01(\x03\x12/\n\tobservers\x18\t \x03(\x0b\x32\x1c.gausslite.v1.ObjectObserver\"\x86\x01\n\x0eObjectObserver\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12\x11\n\tobject_id\x18\x02 \x01(\t\x12\x0e\n\x06target\x18\x03 \x01(\x05\x12\x12\n\nconfidence\x18\x04 \x01(\x01\x12\x15\n\rfirst_seen_ns\x18\x05 \x01(\x03\x12\x14\n\x0clast_seen_ns\x18\x06 \x01(\x03*p\n\nObjectRole\x12\x1b\n\x17OBJECT_ROLE_UNSPECIFIED\x10\x00\x12\x16\n\x12OBJECT_ROLE_TARGET\x10\x01\x12\x16\n\x12OBJECT_ROLE_ANCHOR\x10\x02\x12\x15\n\x11OBJECT_ROLE_OTHER\x10\x03\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,7 +33,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gausslite.v1.objects_pb2', 
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_OBJECTROLE']._serialized_start=487
-  _globals['_OBJECTROLE']._serialized_end=576
+  _globals['_OBJECTROLE']._serialized_end=599
   _globals['_OBJECTLANDMARK']._serialized_start=74
   _globals['_OBJECTLANDMARK']._serialized_end=348
   _globals['_OBJECTOBSERVER']._serialized_start=351

@@ -34,6 +34,8 @@ class _ObjectRoleEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_ObjectRole
     """A target of the task."""
     OBJECT_ROLE_ANCHOR: _ObjectRole.ValueType  # 2
     """An anchor: it locates a target."""
+    OBJECT_ROLE_OTHER: _ObjectRole.ValueType  # 3
+    """An object of a target's noun, but not of the place or colour that the task states."""
 
 class ObjectRole(_ObjectRole, metaclass=_ObjectRoleEnumTypeWrapper): ...
 
@@ -42,6 +44,8 @@ OBJECT_ROLE_TARGET: ObjectRole.ValueType  # 1
 """A target of the task."""
 OBJECT_ROLE_ANCHOR: ObjectRole.ValueType  # 2
 """An anchor: it locates a target."""
+OBJECT_ROLE_OTHER: ObjectRole.ValueType  # 3
+"""An object of a target's noun, but not of the place or colour that the task states."""
 Global___ObjectRole: _TypeAlias = ObjectRole  # noqa: Y015
 
 @_typing.final

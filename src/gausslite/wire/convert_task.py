@@ -191,7 +191,11 @@ def _relation_from_message(message: task_pb2.Relation) -> Relation:
     )
 
 
-_ROLES = {ObjectRole.TARGET: objects_pb2.OBJECT_ROLE_TARGET, ObjectRole.ANCHOR: objects_pb2.OBJECT_ROLE_ANCHOR}
+_ROLES = {
+    ObjectRole.TARGET: objects_pb2.OBJECT_ROLE_TARGET,
+    ObjectRole.ANCHOR: objects_pb2.OBJECT_ROLE_ANCHOR,
+    ObjectRole.OTHER: objects_pb2.OBJECT_ROLE_OTHER,
+}
 _OBJECT_ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}
 _LANDMARK = ("noun", "confidence", "first_seen_ns", "last_seen_ns")
 _OBSERVER = tuple(field.name for field in fields(ObjectObserver))
@@ -213,7 +217,7 @@ def object_from_message(message: objects_pb2.ObjectLandmark) -> ObjectLandmark:
     """Decode an object without its observers. Raises InvalidInputError."""
     role = _OBJECT_ROLE_BY_NUMBER.get(message.role)
     if role is None:
-        raise InvalidInputError(f"object role: expected TARGET or ANCHOR, got {message.role}")
+        raise InvalidInputError(f"object role: expected TARGET, ANCHOR or OTHER, got {message.role}")
     return ObjectLandmark(
         object_id=message.id,
         role=role,

@@ -12,7 +12,7 @@ from observed_objects import ObservedObjects
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import NounMatch
+from gausslite.domain.objects import NounMatch, ObjectRole
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
@@ -219,14 +219,14 @@ def test_doubles_are_merged_when_an_observation_makes_them_overlap():
 
 
 def test_the_best_target_is_reported_first_and_anchors_last():
-    graph = TaskGraph("id", "", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),))
     observations = [
         cloud(*seen, (x_m, x_m + 0.1), (0, 0.1), (0, 0.1))
         for x_m, seen in enumerate([("table", 0.9), ("mug", 0.3), ("mug", 0.8)])
     ]
     object_map = ObjectMap()
     object_map.observe(observations)
-    described = describe_landmarks(object_map.objects, graph)
+    roles = {"mug": ObjectRole.TARGET, "table": ObjectRole.ANCHOR}
+    described = describe_landmarks([(landmark, roles[landmark.phrase]) for landmark in object_map.objects])
     assert [(landmark.noun, landmark.confidence) for landmark in described] == [
         ("mug", 0.8),
         ("mug", 0.3),

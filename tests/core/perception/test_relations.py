@@ -12,6 +12,7 @@ from observed_objects import ObservedObjects
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
+from gausslite.domain.objects import ObjectRole
 from gausslite.domain.relevance import BallRegion
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, Superlative, TaskGraph
 from gausslite.perception.detector import RegionDetector
@@ -153,6 +154,16 @@ def test_a_negated_relation_keeps_the_objects_that_do_not_satisfy_it():
     spatial.observe([TABLE, on, beside])
     assert spatial.target_of(on) is None
     assert spatial.target_of(beside) is not None
+
+
+def test_an_object_that_was_marked_before_its_anchor_was_seen_is_another_one():
+    spatial = objects_of(Relation(Predicate.ON, "mug", "table"))
+    on, beside = small_object("mug", 0.4, -0.4, 0.1), small_object("mug", 2.0, -0.4, 0.1)
+    for _ in range(2):
+        spatial.observe([beside])
+    assert spatial.roles() == [ObjectRole.TARGET]
+    spatial.observe([TABLE, on])
+    assert spatial.roles() == [ObjectRole.OTHER, ObjectRole.ANCHOR, ObjectRole.TARGET]
 
 
 def test_scores_are_compared_only_among_objects_that_satisfy_the_relation():
