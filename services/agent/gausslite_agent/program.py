@@ -8,7 +8,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 
 from gausslite.calibration.calibrate import recording_notes
@@ -20,7 +20,7 @@ from gausslite.domain.task import TaskGraph
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.prior import SavedMap
 from gausslite.mission.prior_run import PriorRun, require_other_folder
-from gausslite.mission.results import prepare_file, prepare_folder
+from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.process import Sibling, sibling
@@ -125,7 +125,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """
 
     async def serve() -> int:
-        return await _serve(parse_arguments(arguments))
+        settings = parse_arguments(arguments)
+        with nullcontext() if settings.out is None else locked_folder(settings.out):
+            return await _serve(settings)
 
     return run_service("gausslite-agent", serve)
 
@@ -205,7 +207,6 @@ def _require_usable(settings: AgentSettings) -> None:
         unit_up_axis(settings.up_axis)
     if settings.out is not None:
         require_other_folder(settings.prior, settings.out)
-        prepare_folder(settings.out)
     if settings.state is not None:
         prepare_file(settings.state)
 

@@ -27,6 +27,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.relevance import BallRegion, Region
 from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.mission.results import locked_folder
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.schedule import read_timeline
 from gausslite.mission.settings import SourceSettings
@@ -245,6 +246,16 @@ def test_a_wrong_command_line_is_one_line_and_code_2(
     assert run(["--listen", "127.0.0.1:0", *arguments]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_two_agents_cannot_write_into_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from gausslite_agent.program import run
+
+    with locked_folder(tmp_path / "out"):
+        # the missing detector ends an agent that does not look whether the folder is in use
+        arguments = ["--listen", "127.0.0.1:0", "--out", str(tmp_path / "out"), "--detector", "/nowhere.onnx"]
+        assert run(arguments) == 2
+    assert "another run writes its results there; choose another --out" in capsys.readouterr().err
 
 
 def test_assign_task_names_the_parser_that_does_not_answer(tmp_path: Path) -> None:
