@@ -43,6 +43,7 @@ from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.map_diff import Change
+from gausslite.mission.prior import SavedMap
 from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import (
     MAP,
@@ -180,6 +181,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _map(options: argparse.Namespace) -> int:
+    earlier = None if options.prior is None else SavedMap.read(options.prior)
     inputs = MapInputs.of(options)
     saved = None if options.resume is None else SavedRun.read(options.resume)
     if saved is not None:
@@ -202,8 +204,8 @@ def _map(options: argparse.Namespace) -> int:
         stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
         inputs = inputs.calibrated(replace(stated, force=options.force))
     prior = None if saved is None else PriorRun.resumed(saved.extra, inputs.mission)
-    if options.prior is not None:
-        prior = localised(options.prior, inputs)
+    if earlier is not None:
+        prior = localised(earlier, inputs)
     recorded = inputs
     if prior is not None:
         inputs = in_frame_of(prior, recorded)

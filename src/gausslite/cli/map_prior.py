@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 from gausslite.cli.map_inputs import MapInputs
 from gausslite.datasets.moved_source import MovedSource
@@ -17,9 +16,9 @@ from gausslite.mission.settings import PoseMode
 from gausslite.process import print_message
 
 
-def localised(folder: Path, inputs: MapInputs) -> PriorRun:
-    """Localise the sequence in the map of a run, and print the result. Raises MapFileError."""
-    prior = PriorRun(SavedMap.read(folder), inputs.mission)
+def localised(earlier: SavedMap, inputs: MapInputs) -> PriorRun:
+    """Localise the sequence in the map of an earlier run, and print the result."""
+    prior = PriorRun(earlier, inputs.mission)
     for frame in _frames(inputs):
         if prior.is_done:
             break

@@ -29,6 +29,15 @@ def test_a_map_names_the_folder_or_the_given_world_frame(tmp_path: Path) -> None
         assert read_world_frame(tmp_path / "out" / "map.ply") == name
 
 
+def test_a_missing_earlier_map_is_refused_before_the_recording_is_analysed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
+    assert main(["map", str(sequence), "--prior", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert f"{tmp_path / 'none' / 'map.ply'}: cannot read the map: No such file" in line
+
+
 def test_two_runs_cannot_write_into_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = write_seven_scenes(tmp_path / "kitchen", FRAMES)
     with locked_folder(tmp_path / "out"):
