@@ -173,7 +173,7 @@ def _correction_of(source: Source, lens: Lens | None, decide: Callable[[Evidence
         decide(Evidence("camera-correction", _NONE, ("the source has an ideal camera",), guaranteed=True))
         return CameraCorrection()
     if not source.depth_registered:
-        decide(Evidence("camera-correction", _NONE, ("depth is not registered to colour",)))
+        decide(Evidence("camera-correction", _NONE, ("needs depth that is known to be registered to colour",)))
         return CameraCorrection()
     estimate = estimate_camera(source, CameraCorrection(lens or source.lens))
     correction = estimate.correction

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from tiny_sequences import write_seven_scenes
 
 from gausslite.cli.main import main
 from gausslite.domain.recording import CameraCorrection
@@ -40,6 +41,14 @@ def test_json_has_every_estimate_and_its_evidence(capsys: pytest.CaptureFixture[
     assert stored["evidence"]["register_depth"] == ["the layout has registered depth"]
     assert "turn fast enough" in stored["evidence"]["camera_correction"][0]
     assert "pairs of frames" in stored["evidence"]["pose_prior"][0]
+
+
+def test_depth_of_a_layout_that_states_nothing_is_not_called_unregistered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", str(write_seven_scenes(tmp_path / "kitchen", tuple(range(5)))), "--json"]) == 0
+    evidence = json.loads(capsys.readouterr().out)["evidence"]
+    assert evidence["camera_correction"] == ["needs depth that is known to be registered to colour"]
 
 
 def test_the_published_lens_is_kept_and_the_readout_of_a_real_clip_is_found(
