@@ -17,6 +17,7 @@ from gausslite.task.clause_types import (
     is_modal,
     is_question_subject,
 )
+from gausslite.task.correction import apply_corrections
 from gausslite.task.lexicon import ORDINALS, is_attribute, word_set
 from gausslite.task.negation import HAVE_FORMS, NOUN_PHRASE_TAGS, OBJECT_START_TAGS, chunk_negation
 from gausslite.task.tags import Tag, tag_words
@@ -25,6 +26,7 @@ from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
 _OBJECT_TAGS: Final = OBJECT_START_TAGS | {Tag.PRONOUN, Tag.ANAPHOR}
+_PERMISSIONS: Final = word_set("may can could")
 _NAMING: Final = word_set("label mark name call tag")
 _PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
 _BELONGING_TAGS: Final = frozenset({Tag.NOUN, Tag.INDEFINITE, Tag.ANAPHOR, Tag.PARTICIPLE})
@@ -57,7 +59,8 @@ class VerbChunker:
         ):
             buffer.emit_preposition("near", "has", current_place=True)
         if word != "be":  # "should be moved to the bench"
-            self._after_modal = is_modal(buffer.tagged, buffer.index) and buffer.last_kind() is ChunkKind.NOUN
+            requires = is_modal(buffer.tagged, buffer.index) or (word in _PERMISSIONS and self._denied_subject() > 0)
+            self._after_modal = requires and buffer.last_kind() is ChunkKind.NOUN
 
     def verb(self, word: str) -> None:
         """Emit an instruction; a verb of a subordinate clause relates its object to its subject."""
@@ -80,7 +83,7 @@ class VerbChunker:
             buffer.close()  # "something to write with"
         elif is_required and self._subject_is_object():
             if base in verbs.BELONGING_VERBS or buffer.word(-1) == "be":
-                buffer.emit(ChunkKind.SUBJECT_VERB, base)
+                self._require(base)
         elif belongs and not is_command(tagged, index):
             buffer.emit(ChunkKind.SUBJECT_VERB, base)
         elif subject is Tag.CONJUNCTION and word != base and described:
@@ -129,9 +132,10 @@ class VerbChunker:
         if after in NOUN_PHRASE_TAGS and before not in (Tag.NOUN, Tag.INDEFINITE, Tag.PRONOUN):
             buffer.words.append(word)
             return
-        self._end_relative_subject(finite=after is Tag.PRONOUN or before is Tag.INDEFINITE)
+        gives = buffer.last_verb() in verbs.GIVING_VERBS
+        self._end_relative_subject(finite=after is Tag.PRONOUN or before is Tag.INDEFINITE or not gives)
         if self._after_modal and self._subject_is_object():
-            buffer.emit(ChunkKind.SUBJECT_VERB, verbs.verb_base(word) or word)
+            self._require(verbs.verb_base(word) or word)
         elif after is Tag.ADJECTIVE and buffer.tag(2) not in NOUN_PHRASE_TAGS:
             pass  # "the coffee went cold"
         elif after in OBJECT_START_TAGS and buffer.last_kind() is ChunkKind.NOUN and before is not Tag.AUXILIARY:
@@ -140,6 +144,21 @@ class VerbChunker:
             else:
                 buffer.chunks.pop()  # "the toy my son dropped": the son is irrelevant
         self._after_modal = False
+
+    def _require(self, base: str) -> None:
+        """Emit the verb of "the box must be moved"; of "no box may be moved", negate it before its subject."""
+        denied_at = self._denied_subject()
+        if denied_at:
+            self._buffer.chunks.insert(denied_at, Chunk(ChunkKind.VERB, base, gerund=True))
+        else:
+            self._buffer.emit(ChunkKind.SUBJECT_VERB, base)
+
+    def _denied_subject(self) -> int:
+        """Return where the subject of "no box on the table may" starts; 0 for one that is not denied."""
+        start = len(self._buffer.chunks)
+        while start and self._buffer.chunks[start - 1].kind in (ChunkKind.NOUN, ChunkKind.PREPOSITION):
+            start -= 1
+        return start if start and self._buffer.chunks[start - 1].kind is ChunkKind.NEGATION else 0
 
     def _negated_verb(self, base: str) -> None:
         """Skip the verb of "that is not standing on"; "who does not wear a helmet" means not near it."""
@@ -201,7 +220,7 @@ _THEY: Final = word_set("they he she")
 
 def chunk_sentence(text: str) -> list[Chunk]:
     """Return the chunks of one normalised sentence, in order."""
-    return _Chunker(tag_words(lexical_units(text))).run()
+    return apply_corrections(_Chunker(tag_words(lexical_units(text))).run())
 
 
 class _Chunker:
@@ -330,8 +349,14 @@ class _Chunker:
             return
         if word == "what" and buffer.tag(1) is Tag.PRONOUN and buffer.last_verb() in ("ask", "tell", "report"):
             return  # "ask her what she wants"
-        if word in ("nothing", "nobody") and buffer.last_kind() is ChunkKind.PREPOSITION:
-            buffer.chunks.pop()  # "the crate that has nothing on it"
+        denies = word in ("nothing", "nobody")
+        if denies and buffer.last_kind() in (None, ChunkKind.CLAUSE_BREAK, ChunkKind.CONJUNCTION):
+            buffer.emit(ChunkKind.NEGATION, "no")  # "nothing on the altar may be moved"
+            if word == "nobody":
+                return
+        elif denies and buffer.last_kind() in (ChunkKind.PREPOSITION, ChunkKind.NOUN):
+            if buffer.last_kind() is ChunkKind.PREPOSITION:
+                buffer.chunks.pop()  # "the crate that has nothing on it"
             buffer.emit(ChunkKind.NOT_UNDERSTOOD, word)
             return
         buffer.words.append(lexicon.INDEFINITE_PRONOUNS.get(word, "person"))

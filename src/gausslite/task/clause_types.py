@@ -117,10 +117,11 @@ def _clause_type(tagged: TaggedWords, start: int, end: int, before: ClauseType) 
     clause = tagged[first:end]
     if opener[1] is Tag.CLAUSE_BREAK and opener[0] in _REASONS:
         return ClauseType.REASON
-    if clause and opener[0] in _TIMES and clause[0][0] in _OTHER_PEOPLE | {"we"}:
-        return ClauseType.STATEMENT  # "while I hold the door"
-    if clause and opener[0] == "before" and clause[0][1] is Tag.ANAPHOR:
-        return ClauseType.STATEMENT  # "before it reaches the rug"
+    # "while I hold the door", "before it reaches the rug", "while the dog is asleep"
+    others = clause and opener[0] in _TIMES and clause[0][0] in _OTHER_PEOPLE | {"we"}
+    it_does = clause and opener[0] == "before" and clause[0][1] is Tag.ANAPHOR
+    if others or it_does or (opener[0] == "while" and _is_statement(tagged, first)):
+        return ClauseType.STATEMENT
     if not clause or (opener[1] is Tag.CLAUSE_BREAK and opener[0] in _CONDITIONS):
         return ClauseType.REQUEST
     is_statement = clause[0][0] in _UNKNOWN_PEOPLE and len(clause) > 1 and clause[1][1] in _PREDICATES
@@ -128,6 +129,9 @@ def _clause_type(tagged: TaggedWords, start: int, end: int, before: ClauseType) 
     if is_question or any(_is_request(tagged, index) for index in range(first, end)):
         return ClauseType.REQUEST
     # "bring the hammer. And the nails."
+    after = [*tagged[end : end + 3], *[(";", Tag.CLAUSE_BREAK)] * 3]
+    if after[0][0] == ":" and (after[1][1], after[2][1]) == (Tag.VERB, Tag.CLAUSE_BREAK):
+        return ClauseType.REQUEST  # "crane hook: inspect"
     elliptic = not any(tag in (Tag.AUXILIARY, Tag.VERB, Tag.PRONOUN) for _, tag in clause)
     # "there are two sinks. The one near the door."
     names = clause[0][1] in (Tag.DETERMINER, Tag.NOUN, Tag.ADJECTIVE) and opener[1] is Tag.CLAUSE_BREAK

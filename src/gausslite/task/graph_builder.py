@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gausslite.domain.task import TargetRole
-from gausslite.task import lexicon
+from gausslite.task import lexicon, verbs
 from gausslite.task.chunk import Chunk, ChunkKind, NounPhrase, adjectives_only, names_object, phrase_from_text
 from gausslite.task.graph_draft import Clause, GraphDraft, RelationTerms
 from gausslite.task.lexicon import SUPERLATIVES, is_attribute
 from gausslite.task.roles import RoleAssigner
 from gausslite.task.tokens import UNBOUNDED
-from gausslite.task.verbs import BELONGING_VERBS, CONTACT_VERBS, GO_VERBS, LEAVING_VERBS, PLACE_VERBS, TRAVEL_VERBS
 
 # "drone, fly to the roof" addresses the drone, "find the drone" does not
 # with these, a room or place states where something is
@@ -19,6 +18,8 @@ _SPACE_PREPOSITIONS = frozenset(
     {"at", "around", "throughout", "across", "on", "near the middle of", "along", "through"}
 )
 _THOSE_THERE = [ChunkKind.DEMONSTRATIVE, ChunkKind.PREPOSITION]
+# after a negation: "open no door except the red one"
+_EXCEPTIONS = ("except", "besides", "apart", "aside", "other", "but", "save", "barring")
 _ADDRESSED_ROBOTS = (("drone",), ("rover",))
 
 
@@ -58,7 +59,10 @@ class GraphBuilder:
         if chunk.kind is ChunkKind.VERB:
             self._verb(before, chunk)
         elif chunk.kind is ChunkKind.SUBJECT_VERB:
-            self._clause.verb = "put" if chunk.word in BELONGING_VERBS else chunk.word
+            if chunk.word in verbs.AVOIDING_VERBS:  # "drive to the ramp, the cones must be avoided"
+                subjects = self._clause.objects[-1 if self._clause.verb else 0 :]
+                self._draft.roles.update(dict.fromkeys(subjects, TargetRole.OBSTACLE))
+            self._clause.verb = "put" if chunk.word in verbs.BELONGING_VERBS else chunk.word
             self._clause.last_relation, self._negated = None, False
         elif chunk.kind is ChunkKind.NOUN and chunk.noun is not None:
             self._plurals |= {chunk.noun.text} if chunk.noun.is_plural else set()
@@ -73,7 +77,7 @@ class GraphBuilder:
         elif chunk.kind is ChunkKind.NEGATION:
             self._negation(chunk.word)
         elif chunk.kind in (ChunkKind.CLAUSE_BREAK, ChunkKind.STATEMENT):
-            goes_on = self._clause.verb in GO_VERBS and after is not None and after.word in ("past", "via", "to")
+            goes_on = self._clause.verb in verbs.GO_VERBS and after is not None and after.word in ("past", "via", "to")
             self._new_clause(self._clause.verb if goes_on else None)  # "go up the steps, then past the bar"
             self._negated, self._clause.statement = False, chunk.kind is ChunkKind.STATEMENT
         elif chunk.kind is ChunkKind.ANAPHOR:
@@ -123,8 +127,10 @@ class GraphBuilder:
 
     def _negation(self, word: str) -> None:
         """Start an exclusion; a second negation cancels it: "ignore everything except the signs"."""
-        if self._negated and self._draft.excluded[-1:] == ["object"]:
-            self._draft.excluded.pop()
+        if word == "nor" and self._negated:
+            return
+        if self._negated and word.startswith(_EXCEPTIONS):
+            self._draft.excluded = [phrase for phrase in self._draft.excluded if phrase not in self._negated_objects]
             self._negated = False
             return
         if word not in ("not", "no", "but not", "not to") and self._clause.verb is not None:
@@ -152,7 +158,10 @@ class GraphBuilder:
     def _verb(self, before: Chunk | None, chunk: Chunk) -> None:
         is_kept = chunk.word == "keep" and before is not None and before.word == "but"
         is_leave = (chunk.word == "leave" or is_kept) and not self._clause.statement
-        if is_leave and self._draft.targets and self._leave_excludes(before):
+        # "leave the jug, take the cup"
+        later = next((chunk.word for chunk in self._following if chunk.kind is ChunkKind.VERB), "")
+        chooses = self._draft.targets or later in ("take", "bring", "pick", "grab", "get", "fetch")
+        if is_leave and chooses and self._leave_excludes(before):
             self._negate()
             return
         joined = before is not None and before.kind is ChunkKind.CONJUNCTION
@@ -208,7 +217,7 @@ class GraphBuilder:
                 clause.by_pronoun = bool(clause.verb and clause.objects)
                 self._draft.confirm_targets(clause.objects, self._assigner.role_of_object(""))
             return
-        if clause.verb in TRAVEL_VERBS and not clause.objects and clause.referents:
+        if clause.verb in verbs.TRAVEL_VERBS and not clause.objects and clause.referents:
             for phrase in clause.referents:
                 self._assigner.assign_by_preposition(pending, phrase_from_text(phrase))
             return
@@ -218,7 +227,7 @@ class GraphBuilder:
         if named and subjects:
             clause.objects = subjects
             if pending == "with":
-                self._assigner.make_tools(named)
+                self._draft.roles.update(dict.fromkeys(named, TargetRole.TOOL))  # "wipe the table with it"
                 return
             for phrase in named:
                 self._assigner.assign_by_preposition(pending, phrase_from_text(phrase))
@@ -236,9 +245,12 @@ class GraphBuilder:
         """Handle a "this" without a noun."""
         if self._negated:
             self._negate_latest()
+            self._clause.nouns_since_negation += 1
             return
         names_more = self._pending is None and after is not None and after.kind is ChunkKind.PREPOSITION
-        left = self._clause.verb in LEAVING_VERBS and bool(self._draft.context)  # "you are in a kitchen. leave it"
+        left = self._clause.verb in verbs.LEAVING_VERBS and bool(
+            self._draft.context
+        )  # "you are in a kitchen. leave it"
         if left or (self._clause.verb is None and self._pending is None) or (names_more and self._clause.objects):
             return  # "the tiles, especially those behind the toilet"
         self._draft.unnamed = self._draft.unnamed or word
@@ -289,7 +301,7 @@ class GraphBuilder:
         nouns = [*(_with_shared_head(adjective, noun) for adjective in self._adjectives), noun]
         self._adjectives = []
         for listed in nouns:
-            goes = pending == "to" or (self._clause.verb in PLACE_VERBS and not self._clause.current_place)
+            goes = pending == "to" or (self._clause.verb in verbs.PLACE_VERBS and not self._clause.current_place)
             excepted = bool(self._negated_objects) and self._negated_objects[-1] in self._draft.excluded
             goes = goes and not self._clause.places and not self._clause.verb_since_negation and excepted
             if self._negated and pending and goes:
@@ -378,7 +390,9 @@ class GraphBuilder:
     def _may_harm(self, pending: str | None) -> bool:
         """Return True for "don't touch", and for "don't go near" or "over", unlike "don't go to"."""
         verb = self._clause.verb
-        return verb in CONTACT_VERBS or (verb in GO_VERBS and pending in ("near", "on", "above", "past", "via"))
+        return verb in verbs.CONTACT_VERBS or (
+            verb in verbs.GO_VERBS and pending in ("near", "on", "above", "past", "via")
+        )
 
     def _place_negated(self, noun: NounPhrase, relation: str) -> None:
         """Relate an obstacle to its place; "the mugs except the one on the shelf" negates the relation."""
@@ -391,7 +405,7 @@ class GraphBuilder:
             self._draft.excluded = [phrase for phrase in self._draft.excluded if phrase not in objects]
             self._draft.add_relation(RelationTerms(relation, not terms.negated, terms.bounds), objects, noun.text)
         else:
-            if self._clause.verb in PLACE_VERBS and self._clause.verb_since_negation:
+            if self._clause.verb in verbs.PLACE_VERBS and self._clause.verb_since_negation:
                 self._draft.exclude(noun.text)
                 return
             self._denied_places += [(phrase, RelationTerms(relation, True, terms.bounds), noun) for phrase in objects]

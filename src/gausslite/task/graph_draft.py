@@ -129,8 +129,7 @@ class GraphDraft:
         shown = f"'{terms.relation.replace('_', ' ')}' {anchor!r}"
         if terms.relation in ("far_from", "clear_of"):
             return Predicate.NEAR, not terms.negated
-        encloses = anchor.split()[-1] in lexicon.CONTAINERS or lexicon.is_space(tuple(anchor.split()))
-        if terms.relation == "outside" and encloses:
+        if terms.relation == "outside" and anchor.split()[-1] not in lexicon.PASSAGES | {"window", "elevator", "lift"}:
             return Predicate.INSIDE, not terms.negated
         if terms.relation == "at_distance":
             self.warnings.append(f"the distance from {anchor!r} is vague or negative: it is dropped")

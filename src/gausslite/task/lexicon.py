@@ -137,6 +137,7 @@ DEFECTS: Final = words("defects")
 PEOPLE: Final = words("people")
 CLOTHING: Final = words("clothing")
 PARTS: Final = words("parts")
+PASSAGES: Final = word_set("door doorway entrance gate archway")
 # tools to take something with
 HELD_TOOLS: Final = words("held_tools")
 GENERIC: Final = word_set("object thing item stuff obstacle obstruction clutter hazard debris target")

@@ -31,10 +31,11 @@ _QUESTION_WORDS: Final = word_set("is are was were does did has have can could w
 def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
     """Handle the negation at the current word."""
     before, after = buffer.tag(-1), buffer.tag(1)
-    if word == "no" and buffer.word(1) in (",", ".", ";"):
-        buffer.close()  # "the hammer. no, the bigger one"
-    elif word == "no":
+    if word == "no" or (word == "neither" and buffer.word(-1) in HAVE_FORMS):
         _deny(buffer)
+    elif word == "nor" and _denies_place(buffer):
+        buffer.negates_next = True
+        buffer.emit_preposition("near", "without")
     elif before is Tag.PRONOUN and buffer.word(-1) in _SUBJECTS and verb_base(buffer.word(1)) not in _NEGATED_VERBS:
         buffer.close()  # "I can't find my phone"
         # "I can't find it on the sofa"
@@ -63,14 +64,21 @@ def chunk_negation(buffer: ChunkBuffer, word: str) -> None:
         buffer.emit(ChunkKind.NEGATION, word)
 
 
+def _denies_place(buffer: ChunkBuffer) -> bool:
+    """Return True at the "nor" of "has neither a helmet nor a vest"."""
+    buffer.close()
+    return len(buffer.chunks) > 1 and buffer.chunks[-2].kind is ChunkKind.PREPOSITION and buffer.chunks[-2].negated
+
+
 def _deny(buffer: ChunkBuffer) -> None:
     """Negate the relation of "with no lid", "has no lid", "with a lamp but no shade"; exclude for "no forks"."""
     buffer.close()
     kinds = [chunk.kind for chunk in buffer.chunks[-3:]]
     listed = kinds == [ChunkKind.PREPOSITION, ChunkKind.NOUN, ChunkKind.CONJUNCTION]
+    wears = buffer.tag(-2) is Tag.RELATIVE and verb_base(buffer.word(-1)) in HOLDING_VERBS
     if kinds[-1:] == [ChunkKind.PREPOSITION]:
         buffer.chunks[-1] = replace(buffer.chunks[-1], negated=True)
-    elif (buffer.word(-1) in HAVE_FORMS and kinds[-1:] == [ChunkKind.NOUN]) or (
+    elif ((wears or buffer.word(-1) in HAVE_FORMS) and kinds[-1:] == [ChunkKind.NOUN]) or (
         listed and buffer.chunks[-3].word in ("with", "near")
     ):
         buffer.negates_next = True

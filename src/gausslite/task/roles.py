@@ -26,8 +26,6 @@ _ROUTE_PREPOSITIONS: Final = word_set("around past through along across")
 _CROSSING_VERBS: Final = verbs.LEAVING_VERBS | (verbs.GO_VERBS - verbs.REACHING_VERBS - verbs.COVERING_VERBS)
 _PASSING_VERBS: Final = verbs.GO_VERBS - verbs.STOPPING_VERBS - word_set("park dock land")
 _GOING_ON: Final = verbs.TRAVEL_VERBS | {"keep", "turn", "pass"}
-_PASSAGES: Final = word_set("door doorway entrance gate archway")
-_PASSING_RELATIONS: Final = word_set("past beyond")
 
 
 class RoleAssigner:
@@ -37,14 +35,12 @@ class RoleAssigner:
         self._draft = draft
         self._relations = RelationAssigner(draft)
 
+        self.rename = self._relations.rename
+
     @property
     def clause(self) -> Clause:
         """The current clause."""
         return self._relations.clause
-
-    def rename(self, phrase: str, new: str) -> None:
-        """Change the description of an object that the sentence has named."""
-        self._relations.rename(phrase, new)
 
     def end_clause(self, verb: str | None, next_verb: str | None) -> None:
         """Start another clause. The places of a clause without objects ("look under the bed") become targets.
@@ -164,7 +160,7 @@ class RoleAssigner:
         clause = self.clause
         by_route, aimless = clause.preposition in _ROUTE_PREPOSITIONS, not (clause.objects or clause.pending_places)
         moves_by = (by_route or clause.preposition == "by") and clause.verb in _PASSING_VERBS
-        if (pending in _PASSING_RELATIONS and clause.verb in verbs.DELIVERY_VERBS - verbs.PLACE_VERBS) or (
+        if (pending in ("past", "beyond") and clause.verb in verbs.DELIVERY_VERBS - verbs.PLACE_VERBS) or (
             by_route and clause.verb in verbs.LEADING_VERBS and clause.objects
         ):
             self._draft.add_target(noun.text)
@@ -209,7 +205,9 @@ class RoleAssigner:
         if self._keeps_away(pending):
             self._draft.add_target(noun.text, TargetRole.OBSTACLE)  # "place it at least 1 m away from the stove"
             clause.last_relation = "away"
-        elif clause.terms.negated and clause.adds_place and self._has_destination(pending):
+        elif clause.terms.negated and (
+            self._has_destination(pending) if clause.adds_place else self._goes_on(following)
+        ):
             self._draft.exclude(noun.text)  # "put it on the table, not on the shelf"
         elif pending == "far_from" and clause.verb in verbs.GO_VERBS and not (clause.objects or clause.pending_places):
             self._assign_waypoint(noun)  # "back away from the desk"
@@ -245,6 +243,11 @@ class RoleAssigner:
         reached = any(self._draft.roles.get(phrase) is TargetRole.DESTINATION for phrase in self.clause.objects)
         goes_there = places[-1][0].relation == pending if places else reached and self.clause.preposition == "at"
         return self.clause.last_relation == "to" or (self.clause.verb in verbs.TRAVEL_VERBS and goes_there)
+
+    def _goes_on(self, following: Sequence[Chunk]) -> bool:
+        """Return True if another place follows: "put the jacket not on the chair, on the hanger"."""
+        kinds = [chunk.kind for chunk in following[:2]]
+        return self.clause.verb in verbs.PLACE_VERBS and kinds == [ChunkKind.CONJUNCTION, ChunkKind.PREPOSITION]
 
     def _assign_waypoint(self, noun: NounPhrase, conjoined: bool = False) -> None:
         if self.clause.verb in verbs.GO_VERBS:
@@ -289,10 +292,6 @@ class RoleAssigner:
         self.clause.places = [*self.clause.places, noun.text] if conjoined else [noun.text]
         self.clause.in_space = False
 
-    def make_tools(self, phrases: Sequence[str]) -> None:
-        """Make earlier objects tools: "take the sponge and wipe the table with it"."""
-        self._draft.roles.update(dict.fromkeys(phrases, TargetRole.TOOL))
-
     def _assign_after_with(self, noun: NounPhrase) -> None:
         """Assign the noun after "with": the hat of "find a man with a hat" is near him, a sponge is a tool."""
         clause = self.clause
@@ -312,10 +311,9 @@ class RoleAssigner:
 
     def _describes_with(self, noun: NounPhrase) -> bool:
         verb = self.clause.verb
-        if verb is None or verb in verbs.LOOKING_VERBS | verbs.STOPPING_VERBS:
-            return True
         handles = verb in verbs.FETCHING_VERBS | verbs.GIVING_VERBS | verbs.DELIVERY_VERBS
-        return handles and noun.head not in lexicon.HELD_TOOLS
+        looks = verb is None or verb in verbs.LOOKING_VERBS | verbs.STOPPING_VERBS
+        return looks or (handles and noun.head not in lexicon.HELD_TOOLS)
 
     def _assign_loaded(self, noun: NounPhrase) -> None:
         """Make the noun the object and the objects so far destinations: "load the van with boxes"."""
@@ -381,7 +379,7 @@ class RoleAssigner:
     def _destination(self, noun: NounPhrase) -> None:
         clause = self.clause
         latest = self._draft.mentions[-1] if self._draft.mentions else ""
-        is_passage = latest.split()[-1:] and latest.split()[-1] in _PASSAGES
+        is_passage = latest.split()[-1:] and latest.split()[-1] in lexicon.PASSAGES
         if (clause.verb in verbs.STOPPING_VERBS and clause.pending_places) or (
             is_passage and self._draft.roles.get(latest) is TargetRole.DESTINATION
         ):
@@ -414,6 +412,8 @@ class RoleAssigner:
                     self._relations.relate("inside" if place.head in lexicon.CONTAINERS else "near", place)
         elif not clause.objects:
             self.target(noun, TargetRole.OBJECT)
+        elif clause.verb in verbs.FETCHING_VERBS and noun.head in lexicon.PEOPLE and noun.is_definite:
+            self._add_destination(noun)
         else:
             clause.last_relation = "for"
 

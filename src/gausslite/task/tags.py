@@ -119,6 +119,8 @@ _BE: Final = word_set("is are was were")
 _OBJECTS_OF_VERBS: Final = word_set("the a an my it them up")
 _BEFORE_NAMES: Final = _ARTICLES | word_set("to at in near from")
 _FINITE: Final = word_set("is are was were has have can will")
+_BEFORE_OBJECTS: Final = lexicon.DETERMINERS | {"no"}
+_AROUND: Final = word_set("around under behind along between beneath")
 _THE: Final = _ARTICLES | word_set("this these those his her its our their")
 _OPENERS: Final = frozenset({"", ",", ".", ";", "and", "then"})
 _TURNS: Final = word_set("left right around back up down forward backward straight here there")
@@ -174,9 +176,11 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or stops  # "walk to the sofa stop", "turn left walk to"
         or (word in verbs.GO_VERBS and before in _TURNS and is_place)
         or (word in verbs.VERBS and before in _LEADING_VERBS | _NEGATED_COMMANDS)
+        or (word in verbs.RESTING_VERBS and is_place and _is_noun(before) and singular(before) != before)
+        or (opens and word in verbs.TOOL_VERBS and after in _AROUND)
         or (opens and word in _MOTIONS and (is_place or after in _TURNS))
         or (word in verbs.PLACE_VERBS and before in ("and", "then") and is_place)
-        or (opens and is_open and word in verbs.VERBS and after in lexicon.DETERMINERS)
+        or (opens and is_open and word in verbs.VERBS and after in _BEFORE_OBJECTS)
         or (opens and is_open and after in _THE and not word.endswith(_MODIFIER_ENDINGS))  # "fluff the pillow"
         or (opens and word in verbs.VERBS and after in _VERB_PARTICLES)  # "switch off"
         or (word in _BELONG and is_place and verbs.base_of_ed(before) is not None)  # "that were washed go in"
@@ -198,6 +202,7 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (opens and is_open and after in _BELONG and singular(word) != word)  # "drinks go on the shelf"
         or (word.endswith("ing") and named)
         or (word == "half" and after == "of"),  # "stand lamp"
+        Tag.PREPOSITION: word == "outside" and after in lexicon.DETERMINERS,
         Tag.GERUND: before in ("without", *_BE) and verbs.base_of_ing(word) is not None,
         Tag.PRONOUN: word == "one" and after in _MODALS_AFTER_ONE,
         Tag.DETERMINER: word == "one" and after == "of",

@@ -30,7 +30,7 @@ _ABOUT: Final = r"about|around|roughly|approximately|approx|some|exactly|nearly|
 # other prepositions that a distance can bound
 _BOUNDED: Final = (
     r"behind|in front|left|right|to the|above|below|under|underneath|beneath|over|inside|on the|before|past|after|"
-    r"beyond"
+    r"beyond|short"
 )
 _DISTANCE: Final = re.compile(
     rf"\b(?:at a distance of )?(?:(?P<max>{_MAX})|(?P<min>{_MIN}))?(?: ?\b(?:{_ABOUT}))? ?"
@@ -110,27 +110,38 @@ _PLACED: Final = (
 )
 _END: Final = r"(?: instead)?(?=$| ?[,.;])"
 _NAMED: Final = r"(?:the|an?|my|that|this)(?: \w+){1,3}?"
-_CORRECTION: Final = r"(?:(?:no|oh|wait|sorry|actually|rather|scratch that|make (?:that|it)),? )+"
+CORRECTION_MARKER: Final = "nowait"
+_CORRECTS: Final = (
+    r"no,? (?:wait|sorry|no)|wait,? no|i meant?|(?:scratch|strike|cancel|forget) that(?=[,.;:]| the\b)|"
+    r"on second thoughts?|or (?:rather|better)(?: still| yet)?|make (?:that|it)(?= (?:the|an?|my|that)\b)|"
+    r"(?:correction|never ?mind|disregard|hold on|hang on)(?=[,.;:])"
+)
+# only after punctuation
+_MAYBE: Final = (
+    r"(?:oh|oops|negative|no|wait|sorry|rather|actually)"
+    r"(?=[,.;:]| (?:the|an?|my|that|this|those|these|not|i|no|wait|sorry|make)\b)"
+)
+_CORRECTION: Final = re.compile(
+    rf"(?:[,.;:]? ?\b(?:{_CORRECTS})|(?:^|[,.;:] ){_MAYBE})(?:[,.;:]? (?:{_CORRECTS}|{_MAYBE}))*[,.;:]?(?= )"
+)
+_DASH: Final = re.compile(r" ?(?:\u2014|\.\.\.| -+ ) ?(?!\d)")
 _IDIOMS_DISTANCE: Final = rf"(?:(?:at least|about) )?(?:a few|several|some|{_VALUE}) {_UNIT}"
 _PLAIN: Final = {
     # short forms
-    r"(it|there|that|what|who|where|here|which|how|he|she)'s": r"\1 is",
+    r"(it|there|that|what(?:ever)?|who|where|here|which|how|he|she)'s": r"\1 is",
     r"(you|we|they)'re": r"\1 are",
     r"(i|you|we|they|it)'(?:ve|d|ll|m)": r"\1",
     r"gets(?= \w+(?:ed|en|wn)\b)|(?:is|are) to be": "should be",
-    r"(is|are|was|were|does|did|has|have|would|could|should|must)n't": r"\1 not",
+    r"(is|are|was|were|does|did|has|have|would|could|should|must|need)n't": r"\1 not",
     r"let's": "let us",
     r"^whose": "the",
-    r"(?:with|has|have) (?:its|their|the) backs? (?:to|towards?|facing|against)": "near",
     r"belonging to": "of",
     r"in (?:your|my) hands?|(?:(?:that|which) )?you(?: are)? (?:holding|carrying)": "",
     r"^the (?:target|goal|object|item)(?: object)? is(?= (?:an?|the|my|one)\b)": "this is",
     r"^(?:if|when) you (?:are )?(?:stand|sit|enter)\w*[^,;.]*,": "",
     # "a cabinet, above it is a lamp"
     rf"(?:^|(?<=[,.;] ))({_PLACED}) (it|them),? (?:there )?(?:is|are) ([^,.;]+)": r" there is \3 \1 \2",
-    r"whose (\w+) (?:is|are) (?!made)(\w+)": r"with a \2 \1",
-    r"whose(?= \w+ (?:is|are) made)": "with",
-    r"(?:likes?|loves?|tends?|prefers?) to \w+(?= (?:on|in|under|behind|near|by|next)\b)": "is",
+    r"whose (\w+) (?:is|are) (\w+)": r"with a \2 \1",
     rf",? (?:but )?(?:no|not) (?:closer|nearer|farther|further) than {_VALUE} ?{_UNIT}{_END}": "",
     rf"^(?:[\w ]* )?(?:which|what) (\w+(?: \w+)?) (?:(?:is|are|(?:did|do|does|has|have|can) \w+ \w+) ([\w ]{{2,40}}?)|"
     rf"((?:the|my|your) [\w ]{{2,30}}?) (?:is|are))(?: \w+ing)? ({_PLACED}|against)$": (
@@ -142,17 +153,13 @@ _PLAIN: Final = {
     r"tell (?:me|us)": "report",
     r",? (?:if|when|while|as)(?: you)?(?: are)? (?:facing|looking(?: at| from)|face|look at|enter|entering) "
     rf"[\w ]{{2,40}}?{_END}": "",
-    # a correction, and what is denied of a place
-    rf"({_NAMED}),? (?:no|sorry|i mean|no,? wait|wait,? no|(?:or )?rather|actually),? ({_NAMED}){_END}": r"\2, not \1",
-    rf"^(\w+(?: up| me| us)?) ({_NAMED})[.,;]+ {_CORRECTION}(?![\w ]* ones?\b)({_NAMED}){_END}": r"\1 \3, not \2",
-    r"(the|an?|my) (\w+)[.;,]? (?:no|sorry),? the (\w+) one\b": r"\1 \3 \2",
-    rf"(\w+) ({_NAMED})[.,;]* {_CORRECTION}\1 ({_NAMED}){_END}": r"\1 \3, not \2",
+    # what is denied of a place
     rf"(?:do not|don't|never) (\w+ {_NAMED}) ({_PLACED} {_NAMED}),? but ({_PLACED} {_NAMED}){_END}": r"\1 \3, not \2",
     rf"(?:do not|don't|never) ((?:put|place|set|leave|bring|move|store|keep|park) {_NAMED}) (?:any ?where )?(?:near|"
     rf"close to|within {_VALUE} ?{_UNIT} of|(?:any )?(?:closer|nearer) than {_VALUE} ?{_UNIT} (?:to|from))": (
         r"\1 clear of"
     ),
-    r"let (the [\w ]+?) (?:stay|be|remain)(?: where (?:it is|they are))?(?= and\b|$)": r"do not touch \1",
+    r"let (the [\w ]+?) (?:stay|be|remain|sleep|rest)(?: where (?:it is|they are))?(?= and\b|$)": r"do not touch \1",
     rf"neither ({_PLACED}|inside|at) (.{{2,40}}?) nor(?= (?:{_PLACED}|inside|at)\b)": r"not \1 \2 and not",
     rf"(stop|wait|halt|pause)(?: just| right| shortly| {_IDIOMS_DISTANCE})? "
     r"(?:(?:before|after|past)(?= (?:the|an?|that|this|it|them)\b)"
@@ -161,12 +168,12 @@ _PLAIN: Final = {
     r"(?:one|two|three) (?:by|at a) (?:one|two|three|time)|side by side|around the (?:corner|bend)(?! of)": "",
     r"(stop|wait|halt)(?: walking| moving)? (?:once|when|after|as soon as) you(?: are| have)?": r"\1",
     r"(?:and|but) (?:(is|are)(?! (?:the|it|they|there)\b)|(?:it )?(has))": r"and which \1\2",
-    r"(^|[.,;] ?|and |but )((?:the|my|an?) [\w ]+?) (?:(?:should|must|can|may|ha(?:s|ve) to) (?:stay|remain|be left)|"
-    rf"stays?|remains?|\w+ off limits)(?: (?:where|as) \w+ (?:is|are)| there| in place)?{_END}": r"\1 do not touch \2",
-    rf"({_PLACED}),? but not (?:{_PLACED}|touching),?(?= (?:the|an?|my)\b)": r"\1",
-    rf"(?:any|(?<=look )every)where(?: else)? (?:but|except|other than)(?= (?:{_PLACED}|inside|at|under)\b)": ", not",
+    r"(^|[.,;] ?|and |but )((?:the|my|an?|those|these) [\w ]+?) (?:(?:should|must|can|may|ha(?:s|ve) to) (?:stay|"
+    r"remain|be left)|stays?|remains?|\w+ off limits)"
+    rf"(?: (?:where|as) \w+ (?:is|are)| there| here| put| in place| untouched)?{_END}": (r"\1 do not touch \2"),
+    rf"(?:any|(?<=look )every)where(?: else)? (?:but|except|other than)(?= (?:{_PLACED}|inside|at|the|my)\b)": ", not",
     r"lacking|devoid of|(?:(?:that |which )?(?:is|are) )?free (?:of|from)|missing(?= (?:an?|its|any|one)\b)": "without",
-    r"(is|are) no longer": r"\1 not",
+    r"(?:is|are) no longer|(?<!that )(?<!which )used to be": "is not",
     r"(another|different|other) (\w+(?: \w+)?) (?:than|from)(?= (?:the|my|that)\b)": r"\1 \2 except",
     r"(?:is|are) (?:what|the ones?)(?: that)? (?:i|we|you) (?:want|need|mean|(?:are )?(?:look|search)ing for)": "",
     r"(?:, ?(?:but |and )?|(?:but|and) )(?:only|just)(?: the| those)?(?= (?:\w+ ){1,2}ones?\b)": " ( the",
@@ -192,12 +199,27 @@ _PLAIN: Final = {
     rf"(?:until|so(?: that)?) you (?:are standing|are|stand)(?= (?:between|at|by|{_PLACED}|{_VALUE} {_UNIT})\b)": (
         "and stop"
     ),
-    r"^(?!(?:put|place|set|leave|store|keep)\b)(.*?\b(?:the|an?) (?:\w+ ){0,2}?\w+) "
-    rf"where (the [\w ]+?) (?:is|are)(?: \w+(?:ed|ing)| kept)?{_END}": r"\1 with \2",
     r"either(?= (?:in|on|under|at|behind|near|next|inside)\b)|(?:\d+|ninety) degrees?|why(?= (?:is|are)\b)": "",
     r"(?:at the (?:bottom|top),? )?(?:make|take) an? (?:\w+ )?(?:left|right|u-?turn|turn)": "go",
     # a double negation is a request
-    r"(?:do not|don't|dont|never) (?:forget|fail|neglect|omit|hesitate) to": "",
+    r"(?:do not|don't|dont|never) (?:(?:forget|fail|neglect|omit|hesitate) to|just|only|merely|simply)": "",
+    r"(?:do not|don't) you(?: dare(?: to)?)?": "do not",
+    r"(?:rather|sooner) (?:have |take |you \w+ )?(.{2,40}?) than": r"want \1, not",
+    r"prefer (.{2,40}?) (?:over|to)(?= (?:the|an?|my)\b)": r"want \1, not",
+    rf"(^|[,;.] |and |but )({_NAMED}) (?:i|we|you) (?:do not|don't|(?:must|should|can) ?not|can't|never) (\w+){_END}": (
+        r"\1do not \3 \2"
+    ),
+    r"(^|[,;.] |and |but )((?:[\w-]+ ){1,4}?)(?:(?:(?:can|may|should|must) be|is|are) )?(?:excepted|excluded|ignored|"
+    rf"skipped|left out|omitted|can wait){_END}": r"\1ignore \2",
+    r"i (?:would )?(?:love|like|appreciate|prefer) it if": "please",
+    r"i think(?: it)? is": "it is",
+    r"i (?:do not|don't) mean": "not",
+    r"i wanted": "i want",
+    r"(?:al)?though(?: please)?(?= (?:not|do not|don't|leave|skip|no)\b)": "but",
+    r"(?:as|so) long as|provided(?: that)?": "if",
+    rf"(?:at (?:least|most)|up to|(?:no|not) (?:more|less|fewer) than)(?= {_VALUE} (?!{_UNIT}\b))": "",
+    r"[.,;] (?:location|position|place)(?: is)?:": "",
+    r"after (?:that|this)(?= \w)": "then",
     r"(?:do not|don't|dont|never) (?:forget|skip|ignore|overlook|miss|omit|neglect|leave out|disregard)(?: about)?": (
         "handle"
     ),
@@ -212,17 +234,18 @@ _PLAIN: Final = {
     r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
+    r"not the \w+ ones?[,;](?: but)?(?= the (?:\w+ )?ones?(?! or\b|,))": "",
     # light verbs, whose noun carries the meaning
     r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
     r"(?:have|take) an? (?:\w+ )?look(?= (?:under|behind|inside|in|on|for|if|whether)\b)": "look",
     r"get rid of|do away with|dispose of|throw (?:away|out)": "remove",
     r"(?:be|being) careful (?:not to|to not)|make sure (?:not to|you don't|to not)|try not to|"
-    r"tak(?:e|ing) care not to|there is no need (?:for you )?to|refrain from|"
+    r"tak(?:e|ing) care not to|there is no need (?:for you )?to|refrain from|by no means|"
+    r"it is forbidden to|(?:you )?(?:need not|(?:do not|don't) (?:have|need) to|are not (?:allowed|permitted) to)|"
     r"(?:under|in) no (?:circumstance|case)s?(?: should you)?": "do not",
     r"^(\w+) nothing": r"do not \1 anything",
-    r"not (?:that|this|these|those|the \w+)(?: ones?)?[,;](?: but)?(?= the (?:\w+ )?ones?(?! or\b|,))": "",
-    r"(?:keep (?:your|the) )?hands off": "do not touch",
+    r"(?:keep (?:your|the) )?(?:hands|fingers) (?:off|away from)": "do not touch",
     r"(?:watch out|look out|be careful|beware) (?:for|of|with)": "avoid",
     r"(?:stay|keep|steer|remain|stand|staying|keeping|steering) (?:well )?(?:clear|away|off) (?:of|from)|"
     r"(?<=, )avoiding|(?:stay|keep) out of": "avoid",
@@ -241,7 +264,7 @@ _PLAIN: Final = {
     r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
     r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
     r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
-    r"pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
+    r"^(?:(?:get|keep) )?eyes on|pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
     r"((?:every|any)(?:thing|one)?|all|(?:every|all|any) (?:\w+ ){0,2}\w+(?= but (?:the|an?|my)\b)) but": r"\1 except",
     r"as well as|along with|together with|in addition to|and also|plus": "and",
@@ -300,6 +323,7 @@ def replace_idioms(text: str) -> str:
     text = _ARROW.sub(" to ", text)
     text = _LEAVE_ALONE.sub(lambda match: f"do not touch {match[1] or match[2]}", text)
     text = _LISTED.sub(_joined, _BRACKETS.sub(_described_before, text))
+    text = _CORRECTION.sub(f" {CORRECTION_MARKER} ", _DASH.sub(", ", text))
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
     text = _AHEAD.sub(r"\1", _COMPARISON.sub("", text))

@@ -53,7 +53,7 @@ PUSHING_VERBS: Final = word_set("move shift push slide drag pull roll nudge plac
 FETCHING_VERBS: Final = words("fetching_verbs")
 # "the mug that does not stand on the table"
 RESTING_VERBS: Final = word_set("hang stand sit lie rest lean")
-POSTURE_VERBS: Final = RESTING_VERBS | word_set("belong locate live stick place mount park")
+POSTURE_VERBS: Final = RESTING_VERBS | word_set("belong go locate live stick place mount park")
 # negated, these mean contact or harm: the object is an obstacle
 CONTACT_VERBS: Final = words("contact_verbs")
 # the direct object is where the robot goes
@@ -105,7 +105,7 @@ def verb_base(word: str) -> str | None:
     """Return the base form of a known verb from any of its forms, or None."""
     if word in VERBS:
         return word
-    return base_of_s(word) or base_of_ing(word) or base_of_ed(word)
+    return base_of_s(word) or base_of_ing(word) or base_of_ed(word) or _known(word.removeprefix("re"))
 
 
 def is_particle(verb: str, word: str) -> bool:
