@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from gausslite.task import lexicon, verbs
-from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind, adjectives_only
+from gausslite.task.chunk import Chunk, ChunkBuffer, ChunkKind
 from gausslite.task.clause_types import (
     SUBJECT_PRONOUNS,
     SUBJECT_TAGS,
@@ -26,6 +26,7 @@ from gausslite.task.tokens import PREPOSITIONS, lexical_units, split_bounds
 _RELATIVES: Final = word_set("that which who whom")
 _BEFORE_GERUND_TAGS: Final = frozenset({Tag.NOUN, Tag.PREPOSITION, Tag.NEGATION, Tag.VERB, Tag.AUXILIARY})
 _OBJECT_TAGS: Final = OBJECT_START_TAGS | {Tag.PRONOUN, Tag.ANAPHOR}
+_SUBJECT_KINDS: Final = (ChunkKind.NOUN, ChunkKind.PREPOSITION)
 _PERMISSIONS: Final = word_set("may can could")
 _NAMING: Final = word_set("label mark name call tag")
 _PASSING: Final = verbs.LEAVING_VERBS | {"keep"}
@@ -78,7 +79,6 @@ class VerbChunker:
         self._after_modal = is_modal(tagged, index) and subject in SUBJECT_TAGS
         is_wish = subject is Tag.PRONOUN and base in WISHES
         belongs = base in verbs.BELONGING_VERBS and word.startswith(base) and subject in _BELONGING_TAGS
-        described = buffer.last_kind(1) in (ChunkKind.NOUN, ChunkKind.ATTRIBUTE)
         if subject is Tag.INFINITIVE and buffer.tag(-2) is Tag.INDEFINITE and buffer.tag(1) not in OBJECT_START_TAGS:
             buffer.close()  # "something to write with"
         elif is_required and self._subject_is_object():
@@ -86,10 +86,6 @@ class VerbChunker:
                 self._require(base)
         elif belongs and not is_command(tagged, index):
             buffer.emit(ChunkKind.SUBJECT_VERB, base)
-        elif subject is Tag.CONJUNCTION and word != base and described:
-            buffer.chunks.pop()  # "which is near the window and opens to the hall"
-            if buffer.tag(1) in _OBJECT_TAGS:
-                self._subordinate_verb(base)
         elif word == "wants" and subject is Tag.NOUN and buffer.tag(1) in OBJECT_START_TAGS:
             buffer.chunks.pop()  # "my sister wants the soda"
             buffer.emit(ChunkKind.VERB, base)
@@ -155,10 +151,10 @@ class VerbChunker:
 
     def _denied_subject(self) -> int:
         """Return where the subject of "no box on the table may" starts; 0 for one that is not denied."""
-        start = len(self._buffer.chunks)
-        while start and self._buffer.chunks[start - 1].kind in (ChunkKind.NOUN, ChunkKind.PREPOSITION):
+        chunks, start = self._buffer.chunks, len(self._buffer.chunks)
+        while start and (chunks[start - 1].word == "nor" or chunks[start - 1].kind in _SUBJECT_KINDS):
             start -= 1
-        return start if start and self._buffer.chunks[start - 1].kind is ChunkKind.NEGATION else 0
+        return start if start and chunks[start - 1].kind is ChunkKind.NEGATION else 0
 
     def _negated_verb(self, base: str) -> None:
         """Skip the verb of "that is not standing on"; "who does not wear a helmet" means not near it."""
@@ -282,11 +278,6 @@ class _Chunker:
         follows_state = buffer.tag(-1) is Tag.CONJUNCTION and buffer.last_kind(1) is ChunkKind.ATTRIBUTE
         if follows_state and not buffer.words and buffer.tag(1) not in NOUN_PHRASE_TAGS:
             return  # "it is white and oval"
-        # "the red and blue mugs": a lone adjective shares the noun of the next phrase
-        if not buffer.words and buffer.last_kind() is ChunkKind.CONJUNCTION and len(buffer.chunks) >= 2:
-            before = buffer.chunks[-2].noun
-            if before is not None and adjectives_only(before.words):
-                buffer.has_determiner = before.has_determiner
         buffer.words.append(word)
 
     def _adjective(self, word: str) -> None:
@@ -347,8 +338,6 @@ class _Chunker:
             buffer.word(1) in _DO_FORMS or (buffer.tag(2) in OBJECT_START_TAGS and buffer.tag(1) is Tag.AUXILIARY)
         ):
             return
-        if word == "what" and buffer.tag(1) is Tag.PRONOUN and buffer.last_verb() in ("ask", "tell", "report"):
-            return  # "ask her what she wants"
         denies = word in ("nothing", "nobody")
         if denies and buffer.last_kind() in (None, ChunkKind.CLAUSE_BREAK, ChunkKind.CONJUNCTION):
             buffer.emit(ChunkKind.NEGATION, "no")  # "nothing on the altar may be moved"

@@ -24,7 +24,8 @@ _UNKNOWN_PEOPLE: Final = word_set("somebody someone nobody everybody everyone")
 _OTHER_PEOPLE: Final = word_set("i he she they")
 _REASONS: Final = word_set("because since as although though")
 _CONDITIONS: Final = word_set("if whether when once until unless before after while")
-_TIMES: Final = word_set("when once until before after while")
+_DURATIONS: Final = word_set("until before after while")
+_TIMES: Final = _DURATIONS | word_set("when once")
 _STRONG_CONJUNCTIONS: Final = word_set(", but +")
 _PREDICATES: Final = frozenset({Tag.VERB, Tag.AUXILIARY, Tag.PARTICIPLE})
 _QUESTION_OPENERS: Final = frozenset({Tag.AUXILIARY, Tag.INDEFINITE, Tag.RELATIVE})
@@ -117,10 +118,10 @@ def _clause_type(tagged: TaggedWords, start: int, end: int, before: ClauseType) 
     clause = tagged[first:end]
     if opener[1] is Tag.CLAUSE_BREAK and opener[0] in _REASONS:
         return ClauseType.REASON
-    # "while I hold the door", "before it reaches the rug", "while the dog is asleep"
+    # "while I hold the door", "before it reaches the rug", "after the guests have left"
     others = clause and opener[0] in _TIMES and clause[0][0] in _OTHER_PEOPLE | {"we"}
     it_does = clause and opener[0] == "before" and clause[0][1] is Tag.ANAPHOR
-    if others or it_does or (opener[0] == "while" and _is_statement(tagged, first)):
+    if others or it_does or (opener[0] in _DURATIONS and _is_statement(tagged, first)):
         return ClauseType.STATEMENT
     if not clause or (opener[1] is Tag.CLAUSE_BREAK and opener[0] in _CONDITIONS):
         return ClauseType.REQUEST

@@ -19,7 +19,7 @@ _PHRASE: Final = (ChunkKind.NOUN, ChunkKind.PREPOSITION, ChunkKind.ATTRIBUTE)
 
 def apply_corrections(chunks: Sequence[Chunk]) -> list[Chunk]:
     """Return the chunks with each corrected phrase in its place, and the denial of what it replaces after it."""
-    chunks = _mark_denials(chunks)
+    chunks = list(chunks)
     while _MARKER in chunks:
         at = chunks.index(_MARKER)
         before = list(dropwhile(_is_break, reversed(chunks[:at])))[::-1]
@@ -29,18 +29,6 @@ def apply_corrections(chunks: Sequence[Chunk]) -> list[Chunk]:
 
 def _is_break(chunk: Chunk) -> bool:
     return chunk.kind in (ChunkKind.CLAUSE_BREAK, ChunkKind.CONJUNCTION, ChunkKind.STATEMENT)
-
-
-def _mark_denials(chunks: Sequence[Chunk]) -> list[Chunk]:
-    """Return the chunks with "the man. Not that man, the woman" as a correction by the woman."""
-    marked = list(chunks)
-    for at in range(len(marked) - 4, -1, -1):
-        negation, denied, then, new = (*marked[at : at + 4], _BREAK, _BREAK)[:4]
-        names = {"one", *(chunk.noun.text for chunk in marked[:at] if chunk.noun)}
-        starts = negation.kind is ChunkKind.NEGATION and (not at or _is_break(marked[at - 1]))
-        if starts and denied.noun and denied.noun.text in names and _is_break(then) and new.noun:
-            marked[at : at + 3] = [_MARKER]
-    return marked
 
 
 def _correct(before: list[Chunk], after: list[Chunk]) -> list[Chunk]:

@@ -237,9 +237,6 @@ class GraphBuilder:
         named = (clause.objects or clause.referents)[-1:]
         if pending is not None and named:
             self._place_negated(phrase_from_text(named[0]), pending)
-        elif pending is None and clause.objects:
-            for phrase in filter(self._draft.is_from_statement, clause.referents):
-                self._draft.exclude(phrase)  # "I'm allergic to nuts, bring a snack without them"
 
     def _handle_demonstrative(self, word: str, before: Chunk | None, after: Chunk | None) -> None:
         """Handle a "this" without a noun."""
@@ -405,7 +402,7 @@ class GraphBuilder:
             self._draft.excluded = [phrase for phrase in self._draft.excluded if phrase not in objects]
             self._draft.add_relation(RelationTerms(relation, not terms.negated, terms.bounds), objects, noun.text)
         else:
-            if self._clause.verb in verbs.PLACE_VERBS and self._clause.verb_since_negation:
+            if (self._clause.verb in verbs.PLACE_VERBS or relation == "to") and self._clause.verb_since_negation:
                 self._draft.exclude(noun.text)
                 return
             self._denied_places += [(phrase, RelationTerms(relation, True, terms.bounds), noun) for phrase in objects]

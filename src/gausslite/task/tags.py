@@ -120,6 +120,7 @@ _OBJECTS_OF_VERBS: Final = word_set("the a an my it them up")
 _BEFORE_NAMES: Final = _ARTICLES | word_set("to at in near from")
 _FINITE: Final = word_set("is are was were has have can will")
 _BEFORE_OBJECTS: Final = lexicon.DETERMINERS | {"no"}
+_DEMONSTRATIVES: Final = word_set("this these those")
 _AROUND: Final = word_set("around under behind along between beneath")
 _THE: Final = _ARTICLES | word_set("this these those his her its our their")
 _OPENERS: Final = frozenset({"", ",", ".", ";", "and", "then"})
@@ -161,7 +162,7 @@ def is_adverb(word: str) -> bool:
         return True
     ending = word.endswith(("ly", "wise", "wards"))
     return ending and not (
-        word in lexicon.ADJECTIVES or singular(word) in _NOUNS or word in verbs.VERBS or word in _CLOSED
+        word in lexicon.ADJECTIVES | verbs.VERBS or singular(word) in _NOUNS or is_thing(word) or word in _CLOSED
     )
 
 
@@ -178,6 +179,7 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         or (word in verbs.VERBS and before in _LEADING_VERBS | _NEGATED_COMMANDS)
         or (word in verbs.RESTING_VERBS and is_place and _is_noun(before) and singular(before) != before)
         or (opens and word in verbs.TOOL_VERBS and after in _AROUND)
+        or (opens and word in verbs.INSPECTION_VERBS and _is_noun(after) and not is_thing(f"{word} {singular(after)}"))
         or (opens and word in _MOTIONS and (is_place or after in _TURNS))
         or (word in verbs.PLACE_VERBS and before in ("and", "then") and is_place)
         or (opens and is_open and word in verbs.VERBS and after in _BEFORE_OBJECTS)
@@ -200,6 +202,7 @@ def _tag_by_neighbours(before: str, word: str, after: str, later: Sequence[str])
         Tag.CLAUSE_BREAK: word == "before" and after in _SUBJECTS,
         Tag.NOUN: waits
         or (opens and is_open and after in _BELONG and singular(word) != word)  # "drinks go on the shelf"
+        or (before in _DEMONSTRATIVES and word in verbs.VERBS and after in PREPOSITIONS and not _describes(word))
         or (word.endswith("ing") and named)
         or (word == "half" and after == "of"),  # "stand lamp"
         Tag.PREPOSITION: word == "outside" and after in lexicon.DETERMINERS,
@@ -218,7 +221,7 @@ def _tag_options(before: str, word: str, after: str, later: Sequence[str]) -> Op
     closed = _CLOSED.get(text)
     if closed is not None:
         return closed
-    if after in lexicon.DETERMINERS and verbs.base_of_ing(word) is not None:
+    if after in lexicon.DETERMINERS and before not in _ARTICLES and verbs.base_of_ing(word) is not None:
         return {Tag.GERUND: 0}  # "cleaning the floors"
     if word[0].isdigit() and not word.endswith("up"):  # "7up"
         return {Tag.DETERMINER: 0, Tag.NOUN: 5}

@@ -116,14 +116,18 @@ _CORRECTS: Final = (
     r"on second thoughts?|or (?:rather|better)(?: still| yet)?|make (?:that|it)(?= (?:the|an?|my|that)\b)|"
     r"(?:correction|never ?mind|disregard|hold on|hang on)(?=[,.;:])"
 )
-# only after punctuation
+# only after punctuation, or after another of these
 _MAYBE: Final = (
+    r"not (?:(?:that|this) \w+|the \w+ ones?)[,;](?: but)?(?= (?:the|my)\b)|"
     r"(?:oh|oops|negative|no|wait|sorry|rather|actually)"
     r"(?=[,.;:]| (?:the|an?|my|that|this|those|these|not|i|no|wait|sorry|make)\b)"
 )
+_DENIED: Final = r"not the \w+[,;](?= (?:the|my)\b)"
 _CORRECTION: Final = re.compile(
-    rf"(?:[,.;:]? ?\b(?:{_CORRECTS})|(?:^|[,.;:] ){_MAYBE})(?:[,.;:]? (?:{_CORRECTS}|{_MAYBE}))*[,.;:]?(?= )"
+    rf"(?:[,.;:]? ?\b(?:{_CORRECTS})|(?:^|[,.;:] )(?:{_MAYBE}))"
+    rf"(?:[,.;:]? (?:{_CORRECTS}|{_MAYBE}|{_DENIED}))*[,.;:]?(?= )"
 )
+_FILLER: Final = re.compile(r"\b(?:h+m+|u[hm]+|erm?|ah|eh)\b,? ")
 _DASH: Final = re.compile(r" ?(?:\u2014|\.\.\.| -+ ) ?(?!\d)")
 _IDIOMS_DISTANCE: Final = rf"(?:(?:at least|about) )?(?:a few|several|some|{_VALUE}) {_UNIT}"
 _PLAIN: Final = {
@@ -135,6 +139,7 @@ _PLAIN: Final = {
     r"(is|are|was|were|does|did|has|have|would|could|should|must|need)n't": r"\1 not",
     r"let's": "let us",
     r"^whose": "the",
+    r",? ?(?:which|that) belongs? to (?:the |my )?[\w']+,?": "",
     r"belonging to": "of",
     r"in (?:your|my) hands?|(?:(?:that|which) )?you(?: are)? (?:holding|carrying)": "",
     r"^the (?:target|goal|object|item)(?: object)? is(?= (?:an?|the|my|one)\b)": "this is",
@@ -168,16 +173,17 @@ _PLAIN: Final = {
     r"(?:one|two|three) (?:by|at a) (?:one|two|three|time)|side by side|around the (?:corner|bend)(?! of)": "",
     r"(stop|wait|halt)(?: walking| moving)? (?:once|when|after|as soon as) you(?: are| have)?": r"\1",
     r"(?:and|but) (?:(is|are)(?! (?:the|it|they|there)\b)|(?:it )?(has))": r"and which \1\2",
-    r"(^|[.,;] ?|and |but )((?:the|my|an?|those|these) [\w ]+?) (?:(?:should|must|can|may|ha(?:s|ve) to) (?:stay|"
-    r"remain|be left)|stays?|remains?|\w+ off limits)"
-    rf"(?: (?:where|as) \w+ (?:is|are)| there| here| put| in place| untouched)?{_END}": (r"\1 do not touch \2"),
+    r"(^|[.,;] ?|and |but )((?:the|my|an?|those|these|anything) [\w ]*?) ?(?:(?:should|must|can|may|ha(?:s|ve) to) "
+    r"(?:stay|remain|be left)|stays?|remains?|\w+ off limits)"
+    rf"(?: (?:where|as) \w+ (?:is|are)| there| here| put| in place| untouched)?{_END}": r"\1 do not touch \2",
     rf"(?:any|(?<=look )every)where(?: else)? (?:but|except|other than)(?= (?:{_PLACED}|inside|at|the|my)\b)": ", not",
     r"lacking|devoid of|(?:(?:that |which )?(?:is|are) )?free (?:of|from)|missing(?= (?:an?|its|any|one)\b)": "without",
     r"(?:is|are) no longer|(?<!that )(?<!which )used to be": "is not",
     r"(another|different|other) (\w+(?: \w+)?) (?:than|from)(?= (?:the|my|that)\b)": r"\1 \2 except",
     r"(?:is|are) (?:what|the ones?)(?: that)? (?:i|we|you) (?:want|need|mean|(?:are )?(?:look|search)ing for)": "",
     r"(?:, ?(?:but |and )?|(?:but|and) )(?:only|just)(?: the| those)?(?= (?:\w+ ){1,2}ones?\b)": " ( the",
-    r",? ?(?:and |but )?(?:nothing (?:else|more)|no others?(?: \w+)?)|nothing (?:but|except|other than)": "",
+    r",? ?(?:and |but )?(?:nothing (?:else|more)|(?:ignore|skip) (?:everything|all) else|no others?(?: \w+)?)|"
+    r"nothing (?:but|except|other than)": "",
     # where the robot starts gives nothing; a viewpoint is an object to pass
     r"^(?:you (?:stand|are standing|are starting)|(?:you )?(?:start|begin|starting|beginning) (?:at|in|from|by|next))\b"
     r"[^.;,]*[.;,]": "",
@@ -187,7 +193,8 @@ _PLAIN: Final = {
     r"with your (?:back|left|right)(?: side)? (?:to|towards?|against) (.{2,40}?),": r"pass \1;",
     r"so(?: that)? you(?: are)? fac(?:e|ing)": "; face",
     r"(?:is |are )?made (?:out )?of (?:(?:solid|dark|light) )?\w+": "",
-    r"(?:could|can|would|will) (?:someone|somebody|anyone|anybody|one of you)": "please",
+    r"(?:could|can|would|will) (?:someone|somebody|anyone|anybody|one of you)|"
+    r"(?:might|may|could) i (?:trouble|ask) you to": "please",
     r"(that|it|he|she|who|which)s? (?:is|has) got": r"\1 has",
     r"throw ((?:[\w']+ ){1,9})(?:away|out)(?=$| ?[,.;]| and )": r"remove \1",
     r"(?:to|on) your (?:\w+ )?(?:left|right)(?: hand)?(?: side)?(?! of\b)|back(?= where\b)": "",
@@ -211,10 +218,13 @@ _PLAIN: Final = {
     ),
     r"(^|[,;.] |and |but )((?:[\w-]+ ){1,4}?)(?:(?:(?:can|may|should|must) be|is|are) )?(?:excepted|excluded|ignored|"
     rf"skipped|left out|omitted|can wait){_END}": r"\1ignore \2",
-    r"i (?:would )?(?:love|like|appreciate|prefer) it if": "please",
+    r"(?:i (?:would )?(?:love|like|appreciate|prefer) it|it would be \w+) if": "please",
+    r"hold(?: position)?(?= (?:at|by|near)\b)": "stop",
     r"i think(?: it)? is": "it is",
     r"i (?:do not|don't) mean": "not",
     r"i wanted": "i want",
+    r"i(?: am)? (?:looking|searching)(?: for)?": "find",
+    r"((?:make|take) an? (?:\w+ )?(?:photo|picture|video|image|scan)) from": r"\1 of",
     r"(?:al)?though(?: please)?(?= (?:not|do not|don't|leave|skip|no)\b)": "but",
     r"(?:as|so) long as|provided(?: that)?": "if",
     rf"(?:at (?:least|most)|up to|(?:no|not) (?:more|less|fewer) than)(?= {_VALUE} (?!{_UNIT}\b))": "",
@@ -234,7 +244,6 @@ _PLAIN: Final = {
     r", (?:just|only)(?= (?:the|a|an|my)\b)": "; ",
     r"be so (?:kind|good) as to|be (?:kind|good) enough to|in order to": "to",
     r"so(?: that)?(?= (?:i|you|we|he|she|they|it|the|my|our|nobody|no|people|everyone|everybody)\b)": "because",
-    r"not the \w+ ones?[,;](?: but)?(?= the (?:\w+ )?ones?(?! or\b|,))": "",
     # light verbs, whose noun carries the meaning
     r"(?:have|take|get|give me|catch|(?:i|we) (?:would )?(?:like|want|need)) an? (?:\w+ ){0,2}"
     r"(?:look|glance|peek|view) (?:at|of|around|over|into)": "look at",
@@ -264,7 +273,7 @@ _PLAIN: Final = {
     r"across the (?:street|road|hall|hallway|room|corridor|aisle) from": "opposite",
     r"pay (?:no|not any) attention to|(?:do not|don't|never) (?:care|worry|bother) (?:about|with)": "ignore",
     r"how (?:far|close|near) (?:is|are) (.{2,60}?) (?:from|to)": r"measure \1 and",
-    r"^(?:(?:get|keep) )?eyes on|pay (?:\w+ )?attention to|focus (?:only )?on|concentrate on": "look at",
+    r"^(?:(?:get|keep) )?eyes on|(?:zoom in|focus(?: only)?|concentrate) on|pay (?:\w+ )?attention to": "look at",
     r"(?:with the exception|to the exclusion) of|other than|but for": "except",
     r"((?:every|any)(?:thing|one)?|all|(?:every|all|any) (?:\w+ ){0,2}\w+(?= but (?:the|an?|my)\b)) but": r"\1 except",
     r"as well as|along with|together with|in addition to|and also|plus": "and",
@@ -323,7 +332,7 @@ def replace_idioms(text: str) -> str:
     text = _ARROW.sub(" to ", text)
     text = _LEAVE_ALONE.sub(lambda match: f"do not touch {match[1] or match[2]}", text)
     text = _LISTED.sub(_joined, _BRACKETS.sub(_described_before, text))
-    text = _CORRECTION.sub(f" {CORRECTION_MARKER} ", _DASH.sub(", ", text))
+    text = _CORRECTION.sub(f" {CORRECTION_MARKER} ", _FILLER.sub("", _DASH.sub(", ", text)))
     for idiom, plain in _IDIOMS:
         text = idiom.sub(plain, text)
     text = _AHEAD.sub(r"\1", _COMPARISON.sub("", text))
