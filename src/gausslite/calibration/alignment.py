@@ -16,6 +16,14 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
+from gausslite.calibration.least_squares import (
+    MIN_STD,
+    NormalEquations,
+    robust_std,
+    robust_weights,
+    shrinkage,
+    weights_at,
+)
 from gausslite.domain.camera import Camera, back_project, lift
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_of, twist_of
@@ -33,8 +41,7 @@ _MAX_TRACKED_POINTS, _MIN_TRACKED_POINTS = 5000, 300
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
 _CORRELATED_PX = 64.0
 """Residuals of neighbouring pixels are correlated: one pixel in a cell of 8x8 counts as independent."""
-_OUTLIER_STDS = 2.0
-_MIN_STD, _MIN_TRACKED_STD, _MIN_PLANE_STD_M = 0.005, 0.01, 0.002
+_MIN_TRACKED_STD, _MIN_PLANE_STD_M = 0.01, 0.002
 _NORMAL_WINDOW_PX = 5
 _NUISANCE_STD = 1.0
 """Prior of the global gain and offset that are fitted along with the pose and then dropped."""
@@ -63,64 +70,6 @@ class PyramidLevel:
 REFINEMENT = (PyramidLevel(3.0, 3), PyramidLevel(1.5, 3), PyramidLevel(0.8, 3))
 COARSE_TO_FINE = (PyramidLevel(5.0, 4, 0.15), PyramidLevel(2.0, 4, 0.08), PyramidLevel(0.8, 4, 0.05))
 FINE = COARSE_TO_FINE[1:]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NormalEquations:
-    """Gauss-Newton's equations of weighted residuals: information · update = gradient."""
-
-    information: Float64[ndarray, "p p"]
-    gradient: Float64[ndarray, " p"]
-
-    @classmethod
-    def of(
-        cls, jacobian: Float64[ndarray, "n p"], residual: Float64[ndarray, " n"], weights: Float64[ndarray, " n"]
-    ) -> NormalEquations:
-        """Return the equations of the update that minimises |residual + jacobian · update|² with these weights."""
-        weighted = jacobian * weights[:, None]
-        return cls(weighted.T @ jacobian, -(weighted.T @ residual))
-
-    def plus(self, other: NormalEquations) -> NormalEquations:
-        """Return the sum; `other` may depend on the first parameters only."""
-        information, gradient, count = self.information.copy(), self.gradient.copy(), len(other.gradient)
-        information[:count, :count] += other.information
-        gradient[:count] += other.gradient
-        return NormalEquations(information, gradient)
-
-    def solve(self, deviation: Float64[ndarray, " p"], prior_std: Float64[ndarray, " p"]) -> Float64[ndarray, " p"]:
-        """Return the update for deviation + update ~ N(0, prior_std²).
-
-        deviation: how far the parameters are from the prior's mean before the update.
-        """
-        # a standard deviation of 0 fixes its parameter up to floating-point precision
-        precision = 1.0 / np.square(np.maximum(prior_std, 1e-9))
-        information, gradient = self.information + np.diag(precision), self.gradient - precision * deviation
-        update: Float64[ndarray, " p"] = np.linalg.solve(information, gradient)
-        return update
-
-
-def robust_std(residual: Float64[ndarray, " n"]) -> float:
-    """Return the standard deviation by the median absolute residual."""
-    return 1.4826 * float(np.median(np.abs(residual)))
-
-
-def robust_weights(residual: Float64[ndarray, " n"], min_std: float = _MIN_STD) -> Float64[ndarray, " n"]:
-    """Return the weights of Geman-McClure, scaled by the robust standard deviation, divided by the variance."""
-    return _weights_at(residual, max(robust_std(residual), min_std))
-
-
-def _weights_at(residual: Float64[ndarray, " n"], residual_std: float) -> Float64[ndarray, " n"]:
-    scaled = residual / residual_std
-    weights: Float64[ndarray, " n"] = np.square(1.0 / (1.0 + np.square(scaled / _OUTLIER_STDS))) / residual_std**2
-    return weights
-
-
-def shrinkage(prior_std: float, fit_std: float) -> float:
-    """Return the factor by which a fitted change is reduced, in [0, 1].
-
-    Without it, the fits of successive frames would let the map drift.
-    """
-    return prior_std**2 / (prior_std**2 + fit_std**2)
 
 
 def comparable_pixels(rendering: Rendering, frame: Frame, max_pixels: int = MAX_PIXELS) -> Int64[ndarray, " n"]:
@@ -420,7 +369,7 @@ class _Model:
     ) -> _Step | None:
         """Return the normal equations of the i-th level at a pose; None if too few points agree with the frame."""
         visible = VisiblePoints.of(self.points, T_camera_rendered, frame.camera)
-        overlap, min_std = 1.0, _MIN_STD
+        overlap, min_std = 1.0, MIN_STD
         if level.max_depth_error is not None:
             measured_m, z_m = visible.measured(frame.depth_m), visible.points[:, 2]
             agrees = (measured_m > 0) & (np.abs(measured_m - z_m) < level.max_depth_error * z_m)
@@ -433,7 +382,7 @@ class _Model:
         # far from the solution, gain and offset dominate the residuals of all points together
         spread = residual if self.normals is None else residual - np.median(residual)
         spread_std = max(robust_std(spread), min_std)
-        equations = NormalEquations.of(jacobian, residual, self.share * _weights_at(spread, spread_std))
+        equations = NormalEquations.of(jacobian, residual, self.share * weights_at(spread, spread_std))
         if self.normals is not None:
             normals = self.normals[visible.index] @ T_camera_rendered[:3, :3].T
             plane_jacobian, plane_residual = _plane_residuals(normals, frame, visible)

@@ -20,13 +20,11 @@ from numpy import ndarray
 from gausslite.calibration.alignment import (
     MAX_PIXELS,
     MIN_PIXELS,
-    NormalEquations,
     comparable_pixels,
     fit_pose,
     independent_share,
-    robust_weights,
-    shrinkage,
 )
+from gausslite.calibration.least_squares import NormalEquations, robust_weights, shrinkage
 from gausslite.calibration.moving_pairs import warp_into
 from gausslite.datasets.corrected import CorrectedSource
 from gausslite.datasets.source import Source, downscaled_size

@@ -19,16 +19,15 @@ from numpy import ndarray
 from gausslite.calibration.alignment import (
     MAX_PIXELS,
     OPAQUE_ALPHA,
-    NormalEquations,
     VisiblePoints,
     blurred_luminance,
     comparable_pixels,
     independent_share,
     luminance_residuals,
     rendered_luminance,
-    robust_weights,
     with_gradients,
 )
+from gausslite.calibration.least_squares import NormalEquations, robust_weights
 from gausslite.calibration.moving_pairs import MIN_COMPARABLE_SHARE, FrameWarp, MovingPairs
 from gausslite.datasets.corrected import correct_frame, recorded_pixels
 from gausslite.domain.camera import Lens, LensModel, back_project

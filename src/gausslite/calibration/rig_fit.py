@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.calibration.alignment import robust_weights
 from gausslite.calibration.features import RelativePose
+from gausslite.calibration.least_squares import robust_weights
 from gausslite.domain.camera import Camera, lift
 from gausslite.domain.pose import inverse, transform_of
 

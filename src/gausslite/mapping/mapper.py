@@ -305,8 +305,7 @@ class GaussianMapper:
 
     def roi_gaussians(self) -> Gaussians:
         """Return a copy of the active Gaussians."""
-        use_ema = self._settings.optimization.ema_updates > 0
-        return self._table.to_gaussians(np.flatnonzero(self._table.active), use_ema)
+        return self._table.to_gaussians(np.flatnonzero(self._table.active), self._settings.optimization.ema_updates > 0)
 
     def shared_gaussians(self) -> Gaussians:
         """Return a copy of the map for others: without untrained Gaussians whose distance is a guess of 4 m or more."""
@@ -383,9 +382,8 @@ class GaussianMapper:
 
     def _refine_keyframes(self, scheduler: StageScheduler) -> None:
         """Refine the next keyframes against the map, while there is time and the prior allows an error."""
-        if not self._refiner.enabled or self._table.count == 0:
-            return
-        for keyframe in self._refiner.next_keyframes(self._keyframes.window):
+        refines = self._refiner.enabled and self._table.count > 0
+        for keyframe in self._refiner.next_keyframes(self._keyframes.window) if refines else ():
             if not scheduler.has_time_for(Stage.KEYFRAME_REFINEMENT):
                 return
             with scheduler.timing(Stage.KEYFRAME_REFINEMENT):
