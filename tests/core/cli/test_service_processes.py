@@ -34,5 +34,5 @@ def test_a_child_does_not_inherit_option_variables(tmp_path: Path, monkeypatch: 
     show = "import os; print(sorted(name for name in os.environ if name.startswith('GAUSSLITE_')))"
     with ProcessGroup(tmp_path) as group:
         child = group.start("child", "timeit", ("-n", "1", "-r", "1", show))
-        child.wait(60)
+        child.process.wait(60)
     assert child.log.read_text().splitlines()[0] == "['GAUSSLITE_SIMD']"
