@@ -337,7 +337,7 @@ class _Model:
         levels: Sequence[PyramidLevel],
         share: float = 1.0,
     ) -> _Model:
-        """Return the model of the luminance at these flat pixel indices."""
+        """Return the model of the luminance at these flat pixel indices, of which each counts as this share."""
         rows, columns = np.divmod(pixels, camera.width_px)
         depth_m = rendering.depth_m.ravel()[pixels].astype(np.float64) / rendering.alpha.ravel()[pixels]
         points = lift(np.stack([columns, rows], axis=1) + 0.5, depth_m, camera)
