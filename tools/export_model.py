@@ -22,8 +22,8 @@ try:
 except ImportError as error:
     raise SystemExit(f"export_model: {error}; install: pip install 'transformers<5' torch onnx") from None
 
-from gausslite.perception.open_vocabulary import INPUTS, OUTPUTS
-from gausslite.perception.text_features import TEXT_ENCODER, TOKENIZER
+from gausslite_detectors.open_vocabulary import INPUTS, OUTPUTS
+from gausslite_detectors.text_features import TEXT_ENCODER, TOKENIZER
 
 _OPSET = 17
 _PHRASE = "object ."

@@ -28,7 +28,6 @@ from gausslite.domain.voxels import (
     select_voxels,
     tombstones,
 )
-from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as agent
 from gausslite.v1 import fusion_service_pb2 as fusion
 from gausslite.v1 import parser_service_pb2 as parser
@@ -36,6 +35,7 @@ from gausslite.wire import convert
 from gausslite.wire.convert_task import graph_to_message, report_to_message
 from gausslite_bench.fuzz.corpus import AGENT_ID, CORPUS, SESSION_ID
 from gausslite_bench.server.synthetic_updates import GRID, voxels_batch
+from gausslite_language.rules import RuleParser
 
 SESSION = SESSION_ID.decode()
 TASK = "Pick up the red mug on the table, not the bowl left of the largest chair"

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from gausslite.calibration.calibrate import StatedValues, as_recorded_notes, calibrate
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
@@ -28,7 +27,6 @@ from gausslite.domain.pose import Twist, UpAxis, require_rigid
 from gausslite.domain.recording import DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import BallRegion, PointedObject, Region
 from gausslite.domain.voxels import empty_batch
-from gausslite.evaluation.views import view_map
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
 from gausslite.mission.settings import (
@@ -42,10 +40,12 @@ from gausslite.mission.settings import (
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.pointing import region_at, region_on_image
 from gausslite.perception.questions import Z_UP, Answer, answer
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
 from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
+from gausslite_calibration.calibrate import StatedValues, as_recorded_notes, calibrate
+from gausslite_evaluation.views import view_map
+from gausslite_language.rules import RuleParser
 
 __all__ = [
     "AgentClient",

@@ -170,9 +170,6 @@ class Sibling(StrEnum):
     """mission_view."""
     REPORT = "gausslite_view.report"
     """write_report."""
-    VIEW_COMMAND = "gausslite_view.view_command"
-    REPORT_COMMAND = "gausslite_view.report_command"
-    BENCH_COMMAND = "gausslite_bench.cli.main"
 
 
 def sibling(module: Sibling) -> Any:

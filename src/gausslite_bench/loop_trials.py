@@ -15,10 +15,10 @@ from gausslite.domain.pose import orthonormal, rotation_angle_deg, transform_of,
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.loops import MIN_GAP, LoopCloser
 from gausslite.mapping.splat_table import SplatTable
-from gausslite.mission.prior import SavedMap
 from gausslite.render.choose import choose_rasterizer
+from gausslite_places.loops import MIN_GAP, LoopCloser
+from gausslite_places.prior_map import SavedMap
 
 _PRIOR = PoseExposurePrior(0.006, 0.13)
 _STEP_M = 2.0

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.export.occupancy import OccupancySettings
 from gausslite.wire.robot import AgentLink, LinkSettings
 from gausslite.wire.security import Tls
+from gausslite_export.occupancy import OccupancySettings
 from gausslite_ros.bag_file import BagOptions
 from gausslite_ros.live_frames import LiveFrames
 from gausslite_ros.live_map import LiveMap

@@ -23,7 +23,7 @@ from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.schedule import ScheduledTaskMapper
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.process import print_message
-from gausslite.task.rules import RuleParser
+from gausslite_language.rules import RuleParser
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
 from gausslite_view.map_page import MapPage, TaskField

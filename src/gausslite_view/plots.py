@@ -12,9 +12,9 @@ from jaxtyping import Bool, Shaped, UInt8
 from numpy import ndarray
 
 from gausslite.domain.errors import GaussLiteError
-from gausslite.evaluation.metrics import psnr
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.views import StoredKeyframe
+from gausslite_evaluation.metrics import psnr
 from gausslite_view.contents import category_colour
 
 _MAX_POINTS = 600

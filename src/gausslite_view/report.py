@@ -14,7 +14,7 @@ from numpy import ndarray
 from gausslite.codec.state_file import read_png, write_atomic
 from gausslite.domain.errors import StorageError
 from gausslite.domain.objects import found_text
-from gausslite.evaluation.compare import MAP_PURPOSES, team_sentence
+from gausslite_evaluation.compare import MAP_PURPOSES, team_sentence
 from gausslite_view.contents import ColourMode
 from gausslite_view.report_elements import as_html, element, picture, styled
 from gausslite_view.report_parts import (

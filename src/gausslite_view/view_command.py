@@ -78,7 +78,7 @@ def show_files(options: argparse.Namespace) -> Iterator[str]:
 @contextmanager
 def _show_team(folder: Path, options: argparse.Namespace) -> Iterator[str]:
     """Show one map of a demo at a time, the voted one first, with what it is for and what a robot alone lacks."""
-    from gausslite.evaluation.compare import TEAM_MAP, map_purpose
+    from gausslite_evaluation.compare import TEAM_MAP, map_purpose
     from gausslite_view.report import team_gain
     from gausslite_view.report_parts import read_results
 

@@ -21,10 +21,10 @@ pytest.importorskip("gsplat", reason="gsplat is not installed; pip install gauss
 import gsplat
 import torch
 
-from gausslite.render.cuda import CudaRasterizer
-from gausslite.render.cuda.kernels import TorchKernels, project
-from gausslite.render.cuda.tables import DeviceCamera
 from gausslite_bench.raster.gsplat_baseline import GsplatBaseline
+from gausslite_gpu import CudaRasterizer
+from gausslite_gpu.kernels import TorchKernels, project
+from gausslite_gpu.tables import DeviceCamera
 
 torch.set_num_threads(1)
 SIZE = (48, 32)

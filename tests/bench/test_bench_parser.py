@@ -11,8 +11,8 @@ from gausslite.cli.main import main
 from gausslite.codec.json import graph_from_json
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import TaskGraph
-from gausslite.task.rules import RuleParser
 from gausslite_bench.parser_scores import load_sentences, score_parser
+from gausslite_language.rules import RuleParser
 
 ROWS = [
     {"text": "Find a mug on a table", "targets": ["mug"], "anchors": ["table"], "relations": [["on", "mug", "table"]]},

@@ -18,7 +18,6 @@ from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import same_kind
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.task.rules import RuleParser
 from gausslite_bench.quality.ablation import cumulative_variants
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HOME_TASKS, WHOLE_HOMES, TaskKind, choose_home_tasks
@@ -28,6 +27,7 @@ from gausslite_bench.quality.study import FinishedTrial, Study, run_study
 from gausslite_bench.quality.tables import FULL_METRICS, ROI_METRICS, StudyResults, ablation_table, quality_table
 from gausslite_bench.quality.trial_cache import TrialCache
 from gausslite_bench.quality.trials import BudgetMode, Conditions, Trial, TrialBudget, Variant
+from gausslite_language.rules import RuleParser
 from gausslite_sim.home_catalogue import HOME_COUNT, HOMES
 
 

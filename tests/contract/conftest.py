@@ -31,7 +31,7 @@ def _cpu(simd: str) -> Rasterizer:
 
 
 def _cuda(device: str) -> Rasterizer:
-    from gausslite.render.cuda import CudaRasterizer
+    from gausslite_gpu import CudaRasterizer
 
     return CudaRasterizer(device)
 

@@ -18,7 +18,6 @@ from gausslite.domain.relevance import BallRegion, RelevanceMap
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.settings import MissionSettings
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate, RelevanceEstimator
-from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import AgentClient
 from gausslite.wire.server import Service
@@ -29,6 +28,7 @@ from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import LoadSettings, parse_arguments
+from gausslite_language.rules import RuleParser
 
 SETTINGS = MissionSettings(max_gaussians=2000, iterations=2, threads=1)
 TASK = "Pick up the mug on the table"

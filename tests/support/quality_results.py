@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from gausslite.evaluation.compare import MapScores
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import choose_home_tasks
 from gausslite_bench.quality.study import FinishedTrial, Origin
 from gausslite_bench.quality.trials import Conditions, Trial, TrialBudget, TrialResult, Variant
+from gausslite_evaluation.compare import MapScores
 
 PLAN = HomeScenePlan(choose_home_tasks(["home-8-manipulation"])[0], frames=4, views=3)
 CONDITIONS = Conditions((96, 72))

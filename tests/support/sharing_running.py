@@ -17,8 +17,8 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.security import Tls
 from gausslite.wire.server import start_server
+from gausslite_cluster.shared_servicer import Share, open_share
 from gausslite_fusion_server.settings import ServerSettings
-from gausslite_fusion_server.shared_servicer import Share, open_share
 
 
 @dataclass(frozen=True)

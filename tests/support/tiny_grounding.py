@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from gausslite.perception.text_features import WordPieces
+from gausslite_detectors.text_features import WordPieces
 
 VOCABULARY = ("[PAD]", "[UNK]", "[CLS]", "[SEP]", ".", "red", "mug", "table", "mu", "##g", "object")
 _UNSURE = -6.0

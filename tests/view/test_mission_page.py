@@ -23,7 +23,7 @@ from gausslite.domain.state import encode_text
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.schedule import ScheduledTaskMapper, TaskSchedule
 from gausslite.mission.settings import MissionSettings, PerceptionSettings, SceneInfo
-from gausslite.task.rules import RuleParser
+from gausslite_language.rules import RuleParser
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 pytest.importorskip("viser")

@@ -37,9 +37,9 @@ from gausslite.perception.pointing import pointed_masks
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.background import IdleTraining, KeyframeUpload
-from gausslite_agent.prior import LOCALISING, PriorFrames
 from gausslite_agent.settings import LoadSettings, QueuePolicy
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
+from gausslite_places.agent_prior import LOCALISING, PriorFrames
 
 
 def _running_future() -> Future[FrameReport]:

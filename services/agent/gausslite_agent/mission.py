@@ -18,7 +18,6 @@ from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
-from gausslite.task.grounding import TaskParser
 from gausslite.wire.convert import values_of
 from gausslite.wire.convert_task import AssignedTask
 from gausslite.wire.spool import Purpose
@@ -35,6 +34,7 @@ from gausslite_agent.state import (
     MissionSummary,
     WorkerStatus,
 )
+from gausslite_language.grounding import TaskParser
 
 _OF_UPLINK = (
     *("handover_bytes", "keyframe_bytes", "keyframes_sent", "keyframes_waiting", "gaussians_sent"),

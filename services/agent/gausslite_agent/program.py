@@ -11,21 +11,16 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 
-from gausslite.calibration.calibrate import recording_notes
 from gausslite.config.values import NONE
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.build import EstimatorFactory
-from gausslite.mission.prior import SavedMap
-from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.process import Sibling, sibling
-from gausslite.task.grounding import TaskParser
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.process import run_service
 from gausslite.wire.server import serve_until_stopped
@@ -35,11 +30,16 @@ from gausslite.wire.views import ChangeNotifier
 from gausslite_agent.background import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import NO_DETECTOR, AgentMission
-from gausslite_agent.prior import PriorFrames
 from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_arguments
 from gausslite_agent.state import SavedMission
 from gausslite_agent.team_map import TeamMapFollower
+from gausslite_calibration.calibrate import recording_notes
+from gausslite_language.grounding import TaskParser
+from gausslite_language.rules import RuleParser
+from gausslite_places.agent_prior import PriorFrames
+from gausslite_places.prior_map import SavedMap
+from gausslite_places.prior_run import PriorRun, require_other_folder
 
 _log = logging.getLogger(__name__)
 _TIMEOUT_S = 30.0

@@ -30,7 +30,6 @@ from gausslite.domain.voxels import (
 )
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mission.runner import correct_live_frame
-from gausslite.task.grounding import TaskParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.v1 import agent_service_pb2_grpc as pb_grpc
 from gausslite.wire.convert import (
@@ -54,6 +53,7 @@ from gausslite_agent.messages import (
 )
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
+from gausslite_language.grounding import TaskParser
 
 
 @dataclass(frozen=True, slots=True, eq=False)

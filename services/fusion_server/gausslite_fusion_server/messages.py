@@ -18,7 +18,7 @@ from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
-from gausslite.fusion.keyframes import AgentKeyframe, EncodedKeyframe
+from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.refinement import LayerView
 from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import AgentContribution

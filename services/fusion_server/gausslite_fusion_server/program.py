@@ -15,7 +15,6 @@ from functools import partial
 from gausslite.domain.errors import GaussLiteError
 from gausslite.fusion import store_maintenance
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.fit_process import FitProcess
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import StoreReport
@@ -36,6 +35,7 @@ from gausslite_fusion_server.settings import (
     parse_arguments,
     parse_maintenance,
 )
+from gausslite_places.fit_process import FitProcess
 
 _SWITCH_INTERVAL_S = 0.001
 _COLLECTION_THRESHOLDS = (2_000, 10, 100)
@@ -100,7 +100,7 @@ def _open_store(settings: ServerSettings) -> FusionStore:
         return MemoryStore()
     if isinstance(settings.store, str):
         import_extra("psycopg", "postgres", f"--store {POSTGRES_SCHEME}...")
-        from gausslite.fusion.postgres_store import PostgresStore
+        from gausslite_cluster.postgres_store import PostgresStore
 
         return PostgresStore(settings.store)
     return SqliteStore(settings.store, settings.store_max_bytes)
@@ -153,7 +153,7 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
 async def _serve_share(settings: ServerSettings, peer_address: str) -> None:
     """Serve a part of a mission, together with the other servers of the database."""
     import_extra("psycopg", "postgres", f"--store {POSTGRES_SCHEME}...")
-    from gausslite_fusion_server.shared_servicer import open_share
+    from gausslite_cluster.shared_servicer import open_share
 
     async with open_share(settings, peer_address) as share:
         metrics = metrics_server(settings.metrics, share.engine, share.sender.acknowledgements, share.counts)

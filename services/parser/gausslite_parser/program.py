@@ -13,14 +13,14 @@ from gausslite.config.option import build, option
 from gausslite.config.program import Program, parse_options
 from gausslite.domain.errors import GaussLiteError
 from gausslite.process import print_message
-from gausslite.task.grounding import TaskParser
-from gausslite.task.rules import BackendSettings, open_parser
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire.channel import PARSER_ADDRESS
 from gausslite.wire.convert_task import graph_to_message
 from gausslite.wire.process import run_service
 from gausslite.wire.security import Tls, TlsFiles
 from gausslite.wire.server import Service, serve_until_stopped
+from gausslite_language.grounding import TaskParser
+from gausslite_language.rules import BackendSettings, open_parser
 
 SERVICE_NAME = parser_service_pb2.DESCRIPTOR.services_by_name["ParserService"].full_name
 

@@ -9,24 +9,17 @@ import os
 import sys
 from collections.abc import Callable, Collection, Sequence
 from importlib import import_module
-from typing import cast
+from typing import Final, cast
 
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.program import parse_options
-from gausslite.domain.errors import GaussLiteError
-from gausslite.process import Sibling, Terminated, print_message, raise_interrupts, sibling
+from gausslite.domain.errors import GaussLiteError, MissingPluginError
+from gausslite.plugins import Command, Group, load, names
+from gausslite.process import Terminated, print_message, raise_interrupts
 
-SUMMARIES = {
+_SUMMARIES: Final = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",
-    "demo": "run a task parser, a fusion server and two agents as processes; fuse and score their maps",
-    "parse": "parse a task sentence into targets, anchors and relations",
-    "eval": "score a map on frames of a sequence, in the region of interest (ROI) and over whole images",
-    "calibrate": "estimate the camera of a recording: depth registration, lens, rolling shutter, times, pose errors",
     "fuse": "fuse map files into one by a vote in every voxel",
-    "export": "write a map for other tools: splat viewers, point clouds, planners, meshes",
-    "report": "show the results of one or several runs on one HTML page: pictures, plots and tables",
-    "diff": "say what changed between the maps of two runs: objects that are gone, moved or new",
-    "view": "show a map, a run, an agent or a fusion server on a page in the browser",
     "status": "print the state of a running agent or fusion server",
     "end": "end the mission of a running agent: send what waits, hand over, save",
     "refine": "refine the fused map of a running team",
@@ -34,13 +27,8 @@ SUMMARIES = {
     "evict": "delete the data of an agent from a fusion server, and keep it out on request",
     "unban": "let a banned agent join a fusion server again",
     "objects": "print where objects are, or which ones a question means, from a fusion server or the results of a run",
-    "models": "list the model files for detection and segmentation, print how each is made, and inspect one",
-    "completion": "print the completion of commands and options for a shell",
-    "doctor": "check the machine and the installation: CPU, GPU, memory, disk, clock, ports, models, extras",
-    "bench": "measure the rasterizer, the mapping loop, the GPU, map quality or a task parser",
 }
 _TEAM = ("status", "end", "refine", "fetch", "evict", "unban")
-_SIBLINGS = {"report": Sibling.REPORT_COMMAND, "view": Sibling.VIEW_COMMAND, "bench": Sibling.BENCH_COMMAND}
 
 
 class _PrintVersion(argparse.Action):
@@ -56,27 +44,44 @@ class _PrintVersion(argparse.Action):
         parser.exit()
 
 
-def build_parser(configured: Collection[str] = tuple(SUMMARIES)) -> CommandParser:
-    """Return the parser of `gausslite`. configured: commands that get their options; each imports its module."""
+def commands() -> dict[str, Command]:
+    """Return the sub-commands: those of the core, then those of the packages beside it."""
+    core = {name: Command(summary, f"gausslite.cli.{_module(name)}") for name, summary in _SUMMARIES.items()}
+    return core | {name: _plugin(name) for name in names(Group.COMMANDS)}
+
+
+def _module(name: str) -> str:
+    return f"team:configure_{name}" if name in _TEAM else f"{name}_command:configure"
+
+
+def _plugin(name: str) -> Command:
+    """Return a command of another package; one whose package is not installed says so when it is chosen."""
+    try:
+        command: Command = load(Group.COMMANDS, name)
+    except MissingPluginError as error:
+        return Command(str(error).partition(": ")[2], "")
+    return command
+
+
+def build_parser(configured: Collection[str] | None = None) -> CommandParser:
+    """Return the parser of `gausslite`. configured: commands that get their options, which imports their modules."""
     parser = CommandParser(prog="gausslite", description="Online 3D Gaussian maps that spend their detail on a task.")
     parser.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version and exit")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, summary in SUMMARIES.items():
-        command = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
-        if name in configured:
-            _configure(name)(command)
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, command in commands().items():
+        summary = command.summary
+        added = subparsers.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
+        if configured is None or name in configured:
+            _configure(name, command)(added)
     return parser
 
 
-def _configure(name: str) -> Callable[[argparse.ArgumentParser], None]:
+def _configure(name: str, command: Command) -> Callable[[argparse.ArgumentParser], None]:
     """Return the function that adds the options of a command; this imports its module."""
-    if name in _TEAM:
-        configure = getattr(import_module("gausslite.cli.team"), f"configure_{name}")
-    elif name in _SIBLINGS:
-        configure = sibling(_SIBLINGS[name]).configure
-    else:
-        configure = import_module(f"gausslite.cli.{name}_command").configure
-    return cast(Callable[[argparse.ArgumentParser], None], configure)
+    if not command.module:
+        load(Group.COMMANDS, name)
+    module, _, function = command.module.partition(":")
+    return cast(Callable[[argparse.ArgumentParser], None], getattr(import_module(module), function or "configure"))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
-from gausslite.cli.map_prior import in_frame_of, localised
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
     RecordingOptions,
@@ -35,16 +34,9 @@ from gausslite.domain.objects import ObjectLandmark, found_text
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text, get_text
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.evaluation.compare import TrainingFit, score_training_views
-from gausslite.evaluation.metrics import trajectory_error
-from gausslite.evaluation.pictures import render_preview
-from gausslite.evaluation.views import view_map
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
-from gausslite.mission.map_diff import Change
-from gausslite.mission.prior import SavedMap
-from gausslite.mission.prior_run import PriorRun, require_other_folder
 from gausslite.mission.results import (
     MAP,
     PREVIEW,
@@ -72,6 +64,14 @@ from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome,
 from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, Sibling, import_extra, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.channel import MAX_PORT
+from gausslite_evaluation.compare import TrainingFit, score_training_views
+from gausslite_evaluation.metrics import trajectory_error
+from gausslite_evaluation.pictures import render_preview
+from gausslite_evaluation.views import view_map
+from gausslite_places.map_diff import Change
+from gausslite_places.prior_localisation import in_frame_of, localised
+from gausslite_places.prior_map import SavedMap
+from gausslite_places.prior_run import PriorRun, require_other_folder
 
 
 def trajectory_report(settings: SourceSettings, source: Source, mapper: TaskMapper) -> dict[str, object]:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, replace
 from typing import Any
 
-from gausslite.calibration.calibrate import StatedValues
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, stated_values
 from gausslite.codec.json import graph_as_json
 from gausslite.config.option import build, option
@@ -30,6 +29,7 @@ from gausslite.mission.settings import (
     default_policy,
 )
 from gausslite.process import print_message
+from gausslite_calibration.calibrate import StatedValues
 
 FRAMES_KEY = "frames"
 """Name of the text of --frames among the extra arrays of a saved run."""
@@ -174,7 +174,7 @@ def parse_task(options: argparse.Namespace) -> TaskGraph | None:
                 "--set target-at=X,Y,Z[,R]"
             )
         return None
-    from gausslite.task.rules import RuleParser
+    from gausslite_language.rules import RuleParser
 
     return RuleParser().parse(options.task)
 
@@ -241,6 +241,6 @@ def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSc
     for frame in frames:
         if frames.count(frame) > 1:
             raise InvalidInputError(f"task-at: expected one task for a frame, got {frames.count(frame)} for {frame}")
-    from gausslite.task.rules import RuleParser
+    from gausslite_language.rules import RuleParser
 
     return TaskSchedule(first, tuple((switch.frame, RuleParser().parse(switch.text)) for switch in switches))

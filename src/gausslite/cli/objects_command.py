@@ -92,7 +92,7 @@ def _select(place: _Place, question: str) -> tuple[Sequence[TeamObject], Sequenc
     if not question:
         return place.objects, ()
     from gausslite.perception.questions import answer
-    from gausslite.task.rules import RuleParser
+    from gausslite_language.rules import RuleParser
 
     try:
         graph = RuleParser().parse(question)

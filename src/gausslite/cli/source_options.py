@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite.calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
 from gausslite.config.option import option
 from gausslite.config.values import (
     AUTO,
@@ -35,6 +34,7 @@ from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.runner import MissionResult, region_file_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
 from gausslite.process import Sibling, print_message, sibling
+from gausslite_calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
 
 _MESSAGE_WIDTH, _VALUE_WIDTH = 150, 30
 """Characters of a message on an estimate, and of the value in it; `gausslite calibrate` prints longer ones."""

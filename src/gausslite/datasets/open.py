@@ -7,18 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gausslite.datasets.corrected import UndistortedColourSource
-from gausslite.datasets.record3d import Record3dSource
-from gausslite.datasets.registered_source import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source
 from gausslite.datasets.tum import TumSource
-from gausslite.datasets.zed import ZedSource
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import DepthRegistration
 from gausslite.process import Sibling, sibling
+from gausslite_calibration.registered_source import RegisteredSource
+from gausslite_recorders.record3d import Record3dSource
+from gausslite_recorders.zed import ZedSource
 
 _READERS = (TumSource, SevenScenesSource, ReplicaSource, ZedSource, Record3dSource)
 _LAYOUTS = (

@@ -36,6 +36,10 @@ class ModelFileError(InvalidInputError):
     """A model file is missing, damaged or of an unexpected kind."""
 
 
+class MissingPluginError(InvalidInputError):
+    """No package that is installed provides what was chosen."""
+
+
 class MapFileError(InvalidInputError):
     """A stored map cannot be read."""
 

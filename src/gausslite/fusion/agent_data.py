@@ -10,12 +10,12 @@ import numpy as np
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError
 from gausslite.domain.voxels import RoiSubset
-from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import fuse
 from gausslite.fusion.vote_input import VoteInput
+from gausslite_places.frame_aligner import FrameAligner
 
 _log = logging.getLogger(__name__)
 # no agent can join under such a name, because ids of agents hold no colon

@@ -22,11 +22,9 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.fusion.agent_data import AgentData
-from gausslite.fusion.alignment import Fit, fit_frame
-from gausslite.fusion.frame_aligner import FrameAligner
 from gausslite.fusion.frames import FrameAlignment, FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers, load_refinement, save_refinement
-from gausslite.fusion.keyframes import (
+from gausslite.fusion.keyframe_pool import (
     AgentKeyframe,
     EncodedKeyframe,
     FrameDecoder,
@@ -41,7 +39,6 @@ from gausslite.fusion.objects import MergedObjects, TeamObjects, find_objects
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome, SessionRecord, require_storable
 from gausslite.fusion.traffic import Acknowledgements, AgentContribution, MissionStatus, StorageProbe, TrafficLog
-from gausslite.fusion.unknown_frames import Find, UnknownFrames, find_frame
 from gausslite.fusion.updates import (
     MissionClock,
     PendingUpdate,
@@ -51,6 +48,9 @@ from gausslite.fusion.updates import (
     require_within_quotas,
 )
 from gausslite.fusion.vote_input import VoteInput
+from gausslite_places.frame_aligner import FrameAligner
+from gausslite_places.frame_fit import Fit, fit_frame
+from gausslite_places.unknown_frames import Find, UnknownFrames, find_frame
 
 
 class JoinResult(NamedTuple):

@@ -18,8 +18,8 @@ from numpy import ndarray
 
 from gausslite.domain.errors import CodecError, GaussLiteError
 from gausslite.domain.pose import inverse, require_rigid, rotation_angle_deg
-from gausslite.fusion.alignment import FrameFit
 from gausslite.fusion.store import FusionStore
+from gausslite_places.frame_fit import FrameFit
 
 RECORD = "alignment"
 _MAX_SEGMENTS = 200

@@ -23,7 +23,7 @@ from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
-from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mapping.density import densify, prune
 from gausslite.mapping.settings import REFINE_RATES, DensitySettings

@@ -31,7 +31,6 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.free_space import contradicted_rows, guessed_far, left_behind
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
-from gausslite.mapping.loops import LoopCloser, LoopCounts
 from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
 from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
@@ -40,6 +39,7 @@ from gausslite.mapping.task_change import add_roi_evidence, clear_roi, update_ro
 from gausslite.mapping.training import CountedScheduler, SkippableStage, Stage, StageScheduler, Trainer
 from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
 from gausslite.render.rasterizer import Rasterizer, Rendering
+from gausslite_places.loops import LoopCloser, LoopCounts
 
 _MAX_KEYFRAMES = 2**31 - 1
 _STAYS = np.eye(4)

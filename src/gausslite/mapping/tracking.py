@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.calibration.alignment import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
-from gausslite.calibration.features import FeatureView, detect_features, relative_pose
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
 from gausslite.domain.frame import Frame
@@ -26,6 +24,8 @@ from gausslite.domain.pose import (
     twist_of,
 )
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
+from gausslite.pose_fit.features import FeatureView, detect_features, relative_pose
+from gausslite.pose_fit.photometric import COARSE_TO_FINE, FINE, Alignment, PyramidLevel, align
 from gausslite.render.rasterizer import Rendering
 
 _MIN_DISTANCE_M, _MIN_ANGLE_DEG = 0.25, 15.0

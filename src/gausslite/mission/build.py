@@ -31,7 +31,7 @@ from gausslite.render.choose import choose_rasterizer
 
 if TYPE_CHECKING:
     from gausslite.perception.detector import Detector
-    from gausslite.perception.models import ModelRegistry
+    from gausslite_detectors.models import ModelRegistry
 
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
@@ -56,7 +56,7 @@ def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
     """Open the user's model files and run each once; None without any. Raises ModelFileError, InvalidInputError."""
     if perception.model is None:
         return None
-    from gausslite.perception.models import ModelRegistry
+    from gausslite_detectors.models import ModelRegistry
 
     tiling = Tiling(perception.tiles, perception.detection_time_s)
     return ModelRegistry(
@@ -111,7 +111,7 @@ class EstimatorFactory:
     def require_detector(self) -> None:
         """Raise InvalidInputError if one is needed, and there is neither a model file nor ground truth."""
         if self._needs_detector and self._models is None and not self._scene().regions:
-            from gausslite.perception.models import detector_advice
+            from gausslite_detectors.models import detector_advice
 
             raise InvalidInputError(
                 f"detector: expected --detector FILE.onnx, which finds the task's objects; {detector_advice()}"

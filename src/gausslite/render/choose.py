@@ -26,7 +26,7 @@ def choose_rasterizer(name: str = "auto", threads: int | None = None) -> Rasteri
         return CpuRasterizer(threads=threads)
     if name == "cuda":
         _require_packages("cuda", "torch", "gsplat")
-        from gausslite.render.cuda import CudaRasterizer
+        from gausslite_gpu import CudaRasterizer
 
         return CudaRasterizer()
     if name == "reference":

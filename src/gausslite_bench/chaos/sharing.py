@@ -20,7 +20,6 @@ from numpy import ndarray
 from gausslite.codec.ply import ply_bytes
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.voxels import VoxelBatch
-from gausslite.fusion.regions import slots_of
 from gausslite.fusion.store_rows import UpdateLog, read_batches, require_intact
 from gausslite.fusion.store_values import Scores
 from gausslite.wire.clients import Export, FusionClient
@@ -34,6 +33,7 @@ from gausslite_bench.chaos.agent_team import AgentTeam
 from gausslite_bench.chaos.fault_proxy import FaultProxy
 from gausslite_bench.server.server_process import DEFAULT_COMMAND, ServerProcess
 from gausslite_bench.server.sharing import new_database
+from gausslite_cluster.regions import slots_of
 
 _PROGRESS_S, _POLL_S, _MAX_FAULT_S = 240.0, 0.02, 2.0
 _STARTS = 10

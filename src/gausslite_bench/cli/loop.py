@@ -21,7 +21,6 @@ from gausslite.config.program import Program
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.evaluation.views import HeldOutView
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.policies import TASK
 from gausslite.mission.build import EstimatorFactory, build_mapper, region_estimator
@@ -41,6 +40,7 @@ from gausslite.render.rasterizer import Rasterizer
 from gausslite_bench.loop.frame_costs import CostLog, FrameCost, Latency, LoopBench, LoopTiming, Overhead
 from gausslite_bench.loop.memory import MemoryTrend, back_and_forth, resident_mib
 from gausslite_bench.loop.rate_gap import RateGap
+from gausslite_evaluation.views import HeldOutView
 
 _HOME = "sim:home?seed=0&trajectory=0"
 _HOME_TASK = "Pick up the mug on the table"

@@ -13,8 +13,8 @@ from pathlib import Path
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option
 from gausslite.config.program import Program
-from gausslite.task.rules import BackendSettings, open_parser
 from gausslite_bench.parser_scores import SENTENCES, ParserScore, load_sentences, score_parser
+from gausslite_language.rules import BackendSettings, open_parser
 
 
 @dataclass(frozen=True, slots=True)

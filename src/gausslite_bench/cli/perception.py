@@ -28,10 +28,10 @@ from gausslite.domain.relevance import Region
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.mission.settings import PerceptionSettings, SourceSettings
 from gausslite.perception.detector import Detector, Tiling
-from gausslite.task.rules import RuleParser
 from gausslite_bench.perception.absent_nouns import AbsentSummary, absent_queries, choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
 from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery, TaskScore
+from gausslite_language.rules import RuleParser
 
 _ANY_OBJECT = "object"
 _COLUMNS = ("IoU", "precision", "recall", "marked, %", "max, %", "frames", "right", "found", "late")
@@ -81,7 +81,7 @@ def configure_perception(parser: CommandParser) -> None:
 
 def run_perception(options: argparse.Namespace) -> int:
     """Run every task on every frame and print the scores of each stage."""
-    from gausslite.perception.models import ModelRegistry
+    from gausslite_detectors.models import ModelRegistry
 
     if options.detector is None:
         raise InvalidInputError("--detector: expected a model file to compare with ground truth, got none")
@@ -201,7 +201,7 @@ def _task_queries(texts: Sequence[str], regions: Mapping[str, Region]) -> list[T
 def _absent_queries(options: argparse.Namespace, detector: Detector, regions: Mapping[str, Region]) -> list[TaskQuery]:
     """Return a search for each noun of --absent, or for as many nouns of the detector's vocabulary."""
     if isinstance(options.absent, int):
-        from gausslite.perception.class_match import TextEmbeddings
+        from gausslite_detectors.class_match import TextEmbeddings
 
         embeddings = TextEmbeddings.from_model_folder(options.detector)
         vocabulary = () if embeddings is None else tuple(embeddings.noun_index)

@@ -20,12 +20,12 @@ from gausslite.datasets.source import frame_size, select_frames
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import rotation_angle_deg, transform_of, translation_m
-from gausslite.evaluation.views import view_map
-from gausslite.mission.prior import MAX_LOCALISED_FRAMES, SavedMap
 from gausslite.mission.results import as_text
 from gausslite.mission.settings import SourceSettings
-from gausslite.places.localisation import PlaceMap
 from gausslite_bench.loop_trials import LoopScore, LoopTrials
+from gausslite_evaluation.views import view_map
+from gausslite_places.localisation import PlaceMap
+from gausslite_places.prior_map import MAX_LOCALISED_FRAMES, SavedMap
 
 _WRONG_M, _WRONG_DEG = 0.25, 10.0
 _BESIDE = np.array([20.0, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -19,13 +19,13 @@ from gausslite.config.values import NONE, PRIOR_FORM, read_prior, read_up_axis
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.source import downscaled_size
 from gausslite.domain.errors import InvalidInputError
-from gausslite.evaluation.lpips import LPIPS_HELP
 from gausslite.mission.settings import POSE_PRIOR_HELP
 from gausslite_bench.cli.argument_types import read_image_size, read_seeds
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HomeTask, choose_home_tasks
 from gausslite_bench.quality.real_scenes import REAL_CAMERA, RealScenePlan, choose_kinds, real_plans
 from gausslite_bench.quality.scenes import PosePolicy, ScenePlan
+from gausslite_evaluation.lpips import LPIPS_HELP
 
 _HOME_FRAMES = 60
 _HOME_SIZE = (320, 240)

@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.state_file import write_atomic
-from gausslite.evaluation.lpips import load_lpips
 from gausslite.mission.build import open_models
 from gausslite.mission.results import write_json
 from gausslite_bench.quality.equal_time import first_visible_scene, load_rate, measure_rate, rate_trials
@@ -21,6 +20,7 @@ from gausslite_bench.quality.scenes import UnseenRegionError
 from gausslite_bench.quality.study import FinishedTrial, Origin, Study, expected_origins, run_study
 from gausslite_bench.quality.tables import StudyResults
 from gausslite_bench.quality.trial_cache import TrialCache
+from gausslite_evaluation.lpips import load_lpips
 
 RATE_FILE = "rate.json"
 

@@ -17,7 +17,6 @@ from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import split_names
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.voxels import VoxelGrid, group_by_voxel
-from gausslite.fusion.alignment import SurfaceSamples
 from gausslite.mapping.policies import POLICIES
 from gausslite.mission.results import as_text, prepare_folder, write_json
 from gausslite.mission.settings import MissionSettings, PerceptionSettings
@@ -32,6 +31,7 @@ from gausslite_bench.team.object_positions import PositionScore, measure_positio
 from gausslite_bench.team.scenes import HomeTeamPlan, RecordingTeamPlan, TeamPlan
 from gausslite_bench.team.tables import team_table
 from gausslite_bench.team.unknown_frames import search_frames, searches_table
+from gausslite_places.frame_fit import SurfaceSamples
 
 _SIZE = (320, 240)
 _HOME_FRAMES = 60

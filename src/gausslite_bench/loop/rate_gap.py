@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.evaluation.compare import evaluate
-from gausslite.evaluation.views import HeldOutView
 from gausslite.render.rasterizer import Rasterizer
+from gausslite_evaluation.compare import evaluate
+from gausslite_evaluation.views import HeldOutView
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,8 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from gausslite.domain.relevance import Detection
-from gausslite.evaluation.pictures import arrange_grid, dim_outside, labelled_image, outline_roi
 from gausslite_bench.perception.stage_scores import FrameMasks
+from gausslite_evaluation.pictures import arrange_grid, dim_outside, labelled_image, outline_roi
 
 _BOX_RGB = (80, 220, 255)
 

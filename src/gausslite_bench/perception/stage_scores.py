@@ -16,13 +16,13 @@ from gausslite.domain.objects import NounMatch
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.relevance import Detection, Region
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.evaluation.views import MIN_ROI_PIXELS
 from gausslite.perception.detector import Detector
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.relevance_tracker import merge_detections
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 from gausslite_bench.perception.past_frames import PastFrames
 from gausslite_bench.perception.shared_detections import SharedDetections
+from gausslite_evaluation.views import MIN_ROI_PIXELS
 
 _MIN_FOUND_SHARE = 0.25
 

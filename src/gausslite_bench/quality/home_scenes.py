@@ -10,10 +10,10 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
-from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite_bench.quality.home_tasks import HomeTask
 from gausslite_bench.quality.scenes import PosePolicy, Scene, make_scene, require_count
+from gausslite_evaluation.views import HeldOutView
 
 _TRAINING_TRAJECTORIES = (0, 1)
 _HELD_OUT_TRAJECTORY = 2

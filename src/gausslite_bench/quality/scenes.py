@@ -14,9 +14,9 @@ from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import Region, RelevanceMap
-from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate, RelevanceEstimator
+from gausslite_evaluation.views import HeldOutView
 
 _MAX_FRAMES = 100_000
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
-from gausslite.evaluation.lpips import Lpips
 from gausslite_bench.quality.scenes import Scene, ScenePlan, UnseenRegionError
 from gausslite_bench.quality.trial_cache import CachedTrial, TrialCache
 from gausslite_bench.quality.trials import (
@@ -21,6 +20,7 @@ from gausslite_bench.quality.trials import (
     build_map,
     evaluate_map,
 )
+from gausslite_evaluation.lpips import Lpips
 
 
 class Origin(StrEnum):

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from statistics import fmean, pstdev
 
-from gausslite.evaluation.lpips import NAME as LPIPS_NAME
 from gausslite_bench.quality.study import FinishedTrial
 from gausslite_bench.quality.trials import TrialBudget
+from gausslite_evaluation.lpips import NAME as LPIPS_NAME
 
 
 class ViewFit(StrEnum):

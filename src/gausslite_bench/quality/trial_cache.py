@@ -13,12 +13,12 @@ from numpy import ndarray
 
 from gausslite.codec.state_file import write_png
 from gausslite.domain.errors import GaussLiteError, StorageError
-from gausslite.evaluation.pictures import comparison_sheet
-from gausslite.evaluation.views import largest_roi_views
 from gausslite.mission.results import prepare_folder, write_json
 from gausslite_bench.quality.code_hash import current_code_hash
 from gausslite_bench.quality.scenes import Scene
 from gausslite_bench.quality.trials import SHEET_VIEWS, Trial, TrialResult, ViewImages
+from gausslite_evaluation.pictures import comparison_sheet
+from gausslite_evaluation.views import largest_roi_views
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,6 @@ from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
-from gausslite.evaluation.compare import MapScores, average, score_view
-from gausslite.evaluation.lpips import Lpips
-from gausslite.evaluation.pictures import to_uint8
-from gausslite.evaluation.views import MapViewer, largest_roi_views, render_fitted, render_fitted_at_region
 from gausslite.mission.build import EstimatorFactory, build_mapper
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.runner import MissionRunner
@@ -30,6 +26,10 @@ from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator, RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene, ScenePlan
+from gausslite_evaluation.compare import MapScores, average, score_view
+from gausslite_evaluation.lpips import Lpips
+from gausslite_evaluation.pictures import to_uint8
+from gausslite_evaluation.views import MapViewer, largest_roi_views, render_fitted, render_fitted_at_region
 
 SHEET_VIEWS = 2
 
@@ -266,7 +266,7 @@ def _build_estimator(trial: Trial, scene: Scene) -> RelevanceEstimator:
         return NoTaskEstimator()
     if not trial.conditions.perception.from_text:
         return RecordedRelevanceEstimator(scene)
-    from gausslite.task.rules import RuleParser
+    from gausslite_language.rules import RuleParser
 
     return EstimatorFactory(trial.conditions.perception.detector, lambda: scene.info).build(
         RuleParser().parse(scene.task)

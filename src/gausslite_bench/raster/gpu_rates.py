@@ -26,9 +26,9 @@ from gausslite_bench.raster.procedural_room import BenchView, held_out_view, see
 from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, ZERO_LEARNING_RATES, Duration
 
 if TYPE_CHECKING:
-    from gausslite.render.cuda import CudaRasterizer
-    from gausslite.render.cuda.loss import CudaView
     from gausslite_bench.raster.gsplat_baseline import Rasterization
+    from gausslite_gpu import CudaRasterizer
+    from gausslite_gpu.loss import CudaView
 
 GPU_GAUSSIANS = (100_000, 300_000, 1_000_000, 3_000_000)
 FRAME_GAUSSIANS = 1_000_000

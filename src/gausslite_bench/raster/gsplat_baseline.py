@@ -12,10 +12,10 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera
-from gausslite.render.cuda.kernels import load_gsplat
-from gausslite.render.cuda.loss import CudaView, training_loss
-from gausslite.render.cuda.tables import to_device
 from gausslite.render.rasterizer import LOG_SCALE, MEAN, NEAR_M, OPACITY_LOGIT, QUAT, RGB, LossWeights
+from gausslite_gpu.kernels import load_gsplat
+from gausslite_gpu.loss import CudaView, training_loss
+from gausslite_gpu.tables import to_device
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 """Signature of gsplat.rasterization: means, quats, scales, opacities, colors, viewmats, Ks, width, height → images."""

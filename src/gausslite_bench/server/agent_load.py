@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import frame_to_message
 from gausslite_bench.async_calls import UpdateStream, UpdateStreams
 from gausslite_bench.server.synthetic_updates import GRID, delta_messages, fill_messages, keyframe, object_report
+from gausslite_language.rules import RuleParser
 
 RATE_HZ = 4.0
 _OBJECTS_PERIOD_S, _KEYFRAME_PERIOD_S = 1.0, 3.0

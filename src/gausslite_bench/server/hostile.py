@@ -26,7 +26,6 @@ from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.voxels import RoiSubset
-from gausslite.task.rules import RuleParser
 from gausslite.wire.channel import require_serving
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import frame_to_message
@@ -41,6 +40,7 @@ from gausslite_bench.server.synthetic_updates import (
     tombstone_message,
     voxels_batch,
 )
+from gausslite_language.rules import RuleParser
 
 GOOD_AGENTS = 4
 _SEQ = 1 << 20

@@ -10,11 +10,9 @@ import numpy as np
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_voxels
-from gausslite.evaluation.compare import MapScores, score_team
-from gausslite.evaluation.views import MapViewer
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentSettings
-from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings, refine
 from gausslite.fusion.sqlite_store import MemoryStore
@@ -25,6 +23,8 @@ from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.team.frame_errors import FrameError
 from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.scenes import TeamPlan, TeamScene
+from gausslite_evaluation.compare import MapScores, score_team
+from gausslite_evaluation.views import MapViewer
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
 ALONE, TRUSTED = " alone", ", frames trusted"

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from gausslite.domain.pose import transform_of, transform_points
-from gausslite.fusion.alignment import FrameFit, SurfaceSamples, fit_frame
 from gausslite.fusion.frames import AlignmentSettings
+from gausslite_places.frame_fit import FrameFit, SurfaceSamples, fit_frame
 
 PARTS = {"whole": (np.inf, np.inf), "1 to 2 m": (1.0, 2.0), "0.4 to 1 m": (0.4, 1.0), "0.15 to 0.4 m": (0.15, 0.4)}
 """Half the edges of the boxes that are cut out of a map."""

@@ -10,8 +10,6 @@ from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel
-from gausslite.evaluation.metrics import psnr
-from gausslite.evaluation.views import HeldOutView, MapViewer
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import build_mapper
 from gausslite.mission.frame_scheduler import FrameScheduler
@@ -21,6 +19,8 @@ from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.team.scenes import TeamPlan
+from gausslite_evaluation.metrics import psnr
+from gausslite_evaluation.views import HeldOutView, MapViewer
 
 _CHECKED = (1, 2, 4, 8, 16, 32, 64, 128)
 

@@ -9,7 +9,7 @@ from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
-from gausslite.fusion.keyframes import AgentKeyframe
+from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.mapping.keyframe_selection import KeyframeSelection
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.voxel_exchange import SentVoxelTracker

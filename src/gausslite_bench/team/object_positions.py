@@ -16,12 +16,12 @@ from gausslite.domain.objects import ObjectReport, TeamObject, same_kind
 from gausslite.domain.pose import transform_points
 from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.evaluation.views import MIN_ROI_PIXELS, HeldOutView
 from gausslite.fusion.objects import find_objects, merge_objects
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.settings import PerceptionSettings
-from gausslite.task.rules import RuleParser
 from gausslite_bench.team.scenes import AgentScene, TeamScene
+from gausslite_evaluation.views import MIN_ROI_PIXELS, HeldOutView
+from gausslite_language.rules import RuleParser
 
 _CELL_M = 0.02
 _MATCH_M = 0.5

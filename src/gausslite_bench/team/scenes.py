@@ -11,12 +11,12 @@ from gausslite.datasets.regions import choose_regions
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.relevance import Region, RelevanceMap
-from gausslite.evaluation.views import HeldOutView
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
 from gausslite_bench.quality.real_scenes import RealScenePlan
 from gausslite_bench.quality.scenes import PosePolicy
+from gausslite_evaluation.views import HeldOutView
 
 _HELD_OUT_TRAJECTORY = 2
 _WALKS = ((0, 0), (1, 0), (0, 3), (1, 3))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean
 
-from gausslite.evaluation.compare import MapScores
 from gausslite_bench.team.bench import CONCATENATION, TeamResult
+from gausslite_evaluation.compare import MapScores
 
 _STRATEGY_COLUMNS = ("ROI PSNR", "gain", "ROI SSIM", "full PSNR")
 

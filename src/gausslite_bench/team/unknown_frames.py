@@ -13,9 +13,9 @@ from numpy import ndarray
 
 from gausslite.domain.pose import rotation_angle_deg, transform_of, transform_points
 from gausslite.domain.voxels import VoxelGrid, group_by_voxel
-from gausslite.fusion.alignment import SurfaceSamples
-from gausslite.fusion.unknown_frames import find_frame, keyframe_samples
 from gausslite_bench.team.missions import AgentMap
+from gausslite_places.frame_fit import SurfaceSamples
+from gausslite_places.unknown_frames import find_frame, keyframe_samples
 
 VOXELS, KEYFRAMES, BOTH = "voxels", "keyframes", "voxels and keyframes"
 SAME, PART, OTHER, MIRRORED = "same scene", "part of it", "another scene", "mirrored scene"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gausslite.cli.demo_services import ProcessGroup
+from gausslite_demo.services import ProcessGroup
 
 
 class InterruptedStart(subprocess.Popen[bytes]):

@@ -24,7 +24,7 @@ from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, select_keys
-from gausslite.fusion.keyframes import KeyframePool
+from gausslite.fusion.keyframe_pool import KeyframePool
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.sqlite_store import SCHEMA_VERSION, MemoryStore, SqliteStore
 from gausslite.fusion.store import FusionStore
@@ -66,7 +66,7 @@ def opener(kind: str, request: pytest.FixtureRequest) -> OpenStore:
             return lambda: SqliteStore(path)
         case _:
             url = request.getfixturevalue("postgres").new_database()
-            from gausslite.fusion.postgres_store import PostgresStore
+            from gausslite_cluster.postgres_store import PostgresStore
 
             return lambda: PostgresStore(url)
 

@@ -28,7 +28,7 @@ from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.keyframes import EncodedKeyframe
+from gausslite.fusion.keyframe_pool import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.membership import SessionRegistry
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore

@@ -14,7 +14,7 @@ from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.fusion.keyframes import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframePool
+from gausslite.fusion.keyframe_pool import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframePool
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.refinement import RefineProgress, RefineSettings, refine
 from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from mapping_scenes import wall_frame
 
-from gausslite.calibration.alignment import align
-from gausslite.calibration.features import detect_features, relative_pose
 from gausslite.datasets.open import open_source
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, rotation_angle_deg, transform_of, translation_m
-from gausslite.evaluation.metrics import trajectory_error
 from gausslite.mapping.tracking import CameraTracker, KeyframeIndex
 from gausslite.mission.build import build_mapper, build_tracker
 from gausslite.mission.settings import MissionSettings, PoseMode
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator
+from gausslite.pose_fit.features import detect_features, relative_pose
+from gausslite.pose_fit.photometric import align
 from gausslite.render.rasterizer import Rendering
+from gausslite_evaluation.metrics import trajectory_error
 
 PRIOR_STD = np.array([0.1] * 3 + [0.1] * 3)
 SETTINGS = MissionSettings(policy="uniform", max_gaussians=20_000, threads=1, poses=PoseMode.TRACK)

@@ -8,11 +8,11 @@ import pytest
 from tiny_sequences import WITHOUT_ESTIMATES, write_seven_scenes, write_tum
 
 import gausslite as gl
-from gausslite.calibration.registration import find_registration
 from gausslite.cli.main import main
 from gausslite.codec.ply import read_world_frame
 from gausslite.datasets.open import default_world_frame, open_source
 from gausslite.mission.results import locked_folder
+from gausslite_calibration.depth_registration import find_registration
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 FRAMES = tuple(range(0, 24, 4))

@@ -9,7 +9,7 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.mission.schedule import TaskSchedule, TaskSwitch
-from gausslite.task.rules import RuleParser
+from gausslite_language.rules import RuleParser
 
 
 def test_the_current_task_is_that_of_the_latest_switch() -> None:

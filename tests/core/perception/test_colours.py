@@ -13,9 +13,9 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, TaskGraph
 from gausslite.perception.colours import ColourMatch, basic_terms, colour_counts, is_evaluated, match_colour, no_colours
-from gausslite.perception.models import ModelRegistry
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import ColourSettings
+from gausslite_detectors.models import ModelRegistry
 
 # colours that every table of colour names gives these names
 FOCAL = {

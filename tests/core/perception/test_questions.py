@@ -9,7 +9,7 @@ import gausslite as gl
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.perception.questions import answer
-from gausslite.task.rules import RuleParser
+from gausslite_language.rules import RuleParser
 
 
 def thing(name: str, centre_m: tuple[float, float, float], size_m: tuple[float, float, float]) -> ObjectLandmark:

@@ -14,12 +14,12 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis
 from gausslite.domain.relevance import NO_TARGET, BallRegion
 from gausslite.domain.task import Predicate, Relation, TaskGraph
-from gausslite.perception.class_match import match_noun
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.lifting import best_depth_m
 from gausslite.perception.object_map import Observation
 from gausslite.perception.relevance import RegionRelevanceEstimator, TaskRelevanceEstimator
 from gausslite.perception.settings import RelevanceTrackerSettings
+from gausslite_detectors.class_match import match_noun
 
 CAMERA = Camera(100.0, 100.0, 80.0, 60.0, 160, 120)
 

@@ -23,8 +23,8 @@ class Watch:
 sys.meta_path.insert(0, Watch())
 from pathlib import Path
 from gausslite.domain.errors import InvalidInputError
-from gausslite.perception.model_file import open_model
-from gausslite.task.language.onnx import OnnxLanguageModel
+from gausslite_detectors.model_file import open_model
+from gausslite_language.models.onnx import OnnxLanguageModel
 for attempt in (lambda: open_model(Path(sys.argv[1])), lambda: OnnxLanguageModel(Path(sys.argv[2]))):
     try:
         attempt()

@@ -16,7 +16,6 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, RateLimitError
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.security import (
     MESSAGE_BYTES,
@@ -26,6 +25,7 @@ from gausslite.wire.security import (
     TokenBucket,
     wait_for_bandwidth,
 )
+from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 
 SERVING = health_pb2.HealthCheckResponse.SERVING

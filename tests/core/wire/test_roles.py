@@ -10,10 +10,10 @@ from fusion_running import GRID, fusion_server, make_subset, request
 from serving import serving
 
 from gausslite.domain.errors import InvalidInputError, NotPermittedError
-from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2, parser_service_pb2, region_service_pb2
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.security import ROLES_OF_METHOD, Caller, Role, require_role
+from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 
 OPERATOR_ONLY = "expected a certificate with one of the roles operator, got"

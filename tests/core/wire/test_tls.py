@@ -19,12 +19,12 @@ from serving import serving
 from gausslite.cli.health_check import main as ask_health
 from gausslite.domain.errors import InvalidInputError, NotPermittedError, UnavailableError
 from gausslite.domain.voxels import group_by_voxel
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.security import Tls
 from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
+from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 
 _FILES = (("cert", "server/cert.pem"), ("key", "server/key.pem"), ("ca", "server/ca.pem"))

@@ -19,7 +19,6 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.sqlite_store import MemoryStore
-from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
@@ -28,6 +27,7 @@ from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.settings import LoadSettings, QueuePolicy
 from gausslite_agent.state import Outcome
+from gausslite_language.rules import RuleParser
 
 
 def test_a_full_queue_drops_and_reports_the_oldest_frame() -> None:

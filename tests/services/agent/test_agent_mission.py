@@ -32,7 +32,6 @@ from gausslite.mission.runner import FrameStream
 from gausslite.mission.schedule import read_timeline
 from gausslite.mission.settings import SourceSettings
 from gausslite.perception.relevance import RegionRelevanceEstimator
-from gausslite.task.rules import RuleParser
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
 from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
 from gausslite.wire.clients import AgentClient, FusionClient
@@ -46,6 +45,7 @@ from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.settings import AgentSettings, parse_arguments
 from gausslite_agent.state import MissionState
+from gausslite_language.rules import RuleParser
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 

@@ -33,7 +33,6 @@ from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
-from gausslite.task.rules import RuleParser
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire import convert, convert_task
 from gausslite.wire.clients import FusionClient
@@ -42,6 +41,7 @@ from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.servicer import NewestTask
+from gausslite_language.rules import RuleParser
 
 
 def test_a_task_is_text_or_a_graph() -> None:

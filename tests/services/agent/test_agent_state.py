@@ -29,7 +29,6 @@ from gausslite.domain.state import State
 from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, group_by_voxel
 from gausslite.fusion.sqlite_store import MemoryStore
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
@@ -39,6 +38,7 @@ from gausslite_agent.mission import AgentMission
 from gausslite_agent.program import run
 from gausslite_agent.settings import AgentIdentity, AgentSettings, parse_arguments
 from gausslite_agent.state import MissionCheckpoint, SavedMission
+from gausslite_language.rules import RuleParser
 
 MUG, TASK, LATER = BallRegion((0.0, 0.0, 1.2), 0.2), "Pick up the mug", "Find the chair"
 

@@ -14,10 +14,10 @@ from fusion_running import frame
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.relevance import BallRegion
-from gausslite.evaluation.metrics import psnr
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.wire.clients import AgentClient
+from gausslite_evaluation.metrics import psnr
 from gausslite_view.pages import live_page, own_address
 
 pytest.importorskip("viser")

@@ -14,9 +14,9 @@ from serving import serving
 
 from gausslite.domain.errors import TaskError, UnavailableError
 from gausslite.domain.task import TaskGraph
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import ParserClient
 from gausslite_agent.program import WaitingParser
+from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 
 TASK = "Pick up the mug"

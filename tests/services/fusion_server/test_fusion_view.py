@@ -16,7 +16,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, group_by_voxel
-from gausslite.task.rules import RuleParser
+from gausslite_language.rules import RuleParser
 from gausslite_view.contents import ColourMode, legend_of
 from gausslite_view.pages import live_page
 

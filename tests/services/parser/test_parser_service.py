@@ -15,9 +15,9 @@ from serving import serving
 
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, TaskError, UnavailableError
 from gausslite.domain.task import TaskGraph
-from gausslite.task.rules import RuleParser
 from gausslite.wire.clients import ParserClient
 from gausslite.wire.server import start_server
+from gausslite_language.rules import RuleParser
 from gausslite_parser.program import parser_service
 
 

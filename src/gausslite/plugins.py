@@ -1,0 +1,71 @@
+"""Find plug-ins: what packages beside the core register as entry points of the groups below.
+
+The core holds the protocol of each group and no name of a plug-in. In a group of which one is used unless somebody
+chooses another, that one has the name "default".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Final
+
+from gausslite.domain.errors import MissingPluginError
+
+DEFAULT: Final = "default"
+
+
+class Group(StrEnum):
+    """What a plug-in adds to the core."""
+
+    COMMANDS = "gausslite.commands"  # a `Command`; the name is the sub-command
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A sub-command of `gausslite`: its line of help, and the module whose `configure(parser)` adds its options."""
+
+    summary: str
+    module: str
+
+
+def names(group: Group) -> tuple[str, ...]:
+    """Return the names that are registered in a group, sorted."""
+    return tuple(sorted(entry_points(group=group).names))
+
+
+def load(group: Group, name: str = DEFAULT) -> Any:
+    """Import a plug-in. Raises MissingPluginError if it is not registered, or its package is not installed."""
+    entry = next(iter(entry_points(group=group, name=name)), None)
+    if entry is None:
+        known = ", ".join(names(group)) or "none"
+        raise MissingPluginError(f"{name}: expected a plug-in of {group}; installed are: {known}")
+    return _import(entry)
+
+
+def find(group: Group, name: str = DEFAULT) -> Any | None:
+    """Import a plug-in; None if it is not registered, or its package is not installed."""
+    try:
+        return load(group, name)
+    except MissingPluginError:
+        return None
+
+
+def installed(group: Group) -> Iterator[tuple[str, Any]]:
+    """Yield the plug-ins of a group by name; those whose package is not installed are left out."""
+    for name in names(group):
+        plugin = find(group, name)
+        if plugin is not None:
+            yield name, plugin
+
+
+def _import(entry: EntryPoint) -> Any:
+    try:
+        return entry.load()
+    except ModuleNotFoundError as error:
+        package = entry.module.partition(".")[0]
+        missing = (error.name or package).partition(".")[0]
+        needs = f"the package {package}" if missing == package else f"the package {missing}, for {package}"
+        raise MissingPluginError(f"{entry.name}: needs {needs}, which is not installed") from error

@@ -1,0 +1,1 @@
+"""Fits of camera poses to images, by brightness and by features."""

@@ -1,0 +1,1 @@
+"""Fusion servers that share a mission in one PostgreSQL database."""

@@ -1,0 +1,1 @@
+"""Detectors and segmenters from the model files of a user."""

@@ -1,0 +1,110 @@
+"""`gausslite export`: write a map in the formats of other tools."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from gausslite.cli.progress import progress_bar
+from gausslite.codec.run_files import KeyframeView
+from gausslite.config.command_parser import bounded
+from gausslite.domain.errors import InvalidInputError
+from gausslite.mission.results import as_text, map_file, prepare_folder, read_report, require_absent
+from gausslite.process import print_message, size_text
+from gausslite_evaluation.views import view_map
+from gausslite_export.formats import FORMATS, ExportSettings, MapContent, read_map, upright
+from gausslite_export.occupancy import OccupancySettings
+
+_MESH_VOXEL_M, _OCCUPANCY_VOXEL_M, _MIN_OPACITY, _VIDEO_S = 0.01, 0.05, 0.3, 12.0
+_FORMATS_OF = {"voxel": ("octomap", "nav2", "mesh"), "min_opacity": ("octomap", "nav2"), "seconds": ("video",)}
+"""The formats on which an option has an effect."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `gausslite export`."""
+    add = parser.add_argument
+    formats = "; ".join(
+        f"{name}: {file_format.summary} ({file_format.suffix})" for name, file_format in FORMATS.items()
+    )
+    add("map", metavar="RUN", type=Path, help="a results folder of `gausslite map`, or a PLY file")
+    add("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=formats)
+    add("--out", metavar="FILE", type=Path, help="the file to write (default: RUN/map with the format's suffix)")
+    add("--region", choices=("roi", "all"), help="only the task's region, or all (default: depends on the format)")
+    voxel_help = f"voxel size in metres (default: {_OCCUPANCY_VOXEL_M:g}; mesh: {_MESH_VOXEL_M:g})"
+    add("--voxel", metavar="M", type=bounded(float, 0.001, 10), help=voxel_help)
+    opacity_help = f"for octomap and nav2 (default: {_MIN_OPACITY:g})"
+    add("--min-opacity", metavar="A", type=bounded(float, 0, 1), help=opacity_help)
+    add("--seconds", metavar="S", type=bounded(float, 0.1, 600), help=f"length of a video (default: {_VIDEO_S:g})")
+    add("--overwrite", action="store_true", help="replace an existing file")
+    add("--json", action="store_true", help="print JSON for scripts")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read the map and write the file. Returns the exit code."""
+    _require_effect(options)
+    chosen = FORMATS[options.to]
+    region = options.region or ("roi" if chosen.region_only else "all")
+    report = read_report(options.map)
+    if options.to == "json" and not report and (options.map / "report.json").exists():
+        raise InvalidInputError(f"{options.map}/report.json: expected the report of a run, got something else")
+    out = options.out or _default_file(options.map, chosen.suffix)
+    for file in chosen.files(out):
+        _require_separate(file, options.map)
+        if not options.overwrite:
+            require_absent(file)
+    content = read_map(options.map, region, report, chosen.max_extent_m)
+    content = upright(content) if chosen.is_upright else content
+    prepare_folder(out.absolute().parent)
+    voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
+    min_opacity = _MIN_OPACITY if options.min_opacity is None else options.min_opacity
+    occupancy = OccupancySettings(voxel_m=voxel_m, min_opacity=min_opacity)
+    seconds = options.seconds or _VIDEO_S
+    settings = ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress, seconds)
+    chosen.write(out, content, settings)
+    _report(options, content, out, "of the task's region" if region == "roi" else "of the map")
+    return 0
+
+
+def _report(options: argparse.Namespace, content: MapContent, out: Path, part: str) -> None:
+    """Print what was written, and on stderr what was left out."""
+    chosen, size = FORMATS[options.to], out.stat().st_size
+    for note in content.notes:
+        print_message(note)
+    if options.to in _FORMATS_OF["min_opacity"] and not content.views:
+        print_message("free space is unknown: expected a results folder with keyframes.json, got none")
+    if options.json:
+        counts = {"gaussians": len(content.chosen), "left_out": content.left_out, "bytes": size}
+        print(as_text({"file": str(out), "format": options.to, **counts}))
+    else:
+        print(f"{len(content.chosen):,} Gaussians {part} → {out} ({chosen.summary}, {size_text(size)})")
+
+
+def _require_effect(options: argparse.Namespace) -> None:
+    """Raise InvalidInputError for an option that the chosen format does not use."""
+    for name, formats in _FORMATS_OF.items():
+        if getattr(options, name) is not None and options.to not in formats:
+            flag = "--" + name.replace("_", "-")
+            raise InvalidInputError(f"{flag}: expected with --to {' or '.join(formats)}, got --to {options.to}")
+
+
+def _default_file(source: Path, suffix: str) -> Path:
+    """Return the output's default path, next to the map; an exported PLY never replaces the map itself."""
+    base = source / "map" if source.is_dir() else source.with_suffix("")
+    return base.with_name(base.name + (".export.ply" if suffix == ".ply" else suffix))
+
+
+def _require_separate(out: Path, source: Path) -> None:
+    """Raise InvalidInputError if the output is the map that is read, also through a link."""
+    file = map_file(source)
+    if out.resolve() == file.resolve() or (out.exists() and out.samefile(file)):
+        raise InvalidInputError(f"--out {out}: expected a file that is not the input")
+
+
+def _with_progress(views: Iterable[KeyframeView]) -> Iterator[KeyframeView]:
+    listed = list(views)
+    with progress_bar(len(listed), "rendering", "view") as bar:
+        for view in listed:
+            yield view
+            bar.update()

@@ -1,0 +1,281 @@
+"""The table of export formats, the content of a map that they write, and the writers of point clouds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float32, Int64
+from numpy import ndarray
+
+from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
+from gausslite.codec.run_files import KeyframeView, read_keyframe_views
+from gausslite.codec.state_file import write_atomic, write_atomic_with
+from gausslite.domain.errors import InvalidInputError, MapFileError
+from gausslite.domain.gaussians import Gaussians, move_gaussians
+from gausslite.domain.pose import transform_of
+from gausslite.mission.results import map_file, stated_up
+from gausslite.process import import_extra
+from gausslite_export.free_cells import free_voxels
+from gausslite_export.mesh import Render, write_mesh
+from gausslite_export.occupancy import (
+    NAV2_IMAGE,
+    NO_VOXELS,
+    OccupancySettings,
+    occupied_voxels,
+    require_voxels,
+    write_nav2,
+    write_octomap,
+)
+from gausslite_export.splat_formats import MAX_SPZ_COORDINATE_M, write_gltf, write_splat, write_spz
+from gausslite_export.video import write_video
+
+_PCD_ROW = np.dtype(
+    [("mean_m", "<f4", 3), ("bgra", "u1", 4), ("opacity", "<f4"), ("kappa", "<u4"), ("target", "<i2"), ("active", "u1")]
+)
+_LAS_STEP_M = 1e-4
+"""Resolution of LAS coordinates, which are 32-bit integers: 0.1 mm covers the 200 km of `MAX_EXTENT_M`."""
+
+
+def write_pcd(path: Path, gaussians: Gaussians) -> None:
+    """Write a binary PCD file (0.7): position, rgb, opacity, kappa, target, active flag. Raises StorageError."""
+    rows = np.zeros(len(gaussians), _PCD_ROW)
+    rows["mean_m"] = gaussians.means_m
+    rows["bgra"][:, :3] = np.clip(np.round(gaussians.rgb[:, ::-1] * 255), 0, 255)
+    for name, column in (("opacity", "opacities"), ("kappa", "kappa"), ("target", "target"), ("active", "active")):
+        rows[name] = getattr(gaussians, column)
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\n"
+        "VERSION 0.7\n"
+        "FIELDS x y z rgb opacity kappa target active\n"
+        "SIZE 4 4 4 4 4 4 2 1\n"
+        "TYPE F F F F F U I U\n"
+        "COUNT 1 1 1 1 1 1 1 1\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
+    )
+    write_atomic(path, header.encode() + rows.tobytes())
+
+
+def write_las(path: Path, gaussians: Gaussians) -> None:
+    """Write a LAS 1.4 file (point format 7): position, rgb, kappa, target. Raises InvalidInputError, StorageError."""
+    laspy = import_extra("laspy", "export", "LAS files")
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.scales = np.full(3, _LAS_STEP_M)
+    header.offsets = np.floor(gaussians.means_m.min(axis=0))
+    header.add_extra_dims([laspy.ExtraBytesParams("kappa", np.uint32), laspy.ExtraBytesParams("target", np.int16)])
+    points = laspy.LasData(header)
+    points.xyz = gaussians.means_m.astype(np.float64)
+    colours = np.clip(np.round(gaussians.rgb * 65535), 0, 65535).astype(np.uint16)
+    points.red, points.green, points.blue = colours.T
+    points.kappa, points.target = gaussians.kappa, gaussians.target
+
+    def write(partial: Path) -> None:
+        with partial.open("wb") as file:
+            points.write(file, do_compress=False)
+
+    write_atomic_with(path, write)
+
+
+_LEAST_TURN = 1e-6
+Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
+MAX_EXTENT_M = 1e5
+"""Limit of the coordinates that the mapper's voxel grid of 0.1 m can hold; a file with larger ones is damaged."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapContent:
+    """A map and the other content of its results folder; `views` and `report` are empty for a single PLY file.
+
+    gaussians: the whole map. chosen: the Gaussians to write, at least one. left_out: how many Gaussians of the file are
+    in neither; notes: why, because they are no numbers, too far away or too large.
+    """
+
+    gaussians: Gaussians
+    chosen: Gaussians
+    left_out: int = 0
+    notes: tuple[str, ...] = ()
+    world_frame: str = ""
+    views: Sequence[KeyframeView] = ()
+    report: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ExportSettings:
+    """How to write a map.
+
+    renderer: returns a function that renders a map; all formats that use the keyframes need it. occupancy: for octomap
+    and nav2; its voxel size is also the mesh's. progress: wraps the rendered views. video_s: length of a video.
+    """
+
+    renderer: Callable[[Gaussians], Render]
+    occupancy: OccupancySettings = field(default_factory=OccupancySettings)
+    progress: Progress = iter
+    video_s: float = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A file format.
+
+    suffix: of the written file. companion: suffix of a second file with the same name. summary: one line of the help.
+    region_only: if the user selects nothing, write only the
+    Gaussians of the task's region. max_extent_m: the largest coordinate and standard deviation that the format holds.
+    is_upright: its z axis points up.
+    """
+
+    suffix: str
+    summary: str
+    write: Callable[[Path, MapContent, ExportSettings], None]
+    region_only: bool = False
+    max_extent_m: float = MAX_EXTENT_M
+    companion: str = ""
+    is_upright: bool = False
+
+    def files(self, out: Path) -> tuple[Path, ...]:
+        """Return the files written for this path. Raises InvalidInputError for the suffix of another format."""
+        suffixes = (".yaml", ".yml") if self.suffix == ".yaml" else (Path(f"x{self.suffix}").suffix,)
+        if out.suffix.lower() not in suffixes:
+            expected = " or ".join(suffixes)
+            raise InvalidInputError(
+                f"--out {out}: expected a name with the suffix {expected}, such as map{self.suffix}"
+            )
+        return (out, out.with_suffix(self.companion)) if self.companion else (out,)
+
+
+def read_map(
+    path: Path,
+    region: str,
+    report: Mapping[str, object] = MappingProxyType({}),
+    max_extent_m: float = MAX_EXTENT_M,
+) -> MapContent:
+    """Read a results folder or a PLY file.
+
+    region: `roi` chooses the Gaussians of the task's region, `all` all. report: the content of the results folder's
+    report.json. Gaussians with a coordinate or a standard deviation above max_extent_m are left out. Raises
+    MapFileError; InvalidInputError if nothing is left to write.
+    """
+    folder, file = path if path.is_dir() else None, map_file(path)
+    if not file.is_file():
+        raise MapFileError(f"{path}: expected a results folder with map.ply, or a PLY file, got neither")
+    stored = read_stored_map(file)
+    if not len(stored.gaussians):
+        raise InvalidInputError(f"{path}: expected a map with at least one Gaussian, got an empty map")
+    gaussians = stored.gaussians.take(_largest_extent_m(stored.gaussians) <= max_extent_m)
+    if not len(gaussians):
+        raise InvalidInputError(f"{path}: expected Gaussians within {max_extent_m:g} m of the origin, got none")
+    chosen = gaussians if region == "all" else gaussians.take(gaussians.active)
+    if not len(chosen):
+        raise InvalidInputError(f"{path}: the map has no region of a task; export all of it with --region all")
+    views = [] if folder is None else read_keyframe_views(folder)
+    notes: tuple[str, ...] = (left_out_note(stored),) if stored.left_out else ()
+    if len(gaussians) < len(stored.gaussians):
+        far = len(stored.gaussians) - len(gaussians)
+        notes += (
+            f"left out {far} of {len(stored.gaussians)} Gaussians: expected coordinates and standard deviations up to "
+            f"{max_extent_m:g} m, got larger ones",
+        )
+    total = len(stored.gaussians) + stored.left_out
+    return MapContent(
+        gaussians, chosen, total - len(gaussians), notes, world_frame=stored.world_frame, views=views, report=report
+    )
+
+
+def upright(content: MapContent) -> MapContent:
+    """Return the map turned so that z points up, with a note, if its up is stated. Raises InvalidInputError."""
+    up = np.array(stated_up(content.report) or (0.0, 0.0, 1.0))
+    axis = np.array((up[1], -up[0], 0.0))
+    length = float(np.linalg.norm(axis))
+    if length < _LEAST_TURN and up[2] > 0:
+        return content
+    angle_rad, axis = float(np.arctan2(length, up[2])), axis / length if length > 0 else np.array((1.0, 0.0, 0.0))
+    T = transform_of(np.concatenate([np.zeros(3), angle_rad * axis]))
+    about, shown = (",".join(f"{value + 0.0:.3g}" for value in np.round(vector, 3)) for vector in (axis, up))
+    note = (
+        f"up is {shown} in the map: it is turned by {np.degrees(angle_rad):.1f} deg about {about}, so that z points up"
+    )
+    return replace(
+        content,
+        gaussians=move_gaussians(content.gaussians, T),
+        chosen=move_gaussians(content.chosen, T),
+        views=[replace(view, T_world_camera=T @ view.T_world_camera) for view in content.views],
+        notes=(*content.notes, note),
+    )
+
+
+def _largest_extent_m(gaussians: Gaussians) -> Float32[ndarray, " n"]:
+    """Return the largest absolute coordinate or standard deviation of each Gaussian."""
+    largest: Float32[ndarray, " n"] = np.maximum(np.abs(gaussians.means_m), gaussians.scales_m).max(axis=1)
+    return largest
+
+
+def _objects(path: Path, content: MapContent, _settings: ExportSettings) -> None:
+    """Write the objects that the mission confirmed, and the extent of the chosen Gaussians, as JSON."""
+    means_m = content.chosen.means_m
+    content_of_map = {
+        "world_frame": content.world_frame,
+        "task": content.report.get("task"),
+        "objects": content.report.get("objects", []),
+        "gaussians": len(content.chosen),
+        "bounds_m": np.stack([means_m.min(axis=0), means_m.max(axis=0)]).tolist(),
+    }
+    write_atomic(path, (json.dumps(content_of_map, indent=2, ensure_ascii=False) + "\n").encode())
+
+
+def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    render, voxel_m = settings.renderer(content.gaussians), settings.occupancy.voxel_m
+    write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
+
+
+def _free(content: MapContent, settings: ExportSettings) -> Int64[ndarray, "f 3"]:
+    """Return the free voxels in the box around the chosen Gaussians; none of them holds a Gaussian of the whole map."""
+    if not content.views:
+        return NO_VOXELS
+    occupancy = settings.occupancy
+    chosen, occupied = require_voxels(content.chosen, occupancy), occupied_voxels(content.gaussians, occupancy)
+    views, render = settings.progress(content.views), settings.renderer(content.gaussians)
+    return free_voxels(views, render, chosen, occupied, occupancy.voxel_m)
+
+
+def _video(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    write_video(path, content.views, settings.renderer(content.chosen), settings.video_s, settings.progress)
+
+
+FORMATS: Mapping[str, Format] = MappingProxyType(
+    {
+        "ply": Format(
+            ".ply", "3D Gaussian splatting PLY", lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame)
+        ),
+        "spz": Format(
+            ".spz",
+            "compressed splats (SPZ)",
+            lambda path, map_, _: write_spz(path, map_.chosen),
+            max_extent_m=MAX_SPZ_COORDINATE_M,
+        ),
+        "splat": Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen)),
+        "gltf": Format(
+            ".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen), is_upright=True
+        ),
+        "pcd": Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen)),
+        "las": Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen)),
+        "octomap": Format(
+            ".bt",
+            "occupied and free voxels of the region",
+            lambda path, map_, settings: write_octomap(path, map_.chosen, settings.occupancy, _free(map_, settings)),
+            region_only=True,
+        ),
+        "nav2": Format(
+            ".yaml",
+            "2D grid",
+            lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy, _free(map_, settings)),
+            companion=NAV2_IMAGE,
+            is_upright=True,
+        ),
+        "mesh": Format(".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True),
+        "video": Format(".mp4", "fly-through along the keyframes", _video),
+        "json": Format(".json", "objects of the mission", _objects, region_only=True),
+    }
+)

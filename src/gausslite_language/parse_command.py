@@ -1,0 +1,51 @@
+"""`gausslite parse`: print the task graph of a sentence."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import MISSING, dataclass
+
+from gausslite.codec.json import graph_as_json
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.option import build, option
+from gausslite.config.program import Program
+from gausslite.domain.task import TargetRole, TaskGraph
+from gausslite_language.rules import BackendSettings, open_parser
+
+
+@dataclass(frozen=True, slots=True)
+class ParseOptions:
+    """The options of `gausslite parse` beside those of the backend."""
+
+    text: str = option(MISSING, 'for example "Pick up the mug on the table"', metavar="TEXT")
+    json: bool = option(False, "print JSON for scripts")
+
+
+def configure(parser: CommandParser) -> None:
+    """Add the options of `gausslite parse`."""
+    Program.of(ParseOptions, BackendSettings, flags="json backend llm-model llm-url", positional="text").add_to(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Parse the sentence and print its graph. Returns the exit code."""
+    key = os.environ.get(options.llm_key_variable) or None
+    graph = open_parser(build(BackendSettings, options, api_key=key)).parse(options.text)
+    print(json.dumps(graph_as_json(graph)) if options.json else _as_text(graph))
+    return 0
+
+
+def _as_text(graph: TaskGraph) -> str:
+    roles = zip(graph.targets, graph.roles, strict=True)
+    targets = ", ".join(name if role is TargetRole.OBJECT else f"{name} ({role})" for name, role in roles)
+    lines = [f"targets   {targets}", f"anchors   {', '.join(graph.anchors) or '-'}"]
+    lines += [f"relation  {relation}" for relation in graph.relations]
+    for attribute in graph.attributes:
+        values = [value for value in (attribute.colour, attribute.superlative) if value is not None]
+        lines.append(f"attribute {attribute.name}: {', '.join(values)}")
+    lines += [f"excluded  {name}" for name in graph.excluded]
+    lines += [f"context   {place}" for place in graph.context]
+    lines += [f"warning   {warning}" for warning in graph.warnings]
+    return "\n".join(lines)

@@ -1,0 +1,173 @@
+"""Parse tasks by rules, without a model or a network, in less than a millisecond; or choose another parser."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from gausslite.config.option import check_options, option
+from gausslite.domain.errors import InvalidInputError, TaskError
+from gausslite.domain.task import EXAMPLE, TargetRole, TaskGraph, require_task_text
+from gausslite_language.chunk import Chunk, ChunkKind
+from gausslite_language.chunker import chunk_sentence
+from gausslite_language.graph_builder import build_draft
+from gausslite_language.graph_draft import GraphDraft
+from gausslite_language.grounding import ParsedPhrases, TaskParser, grounded_graph, normalise_text
+from gausslite_language.models.parsers import LanguageModel
+from gausslite_language.tags import is_english
+from gausslite_language.tokens import comparisons, tokenize
+
+_CODE: Final = re.compile(r"[{}\[\]<=|\\$*]|(?<![-=])>|\w\(|&&|^import ")
+RESPONSE_FORMATS: Final = ("json_schema", "json_object", "none")
+
+
+class Backend(StrEnum):
+    """Kind of task parser."""
+
+    RULES = "rules"
+    ONNX = "onnx"
+    HTTP = "http"
+
+
+@dataclass(frozen=True, slots=True)
+class BackendSettings:
+    """The task parser and its language model. key_variable: the environment variable whose value is api_key."""
+
+    backend: Backend = option(
+        Backend.RULES,
+        "parse tasks by rules, by a language model in this process (onnx) or on a server (http)",
+    )
+    model: str | None = option(
+        None,
+        "http: the model's name; onnx: a folder with genai_config.json",
+        key="llm-model",
+        metavar="NAME|FOLDER",
+        needs="backend=onnx|http",
+    )
+    url: str | None = option(
+        None,
+        "base of an OpenAI-compatible server, http://localhost:8000/v1",
+        key="llm-url",
+        metavar="URL",
+        needs="backend=http",
+    )
+    response_format: str = option(
+        RESPONSE_FORMATS[0],
+        "response format to request",
+        key="llm-format",
+        choices=RESPONSE_FORMATS,
+        needs="backend=http",
+    )
+    timeout_s: float = option(
+        10.0,
+        "longest wait for the model; rules parse the task after that",
+        key="llm-timeout",
+        unit="s",
+        low=0.001,
+        high=600,
+    )
+    key_variable: str = option(
+        "GAUSSLITE_LLM_API_KEY",
+        "environment variable that holds the API key of the server",
+        key="llm-key-variable",
+        metavar="NAME",
+    )
+
+    api_key: str | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.backend is not Backend.RULES and not self.model:
+            expected = "a folder" if self.backend is Backend.ONNX else "the model's name at the server"
+            raise InvalidInputError(f"backend {self.backend}: expected --llm-model, {expected}, got none")
+        if self.backend is Backend.HTTP and not self.url:
+            raise InvalidInputError("backend http: expected --llm-url, such as http://localhost:8000/v1, got none")
+
+
+def open_parser(settings: BackendSettings) -> TaskParser:
+    """Return the parser of these settings; a language model's answers are cached, and it falls back to rules.
+
+    Loads the model of the onnx backend. Raises InvalidInputError, ModelFileError.
+    """
+    rules = RuleParser()
+    if settings.backend is Backend.RULES:
+        return rules
+    from gausslite_language.models.parsers import CachedParser, FallbackParser, LanguageParser
+
+    language_parser = LanguageParser(_open_model(settings))
+    name = str(settings.backend)
+    return FallbackParser(CachedParser(language_parser, name, language_parser.version), name, rules)
+
+
+def _open_model(settings: BackendSettings) -> LanguageModel:
+    if settings.backend is Backend.ONNX:
+        from gausslite_language.models.onnx import OnnxLanguageModel
+
+        return OnnxLanguageModel(Path(settings.model or ""), settings.timeout_s)
+    from gausslite_language.models.http import HttpLanguageModel, HttpSettings, ResponseFormat
+
+    response_format = ResponseFormat(settings.response_format)
+    return HttpLanguageModel(
+        HttpSettings(settings.url or "", settings.model or "", response_format, settings.timeout_s, settings.api_key)
+    )
+
+
+class RuleParser:
+    """A TaskParser for English sentences about objects and their places (Sec. III-B.1)."""
+
+    def parse(self, text: str) -> TaskGraph:
+        """Return the graph of one task. Raises TaskError."""
+        require_task_text(text)
+        chunks = chunk_sentence(normalise_text(text))
+        _require_structure(text, chunks)
+        draft = build_draft(chunks)
+        if not draft.targets:
+            raise TaskError(_no_object_message(text, tuple(draft.excluded)))
+        draft.warnings += [
+            f"{comparison!r} is not understood: it is dropped" for comparison in comparisons(normalise_text(text))
+        ]
+        if _loses_negation(chunks, draft):
+            draft.warnings.append("a negation is not understood: it is dropped")
+        parsed = ParsedPhrases(
+            targets={target: draft.roles[target] for target in draft.targets},
+            anchors=draft.anchors,
+            relations=draft.relations,
+            excluded=draft.excluded,
+            context=draft.context,
+            warnings=draft.warnings,
+            mentions=draft.mentions,
+        )
+        return grounded_graph(text, parsed, draft)
+
+
+def _loses_negation(chunks: list[Chunk], draft: GraphDraft) -> bool:
+    """Return True if the sentence negates something and neither the graph nor a warning says so."""
+    negates = any(chunk.kind is ChunkKind.NEGATION or chunk.negated for chunk in chunks)
+    is_stated = draft.warnings or draft.excluded or TargetRole.OBSTACLE in draft.roles.values()
+    return negates and not is_stated and not any(relation.negated for relation in draft.relations)
+
+
+def _require_structure(text: str, chunks: list[Chunk]) -> None:
+    """Raise TaskError for code, for mostly unknown words, as in another language, and for unknown words alone."""
+    nouns = [chunk.noun for chunk in chunks if chunk.noun is not None]
+    words = [word for word in tokenize(normalise_text(text)) if word[0].isalpha()]
+    unknown = [word for word in words if not is_english(word)]
+    prepositions = any(chunk.kind is ChunkKind.PREPOSITION for chunk in chunks)
+    plain = not prepositions and not any(noun.has_determiner for noun in nouns)
+    is_foreign = len(words) > 2 and (2 * len(unknown) > len(words) or (plain and len(unknown) > 1))
+    if _CODE.search(text) or is_foreign:
+        raise TaskError(_no_object_message(text, ()))
+    has_structure = prepositions or any(chunk.kind is ChunkKind.VERB for chunk in chunks)
+    if not has_structure and not any(noun.is_known or noun.has_determiner for noun in nouns):
+        raise TaskError(_no_object_message(text, ()))
+
+
+def _no_object_message(text: str, excluded: tuple[str, ...]) -> str:
+    shown = text.strip() if len(text.strip()) <= 60 else text.strip()[:57] + "..."
+    received = repr(" ".join(shown.split()))
+    if excluded:
+        received = f"only objects to leave alone ({', '.join(excluded)}) in {received}"
+    return f"task text: expected an English sentence that names an object, such as {EXAMPLE}, got {received}"

@@ -1,0 +1,351 @@
+"""Find the frame of an agent that does not know it: match its surfaces with the team's without a guess, or abstain.
+
+A wrong frame would spoil the team's map, so a motion has to pass every test on samples that did not find it: shared
+surface is near, its texture agrees inside small blocks, and no other motion passes nearly as well, unless what that one
+leaves out passes too. The texture decides: of unrelated, mirrored and disjoint rooms, many have walls and floors that
+fit.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from threading import RLock
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from numpy import ndarray
+
+from gausslite.domain.camera import back_project
+from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
+from gausslite.domain.frame import Frame, without_depth_edges
+from gausslite.domain.pose import orthonormal, rotation_angle_deg, transform_of, transform_points
+from gausslite.domain.voxels import VoxelGrid
+from gausslite.fusion.frames import FrameAlignment, FrameAlignments
+from gausslite.fusion.keyframe_pool import KeyframePool
+from gausslite.fusion.store import FusionStore
+from gausslite_places.frame_aligner import FrameAligner, log_change
+from gausslite_places.frame_fit import (
+    LUMINANCE,
+    FrameFit,
+    SurfaceSamples,
+    TargetSurface,
+    blocks_of,
+    evaluate_motion,
+    in_shared_cubes,
+    occupied_blocks,
+)
+from gausslite_places.surface_registration import Surface, can_match_without_guess, matched_motion
+
+_log = logging.getLogger(__name__)
+_MIN_SAMPLES = 300
+_SPACINGS_M = (0.1, 0.15, 0.2)
+"""Of the samples whose features are matched: no single one finds the motions of all homes."""
+_MIN_INLIERS = 3
+_REACH_M = (0.5, 0.3, 0.15)
+_COARSE_SAMPLES = 1500
+_MIN_BLOCKS = 30
+_MIN_MATCHED, _MIN_TEXTURE = 0.9, 0.35
+"""Of 123 pairs of parts of homes and of the kitchen, wrong motions with 90 % matched have a texture of at most 0.28,
+right ones of at least 0.39."""
+_OTHER_MATCHED, _OTHER_TEXTURE, _OTHER_BLOCKS = 0.9, 0.7, 15
+"""Shares of the best motion's figures, and blocks, with which another motion is as good."""
+_APART_M, _APART_DEG = 0.25, 8.0
+_MIN_BLOCK_SAMPLES = 4
+_MAX_KEYFRAMES = 24
+_SAMPLE_GRID = VoxelGrid(0.05)
+_NEAREST_M, _FARTHEST_M, _STEP_PX, _DEPTH_EDGE_PX = 0.1, 5.0, 2, 2
+_MAX_KEYFRAME_SAMPLES = 20_000
+"""A view of rooms has a few thousand; a forged image could have one for each pixel."""
+_ATTEMPTS = 2
+"""Searches that fail, before an agent waits for more data as after any other search."""
+_GROWTH = 1.25
+_KEYFRAME_VOXELS = 100
+"""What a keyframe adds to the size of a map, in voxels."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSearch:
+    """What a search has found: the fit of the only motion that passes every test, otherwise the reason of none."""
+
+    fit: FrameFit | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Agreement:
+    """How held-out samples agree with the target after a motion.
+
+    overlap: share of samples in cubes that both occupy; blocks: their number. matched: share of these with a surface
+    within 10 cm. texture: correlation of the matched luminances about their means in each block of 25 cm.
+    """
+
+    overlap: float = 0.0
+    blocks: int = 0
+    matched: float = 0.0
+    texture: float = 0.0
+
+    def is_about_as_good(self, best: _Agreement) -> bool:
+        """Return whether this motion is about as good as the best one."""
+        is_matched = self.matched >= _OTHER_MATCHED * best.matched
+        return is_matched and self.texture >= _OTHER_TEXTURE * best.texture and self.blocks >= _OTHER_BLOCKS
+
+    @property
+    def reason(self) -> str:
+        """Why it does not pass; empty if it does."""
+        overlap = f"overlap {100 * self.overlap:.0f} %"
+        if self.blocks < _MIN_BLOCKS:
+            return f"{overlap}, which is too little to be sure"
+        if self.matched < _MIN_MATCHED:
+            return f"{overlap}, of which {100 * self.matched:.0f} % fit and {100 * _MIN_MATCHED:.0f} % would have to"
+        return f"{overlap}, but its texture differs" if self.texture < _MIN_TEXTURE else ""
+
+
+def find_frame(source: SurfaceSamples, target: SurfaceSamples) -> FrameSearch:
+    """Return the motion of the source that fits it to the target, wherever it is.
+
+    Needs `kiss-matcher`. The result is a pure function of the samples.
+    """
+    if min(len(source), len(target)) < _MIN_SAMPLES:
+        return FrameSearch(None, "too few surfaces so far")
+    if not can_match_without_guess():
+        return FrameSearch(None, "the server needs pip install 'gausslite[slam]' to find it")
+    search = _Search(source, target)
+    motions = list(search.matched_motions(source, target, _SPACINGS_M))
+    if not motions:
+        return FrameSearch(None, "no overlap found")
+    motion = max(motions, key=search.score)
+    agreement = search.agreement(motion)
+    if agreement.reason:
+        return FrameSearch(None, agreement.reason)
+    others = (other for other in search.alternatives(motion, motions) if search.is_apart(other, motion))
+    if any(
+        search.agreement(other).is_about_as_good(agreement) and not search.excels(motion, other) for other in others
+    ):
+        return FrameSearch(None, f"overlap {100 * agreement.overlap:.0f} %, but it fits in several places")
+    return FrameSearch(search.fit(motion))
+
+
+Find = Callable[[SurfaceSamples, SurfaceSamples], FrameSearch]
+"""`find_frame`, in this process or in another one. Raises UnavailableError."""
+
+
+class _Search:
+    """Two sets of samples: one half of the source finds motions, the other tests them."""
+
+    def __init__(self, source: SurfaceSamples, target: SurfaceSamples) -> None:
+        self._source, self._target = source, target
+        self._blocks, is_first = blocks_of(source.points_m)
+        self._is_held_out = ~is_first
+        self._first = source.take(is_first)
+        self._places = TargetSurface(target)
+        rng = np.random.default_rng(0)
+        few = rng.permutation(len(self._first))[:_COARSE_SAMPLES]
+        self._coarse, self._whole = Surface(self._first.points_m[few]), Surface(self._first.points_m)
+
+    def matched_motions(
+        self, source: SurfaceSamples, target: SurfaceSamples, spacings_m: Sequence[float]
+    ) -> Iterator[Float64[ndarray, "4 4"]]:
+        """Yield the motions that matches of point features of these samples propose, refined on the first half."""
+        for spacing_m in spacings_m:
+            own, theirs = (Surface.sampled(samples.points_m, spacing_m) for samples in (source, target))
+            proposed = matched_motion(own, theirs, min_inliers=_MIN_INLIERS)
+            if proposed is not None:
+                yield self._registered(self._coarse, proposed)
+
+    def alternatives(
+        self, motion: Float64[ndarray, "4 4"], others: Sequence[Float64[ndarray, "4 4"]]
+    ) -> Iterator[Float64[ndarray, "4 4"]]:
+        """Yield motions that may fit as well: the others, those of the rest of each map, and turns of the overlap."""
+        yield from others
+        moved = self._source.moved(motion)
+        shared = in_shared_cubes(moved.points_m, self._target.points_m)
+        shared_target = in_shared_cubes(self._target.points_m, moved.points_m)
+        for source, target in (
+            (self._source, self._target.take(~shared_target)),
+            (self._source.take(~shared), self._target),
+        ):
+            if min(len(source), len(target)) >= _MIN_SAMPLES:
+                yield from self.matched_motions(source, target, _SPACINGS_M[:2])
+        centre_m = moved.points_m[shared].mean(axis=0)
+        axes = np.linalg.svd(moved.points_m[shared] - centre_m, full_matrices=False)[2]
+        for axis in axes:
+            for quarter in (1, 2, 3):
+                turn = transform_of(np.concatenate([np.zeros(3), quarter * np.pi / 2 * axis]))
+                turn[:3, 3] = centre_m - turn[:3, :3] @ centre_m
+                yield self._registered(self._coarse, turn @ motion)
+
+    def score(self, motion: Float64[ndarray, "4 4"]) -> float:
+        """Return how much of the first half agrees with the target in distance and colour."""
+        distance, colour, _ = self._places.residuals(self._first.moved(motion))
+        return float(((1.0 - distance) * (1.0 - colour)).mean())
+
+    def agreement(self, motion: Float64[ndarray, "4 4"], beyond: Float64[ndarray, "4 4"] | None = None) -> _Agreement:
+        """Return how the held-out half agrees with the target; beyond: in what another motion does not lay on it."""
+        moved = self._source.moved(motion)
+        shared = self._shared(moved)
+        if beyond is not None:
+            shared &= ~self._shared(self._source.moved(beyond))
+        if not shared.any():
+            return _Agreement()
+        samples, blocks = moved.take(shared), self._blocks[shared]
+        matched = self._places.residuals(samples)[2]
+        theirs = self._places.nearest_luminance(samples.points_m)
+        return _Agreement(
+            overlap=float(shared.sum() / self._is_held_out.sum()),
+            blocks=occupied_blocks(blocks),
+            matched=float(matched.mean()),
+            texture=_block_correlation(samples.luminance[matched], theirs[matched], blocks[matched]),
+        )
+
+    def excels(self, motion: Float64[ndarray, "4 4"], other: Float64[ndarray, "4 4"]) -> bool:
+        """Return whether a motion lays all on the target that another one does, and a part that passes by itself."""
+        more, less = self.agreement(motion, beyond=other), self.agreement(other, beyond=motion)
+        return not more.reason and less.blocks < _OTHER_BLOCKS
+
+    def fit(self, motion: Float64[ndarray, "4 4"]) -> FrameFit:
+        """Return the fit of a motion that passes, refined on the whole first half."""
+        motion = self._registered(self._whole, motion, _REACH_M[-1:])
+        shared = self._shared(self._source.moved(motion))
+        centre_m = self._source.points_m[shared].mean(axis=0)
+        return evaluate_motion(self._source.take(shared), self._blocks[shared], self._places, motion, centre_m)
+
+    def is_apart(self, one: Float64[ndarray, "4 4"], other: Float64[ndarray, "4 4"]) -> bool:
+        """Return whether two motions are different, and not the same one with the error of a registration."""
+        centre_m = self._source.points_m.mean(axis=0, keepdims=True)
+        away_m = np.linalg.norm(transform_points(one, centre_m) - transform_points(other, centre_m))
+        return bool(away_m > _APART_M or rotation_angle_deg(one, other) > _APART_DEG)
+
+    def _shared(self, moved: SurfaceSamples) -> Bool[ndarray, " n"]:
+        shared: Bool[ndarray, " n"] = self._is_held_out & in_shared_cubes(moved.points_m, self._target.points_m)
+        return shared
+
+    def _registered(
+        self, surface: Surface, T: Float64[ndarray, "4 4"], reaches_m: Sequence[float] = _REACH_M
+    ) -> Float64[ndarray, "4 4"]:
+        return orthonormal(self._places.surface.refined(surface, T, *reaches_m))
+
+
+def _block_correlation(
+    one: Float64[ndarray, " n"], other: Float64[ndarray, " n"], blocks: Int64[ndarray, " n"]
+) -> float:
+    """Return the correlation of two values about their means in each block with enough of them; 0 without any."""
+    _, of_sample, counts = np.unique(blocks, return_inverse=True, return_counts=True)
+    used = (counts >= _MIN_BLOCK_SAMPLES)[of_sample]
+    first, second = (
+        (values - (np.bincount(of_sample, values, len(counts)) / np.maximum(counts, 1))[of_sample])[used]
+        for values in (one, other)
+    )
+    spread = float(np.sqrt(np.square(first).sum() * np.square(second).sum()))
+    return float(first @ second) / spread if spread > 0 else 0.0
+
+
+def keyframe_samples(frame: Frame) -> SurfaceSamples:
+    """Return a sample for each cube of 5 cm that the depth of a keyframe shows, in the frame of its pose."""
+    depth_m = without_depth_edges(frame.depth_m, _DEPTH_EDGE_PX)
+    points = back_project(depth_m, frame.camera)[::_STEP_PX, ::_STEP_PX].reshape(-1, 3)
+    used = (points[:, 2] > _NEAREST_M) & (points[:, 2] < _FARTHEST_M)
+    luminance = (frame.rgb[::_STEP_PX, ::_STEP_PX].reshape(-1, 3)[used] / 255.0) @ LUMINANCE
+    world = transform_points(frame.T_world_camera, points[used].astype(np.float64))
+    samples = _one_of_each_cube(SurfaceSamples(world, luminance))
+    return samples.take(np.arange(0, len(samples), max(1, -(-len(samples) // _MAX_KEYFRAME_SAMPLES))))
+
+
+def _one_of_each_cube(samples: SurfaceSamples) -> SurfaceSamples:
+    """Return the mean of the samples in each cube of 5 cm."""
+    _, cube, counts = np.unique(
+        _SAMPLE_GRID.keys(samples.points_m.astype(np.float32)), return_inverse=True, return_counts=True
+    )
+    columns = [*samples.points_m.T, samples.luminance]
+    *xyz, luminance = (np.bincount(cube, column, len(counts)) / counts for column in columns)
+    return SurfaceSamples(np.stack(xyz, axis=1), luminance)
+
+
+class UnknownFrames:
+    """Searches the frames of unlocalised agents as their maps and the team's grow. Call `run` from one thread."""
+
+    def __init__(
+        self,
+        store: FusionStore,
+        alignments: FrameAlignments,
+        aligner: FrameAligner,
+        keyframes: KeyframePool,
+        lock: RLock,
+        find: Find,
+    ) -> None:
+        self._store, self._alignments, self._aligner = store, alignments, aligner
+        self._keyframes, self._lock, self._find = keyframes, lock, find
+        # the team at the latest search, the agent's size and the team's
+        self._searched: dict[str, tuple[tuple[str, ...], tuple[int, int]]] = {}
+        self._failed: dict[str, int] = {}
+        self._samples_of_keyframe: dict[str, dict[int, SurfaceSamples]] = {}
+
+    def run(self) -> None:
+        """Search the frames of the agents with enough new data; the aligner moves the maps. Raises StorageError."""
+        with self._lock:
+            names = [name for name in self._alignments.names() if self._size(name)]
+            for known in (self._searched, self._failed, self._samples_of_keyframe):
+                for name in known.keys() - set(names):
+                    del known[name]
+            waiting = [name for name in names if not self._alignments.get(name).is_localised]
+            team = [name for name in names if self._alignments.get(name).is_used]
+            if waiting and not team:
+                # nobody knows a frame: the first agent's is as good as any
+                first = waiting.pop(0)
+                self._put(first, self._alignments.get(first).in_state({}, is_quarantined=False, is_first=True))
+                team = [first]
+        for name in waiting:
+            self._search(name, team)
+
+    def _search(self, agent_id: str, team: Sequence[str]) -> None:
+        with self._lock:
+            before = {name: self._alignments.get(name) for name in (agent_id, *team)}
+            sizes = self._size(agent_id), sum(self._size(name) for name in team)
+            last_team, last_sizes = self._searched.get(agent_id, ((), sizes))
+            has_grown = any(now >= _GROWTH * then for now, then in zip(sizes, last_sizes, strict=True))
+            if last_team == tuple(team) and not has_grown:
+                return
+            self._searched[agent_id] = tuple(team), sizes
+        try:
+            found = self._find(self._samples(agent_id), SurfaceSamples.concatenate([*map(self._samples, team)]))
+            self._failed.pop(agent_id, None)
+        except (UnavailableError, CodecError, InvalidInputError) as error:
+            # one agent's data must not end the comparisons of the others, nor be searched for ever
+            found = FrameSearch(None, f"the search failed: {error}")
+            self._failed[agent_id] = self._failed.get(agent_id, 0) + 1
+            if self._failed[agent_id] < _ATTEMPTS:
+                del self._searched[agent_id]
+        with self._lock:
+            if any(self._alignments.get(name) is not alignment for name, alignment in before.items()):
+                return
+            unknown = before[agent_id]
+            after = unknown.unlocalised(found.reason) if found.fit is None else unknown.localised(found.fit)
+            self._put(agent_id, after)
+
+    def _put(self, agent_id: str, after: FrameAlignment) -> None:
+        before = self._alignments.get(agent_id)
+        if after.is_localised:
+            self._aligner.put_frame(agent_id, after)
+        elif after.message != before.message:
+            self._alignments.put(agent_id, after)
+        log_change(agent_id, before, after)
+
+    def _samples(self, agent_id: str) -> SurfaceSamples:
+        """Return samples of the agent's voxels and keyframes, in the fused frame if the agent is localised."""
+        with self._lock:
+            T = self._alignments.get(agent_id).T_fused_agent
+            indices = np.array(self._keyframes.indices(agent_id), np.int64)
+            chosen = indices[:: max(1, -(-len(indices) // _MAX_KEYFRAMES))].tolist()
+            encoded = [self._keyframes.find(agent_id, index) for index in chosen]
+        before = self._samples_of_keyframe.get(agent_id, {})
+        self._samples_of_keyframe[agent_id] = samples = {
+            hash(data): before.get(hash(data)) or keyframe_samples(self._keyframes.decode([(agent_id, data)])[0].frame)
+            for data in encoded
+        }
+        seen = _one_of_each_cube(SurfaceSamples.concatenate([*samples.values()])).moved(T)
+        return SurfaceSamples.concatenate([self._aligner.samples(agent_id), seen])
+
+    def _size(self, agent_id: str) -> int:
+        """Return a measure of what the server has of an agent's surfaces."""
+        return self._store.totals(agent_id).voxels + _KEYFRAME_VOXELS * self._keyframes.count(agent_id)

@@ -1,0 +1,38 @@
+"""The joint fit of lens, readout time and offset to moving pairs, against a simulated camera's truth."""
+
+from __future__ import annotations
+
+import pytest
+
+from gausslite.datasets.open import open_source
+from gausslite.domain.camera import Lens
+from gausslite.domain.recording import CameraCorrection
+from gausslite_calibration.joint_camera_fit import fit_camera
+from gausslite_calibration.moving_pairs import MovingPairs
+
+pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
+
+SIZE = (160, 120)
+HOME = f"sim:home-1?frames=90&size={SIZE[0]}x{SIZE[1]}&noise=0&exposure=0&speed=60"
+
+
+@pytest.fixture(scope="module")
+def moving() -> MovingPairs:
+    return MovingPairs.read(open_source(f"{HOME}&shutter=30ms&lens=radtan:-0.2,0.03,0,0"), SIZE)
+
+
+def test_both_radial_coefficients_and_the_readout_time_are_fitted_together(moving: MovingPairs) -> None:
+    fit = fit_camera(moving, CameraCorrection(Lens.parse("radtan:-0.15,0,0,0"), readout_s=0.02), fits_lens=True)
+    assert fit is not None
+    assert fit.correction.lens is not None
+    k1, k2 = fit.correction.lens.coefficients[:2]
+    assert k1 == pytest.approx(-0.2, abs=0.02)
+    assert k2 == pytest.approx(0.03, abs=0.04)
+    assert fit.correction.readout_s == pytest.approx(0.03, abs=0.002)
+    assert abs(fit.correction.time_offset_s) < 0.002
+    assert 0.0 < fit.readout_std_s < 0.002
+    assert 0.0 < fit.offset_std_s < 0.002
+
+
+def test_without_comparable_pairs_there_is_no_fit(moving: MovingPairs) -> None:
+    assert fit_camera(MovingPairs(moving.trajectory, (), moving.frames), CameraCorrection(), fits_lens=False) is None

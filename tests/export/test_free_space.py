@@ -1,0 +1,109 @@
+"""Free cells of an exported room: seen floor and air are free, walls are occupied, what lies behind them is unknown."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyoctomap
+import yaml
+
+from gausslite.codec.run_files import KeyframeView
+from gausslite.domain.camera import Camera
+from gausslite.domain.gaussians import Gaussians
+from gausslite_evaluation.views import view_map
+from gausslite_export.formats import FORMATS, ExportSettings, MapContent
+from gausslite_export.occupancy import OccupancySettings, occupied_voxels
+
+VOXEL_M, HALF_M, WALL_M, EYE_M = 0.1, 2.0, 1.5, 0.75
+SETTINGS = OccupancySettings(voxel_m=VOXEL_M)
+CAMERA = Camera.centred(80.0, 160, 120)
+
+
+def room() -> Gaussians:
+    """Return four walls of a square room, and a post outside of them."""
+    along, up = (v.ravel() for v in np.meshgrid(np.arange(-HALF_M, HALF_M, 0.05), np.arange(0.0, WALL_M, 0.05)))
+    side = np.full(len(along), HALF_M)
+    walls = [np.stack(axes, 1) for s in (-1, 1) for axes in ((s * side, along, up), (along, s * side, up))]
+    post = np.stack([np.full(30, 3.5), np.zeros(30), np.arange(30) * 0.05], axis=1)
+    means = np.concatenate([*walls, post]).astype(np.float32) + np.float32(0.02)
+    n = len(means)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
+    scales, colours = np.full((n, 3), 0.025, np.float32), np.full((n, 3), 0.5, np.float32)
+    flags = np.ones(n, np.bool_), np.ones(n, np.uint32), np.zeros(n, np.int16)
+    return Gaussians(means, quats, scales, np.full(n, 0.95, np.float32), colours, *flags)
+
+
+def turned(angle_rad: float) -> np.ndarray:
+    """Return the pose of a level camera in the middle of the room."""
+    forward = np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
+    down = np.array([0.0, 0.0, -1.0])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([np.cross(down, forward), down, forward], axis=1)
+    T[:3, 3] = 0.03, 0.03, EYE_M
+    return T
+
+
+VIEWS = [KeyframeView(i, i, CAMERA, turned(i * np.pi / 4), 0) for i in range(8)]
+
+
+def export(path: Path, name: str, content: MapContent) -> Path:
+    out = path / f"map{FORMATS[name].suffix}"
+    FORMATS[name].write(out, content, ExportSettings(lambda gaussians: view_map(gaussians).render, SETTINGS))
+    return out
+
+
+def grid(file: Path) -> tuple[np.ndarray, list[float]]:
+    """Return the cells, indexed by x and y, and the origin."""
+    image = cv2.imread(str(file.with_suffix(".pgm")), cv2.IMREAD_UNCHANGED)
+    return image[::-1].T, yaml.safe_load(file.read_text())["origin"]
+
+
+def test_a_rooms_inside_is_free_its_walls_are_occupied_and_behind_them_is_unknown(tmp_path):
+    gaussians = room()
+    cells, origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=VIEWS)))
+    at = lambda x, y: cells[int((x - origin[0]) / VOXEL_M), int((y - origin[1]) / VOXEL_M)]  # noqa: E731
+    assert all(at(x, y) == 254 for x in (-1.45, 0.05, 1.45) for y in (-1.45, 0.05, 1.45))
+    assert all(at(*p) == 0 for p in ((2.03, 0.05), (-1.97, 0.05), (0.05, 2.03), (0.05, -1.97), (3.53, 0.03)))
+    assert all(at(x, y) == 205 for x in (2.45, 2.95) for y in (-1.45, 0.05, 1.45))
+
+
+def test_free_cells_change_neither_size_nor_origin_nor_obstacles_and_need_keyframes(tmp_path):
+    gaussians = room()
+    bare, bare_origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians)))
+    cells, origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians, views=VIEWS)))
+    assert cells.shape == bare.shape
+    assert origin == bare_origin
+    assert ((cells == 0) == (bare == 0)).all()
+    assert (bare[15:25, 15:25] == 205).all()
+
+
+def test_octomap_has_free_voxels_and_none_of_them_holds_an_opaque_gaussian(tmp_path):
+    gaussians = room()
+    # the region is one wall: voxels of the others are not free either
+    region = dataclasses.replace(gaussians, active=np.abs(gaussians.means_m[:, 0]) < 1.9)
+    content = MapContent(region, region.take(region.active), views=VIEWS)
+    tree = pyoctomap.OcTree(str(export(tmp_path, "octomap", content)).encode())
+    air = tree.search([0.55, 0.05, EYE_M])
+    assert air is not None
+    assert air.getLogOdds() < 0
+    for centre_m in (occupied_voxels(region, SETTINGS) + 0.5) * VOXEL_M:
+        node = tree.search(centre_m)
+        assert node is None or node.getLogOdds() > 0
+
+
+def test_a_floor_whose_ellipsoids_reach_below_and_above_it_is_free(tmp_path):
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-HALF_M, HALF_M, 0.05), np.arange(-HALF_M, HALF_M, 0.05)))
+    walls = room()
+    floor = walls.take(np.arange(len(x)) % len(walls))
+    noise_m = np.random.default_rng(0).normal(0, 0.005, len(x))
+    floor = dataclasses.replace(
+        floor,
+        means_m=np.stack([x, y, noise_m], axis=1).astype(np.float32),
+        scales_m=np.full((len(x), 3), 0.05, np.float32),
+    )
+    columns = {f.name: np.concatenate([getattr(m, f.name) for m in (walls, floor)]) for f in dataclasses.fields(walls)}
+    gaussians = Gaussians(**columns)
+    cells, origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians)))
+    inside = slice(int((-1.7 - origin[0]) / VOXEL_M), int((1.7 - origin[0]) / VOXEL_M))
+    assert (cells[inside, inside] == 254).mean() > 0.95

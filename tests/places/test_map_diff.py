@@ -1,0 +1,98 @@
+"""What changed between two maps: only what later views see through, or earlier ones saw empty."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from place_scenes import CAMERA, MapCamera
+from sample_gaussians import plain_gaussians
+
+from gausslite.domain.gaussians import Gaussians
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.mapping.free_space import DepthView
+from gausslite_places.map_diff import Change, ChangeKind, Visit, compare_visits, with_earlier_objects
+
+WALL_M, BOX_M = 3.0, 0.4
+HERE, THERE, OUTSIDE = (-0.5, 0.0, 2.0), (0.5, 0.1, 2.0), (6.0, 0.0, 2.0)
+
+
+def _grid(centre_m: tuple[float, float, float], side_m: float) -> np.ndarray:
+    steps = np.arange(-side_m / 2, side_m / 2 + 0.01, 0.05)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    return np.stack([x, y, np.zeros(len(x))], axis=1) + centre_m
+
+
+def _scene(*boxes_m: tuple[float, float, float]) -> Gaussians:
+    """Return a grey wall and red faces before it."""
+    faces = [_grid(box_m, BOX_M) for box_m in boxes_m]
+    points_m = np.concatenate([_grid((0.0, 0.0, WALL_M), 4.0), *faces])
+    reds = np.arange(len(points_m)) >= len(points_m) - sum(map(len, faces))
+    rgb = np.where(reds[:, None], (0.9, 0.1, 0.1), (0.5, 0.5, 0.5))
+    return plain_gaussians(points_m, rgb=rgb, active=reds, opacities=0.95)
+
+
+def _mug(centre_m: tuple[float, float, float], number: int = 1) -> ObjectLandmark:
+    low, high = (tuple(value + sign * 0.25 for value in centre_m) for sign in (-1, 1))
+    box = AxisAlignedBox(low, high)  # type: ignore[arg-type]
+    return ObjectLandmark(f"mug-{number}", "mug", ObjectRole.TARGET, centre_m, box, 0.9, 0, 1)
+
+
+def _visit(boxes_m: list[tuple[float, float, float]], objects: list[ObjectLandmark], views: int = 4) -> Visit:
+    gaussians = _scene(*boxes_m)
+    camera, seen = MapCamera(gaussians), []
+    for index in range(views):
+        T_world_camera = np.eye(4)
+        T_world_camera[0, 3] = 0.1 * index
+        rendering = camera.render(CAMERA, T_world_camera)
+        seen.append(DepthView.of(rendering.expected_depth_m(0.8), CAMERA, T_world_camera))
+    return Visit(gaussians, objects, seen)
+
+
+def test_the_same_place_has_no_changes() -> None:
+    visit = _visit([HERE], [_mug(HERE)])
+    assert compare_visits(visit, _visit([HERE], [_mug((-0.45, 0.05, 2.0))])) == []
+
+
+def test_a_named_object_is_moved_gone_or_new() -> None:
+    here, there, nowhere = _visit([HERE], [_mug(HERE)]), _visit([THERE], [_mug(THERE)]), _visit([], [])
+    [moved] = compare_visits(here, there)
+    assert (moved.kind, moved.before_m, moved.after_m) == (ChangeKind.MOVED, HERE, THERE)
+    assert moved.describe() == "mug: moved 1.00 m from (-0.50, 0.00, 2.00) m to (0.50, 0.10, 2.00) m"
+    [gone] = compare_visits(here, nowhere)
+    assert gone.describe() == "mug: gone from (-0.50, 0.00, 2.00) m"
+    [new] = compare_visits(nowhere, there)
+    assert new.describe() == "mug: new at (0.50, 0.10, 2.00) m"
+
+
+def test_what_no_later_view_sees_is_not_gone() -> None:
+    assert compare_visits(_visit([HERE, OUTSIDE], [_mug(OUTSIDE)]), _visit([HERE], [])) == []
+    assert compare_visits(_visit([HERE], [_mug(HERE)]), _visit([], [], views=0)) == []
+
+
+def test_an_object_that_was_missed_but_whose_surface_stays_is_not_gone() -> None:
+    assert compare_visits(_visit([HERE], [_mug(HERE)]), _visit([HERE], [])) == []
+
+
+def test_an_object_that_the_earlier_run_did_not_see_is_not_new() -> None:
+    assert compare_visits(_visit([], [], views=0), _visit([THERE], [_mug(THERE)])) == []
+
+
+def test_surfaces_without_a_name_are_reported() -> None:
+    [moved] = compare_visits(_visit([HERE], []), _visit([THERE], []))
+    assert (moved.kind, moved.noun) == (ChangeKind.MOVED, "")
+    assert moved.distance_m == pytest.approx(1.0, abs=0.05)
+    [gone] = compare_visits(_visit([HERE], []), _visit([], []))
+    assert gone.describe().startswith("something of 0.40 x 0.40 x ")
+    assert gone.as_json()["before_m"] == pytest.approx(list(HERE), abs=0.06)
+
+
+def test_earlier_objects_come_along_unless_they_changed_or_were_found_again() -> None:
+    earlier = [_mug(HERE, 1), _mug(THERE, 2), _mug(OUTSIDE, 3)]
+    found = [_mug((6.05, 0.0, 2.0), 1)]
+    changes = [Change(ChangeKind.GONE, "mug", (0.5, 0.5, 0.5), THERE)]
+    objects = with_earlier_objects(found, earlier, changes)
+    assert [(item.object_id, item.centroid_m) for item in objects] == [
+        ("mug-1", (6.05, 0.0, 2.0)),
+        ("mug-1-earlier", HERE),
+    ]
