@@ -21,6 +21,17 @@ class Group(StrEnum):
     """What a plug-in adds to the core."""
 
     COMMANDS = "gausslite.commands"  # a `Command`; the name is the sub-command
+    SOURCES = "gausslite.sources"  # opens recordings; the name is the prefix of an address, as in "sim:home"
+    CALIBRATORS = "gausslite.calibrators"  # estimates what a recording does not state
+    PARSERS = "gausslite.parsers"  # reads a sentence as a task graph
+    DETECTORS = "gausslite.detectors"  # opens a model file as a detector
+    RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
+    CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
+    LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
+    ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
+    STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
+    EXPORTERS = "gausslite.exporters"  # writes a map for another tool; the name is the format
+    PAGES = "gausslite.pages"  # shows a run or a service in the browser
 
 
 @dataclass(frozen=True, slots=True)

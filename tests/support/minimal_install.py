@@ -77,7 +77,7 @@ def default_paths(out: Path) -> list[dict[str, object]]:
         ("models", "list"),
         ("doctor", "--json"),
         ("demo", *halves, "--size", "160x120", "--set", "refine-iterations=5", "--out", str(out / "demo")),
-        *((command, "--help") for command in importlib.import_module("gausslite.cli.main").SUMMARIES),
+        *((command, "--help") for command in importlib.import_module("gausslite.cli.main").commands()),
     )
     results = [run("gausslite", arguments) for arguments in commands]
     return results + [run(program, ("--help",)) for program in PROGRAMS]
@@ -93,7 +93,6 @@ def missing_extras(out: Path) -> list[dict[str, object]]:
         ("view", "gausslite_agent", ("--listen", "127.0.0.1:50099", "--set", "view=0")),
         ("view", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--view", "0")),
         ("metrics", "gausslite_fusion_server", ("--listen", "127.0.0.1:50099", "--metrics", "127.0.0.1:0")),
-        ("completion", "gausslite", ("completion", "bash")),
         *(("export", "gausslite", ("export", run_folder, "--to", kind)) for kind in ("spz", "las", "octomap", "mesh")),
         *(
             (

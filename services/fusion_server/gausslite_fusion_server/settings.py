@@ -168,21 +168,9 @@ def parse_maintenance(arguments: Sequence[str]) -> MaintenanceSettings:
     return MaintenanceSettings(options.command, options.store, other, options.json, getattr(options, "repair", False))
 
 
-def build_parser_with_commands() -> CommandParser:
-    """Return the parser of the server's options and of the maintenance commands, for the completion of a shell."""
-    parser = build_parser()
-    _add_maintenance_commands(parser, required=False)
-    return parser
-
-
 def _maintenance_parser() -> CommandParser:
     parser = CommandParser(prog=PROGRAM, description="Maintain the file of a store.")
-    _add_maintenance_commands(parser, required=True)
-    return parser
-
-
-def _add_maintenance_commands(parser: CommandParser, *, required: bool) -> None:
-    commands = parser.add_subparsers(dest="command", required=required, metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, paths, text in _MAINTENANCE:
         command = commands.add_parser(name, help=text, description=text.capitalize() + ".")
         for path in paths:
@@ -190,3 +178,4 @@ def _add_maintenance_commands(parser: CommandParser, *, required: bool) -> None:
         command.add_argument("--json", action="store_true", help="print one JSON object")
         if name == "verify":
             command.add_argument("--repair", action="store_true", help="delete the damaged rows; without a server")
+    return parser
