@@ -1,6 +1,6 @@
-"""Write src/gausslite/domain/nouns.txt, the nouns of things that can be seen, from the files of WordNet 3.0.
+"""Write src/gausslite_language/nouns.txt, the nouns of things that can be seen, from the files of WordNet 3.0.
 
-    python3 tools/noun_vocabulary.py /usr/share/wordnet LICENSE_OF_WORDNET > src/gausslite/domain/nouns.txt
+    python3 tools/noun_vocabulary.py /usr/share/wordnet LICENSE_OF_WORDNET > src/gausslite_language/nouns.txt
 
 The folder is that of the Debian package wordnet-base; the licence is the text that its copies must contain.
 """

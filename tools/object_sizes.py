@@ -1,6 +1,6 @@
-"""Write src/gausslite/domain/sizes.txt, the lengths of kinds of things, from the asset database of ProcTHOR.
+"""Write src/gausslite_language/sizes.txt, the lengths of kinds of things, from the asset database of ProcTHOR.
 
-    python3 tools/object_sizes.py procthor/databases/asset-database.json > src/gausslite/domain/sizes.txt
+    python3 tools/object_sizes.py procthor/databases/asset-database.json > src/gausslite_language/sizes.txt
 
 The file is in the package procthor (Allen Institute for AI, Apache-2.0): boxes of 1653 models of things in homes.
 """

@@ -15,6 +15,7 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.codec.ply import read_ply, write_ply
+from gausslite.config.task_parser import DefaultParser
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
@@ -45,7 +46,6 @@ from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
 from gausslite_calibration.calibrate import StatedValues, as_recorded_notes, calibrate
 from gausslite_evaluation.views import view_map
-from gausslite_language.rules import RuleParser
 
 __all__ = [
     "AgentClient",
@@ -174,7 +174,7 @@ def create_mapper(
         raise InvalidInputError("perception.model: expected a task for the detector, got none")
     if task is None and not chosen:
         settings = _without_task(settings)
-    roi = chosen if task is None else RuleParser().parse(task)
+    roi = chosen if task is None else DefaultParser().parse(task)
     return build_task_mapper(settings, EstimatorFactory(perception, lambda: scene), roi)
 
 
@@ -270,4 +270,4 @@ def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = Z
 
     objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError.
     """
-    return answer(RuleParser().parse(question), list(objects), up_axis)
+    return answer(DefaultParser().parse(question), list(objects), up_axis)

@@ -23,7 +23,8 @@ class Group(StrEnum):
     COMMANDS = "gausslite.commands"  # a `Command`; the name is the sub-command
     SOURCES = "gausslite.sources"  # opens recordings; the name is the prefix of an address, as in "sim:home"
     CALIBRATORS = "gausslite.calibrators"  # estimates what a recording does not state
-    PARSERS = "gausslite.parsers"  # reads a sentence as a task graph
+    PARSERS = "gausslite.parsers"  # a `ParserBackend`, which reads a sentence as a task graph
+    NOUNS = "gausslite.nouns"  # a `NounVocabulary`
     DETECTORS = "gausslite.detectors"  # opens a model file as a detector
     RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
@@ -45,6 +46,13 @@ class Command:
 def names(group: Group) -> tuple[str, ...]:
     """Return the names that are registered in a group, sorted."""
     return tuple(sorted(entry_points(group=group).names))
+
+
+def default_name(group: Group) -> str:
+    """Return the other name of the plug-in that is used unless somebody chooses; "default" if it has none."""
+    values = {entry.name: entry.value for entry in entry_points(group=group)}
+    others = sorted(name for name, value in values.items() if name != DEFAULT and value == values.get(DEFAULT))
+    return others[0] if others else DEFAULT
 
 
 def load(group: Group, name: str = DEFAULT) -> Any:
@@ -79,4 +87,5 @@ def _import(entry: EntryPoint) -> Any:
         package = entry.module.partition(".")[0]
         missing = (error.name or package).partition(".")[0]
         needs = f"the package {package}" if missing == package else f"the package {missing}, for {package}"
-        raise MissingPluginError(f"{entry.name}: needs {needs}, which is not installed") from error
+        name = entry.group if entry.name == DEFAULT else entry.name
+        raise MissingPluginError(f"{name}: needs {needs}, which is not installed") from error

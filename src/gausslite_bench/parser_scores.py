@@ -11,8 +11,7 @@ from pathlib import Path
 
 from gausslite.codec.json import graph_from_json
 from gausslite.domain.errors import InvalidInputError, TaskError
-from gausslite.domain.task import TargetRole, TaskGraph
-from gausslite_language.grounding import TaskParser
+from gausslite.domain.task import TargetRole, TaskGraph, TaskParser
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")
 

@@ -13,7 +13,10 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from gausslite.domain.errors import ModelFileError
-from gausslite.domain.nouns import (
+from gausslite.domain.objects import MatchBasis, NounMatch
+from gausslite.nouns import head_of, is_generic, is_structure, normalised_noun, synonyms
+from gausslite.perception.settings import require_plausible
+from gausslite_language.nouns import (
     is_kind_of,
     is_thing,
     kinds_among,
@@ -22,8 +25,6 @@ from gausslite.domain.nouns import (
     nearest_names,
     synonymous_classes,
 )
-from gausslite.domain.objects import MatchBasis, NounMatch, head_of, is_generic, is_structure, normalised_noun, synonyms
-from gausslite.perception.settings import require_plausible
 
 NOUN_VECTORS_FILE: Final = "lvis_v1_clip_a+cname.npy"
 NOUN_NAMES_FILE: Final = "lvis_v1_train_cat_info.json"

@@ -11,7 +11,8 @@ from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.domain.errors import KernelError, ModelFileError
-from gausslite.domain.objects import MatchBasis, NounMatch, head_of, normalised_noun
+from gausslite.domain.objects import MatchBasis, NounMatch
+from gausslite.nouns import head_of, normalised_noun
 from gausslite_detectors.class_match import NOUN_NAMES_FILE, NOUN_VECTORS_FILE, read_noun_vectors
 from gausslite_detectors.model_file import OpenModel, open_model, run_once
 

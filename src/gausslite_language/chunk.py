@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from gausslite.domain.nouns import is_thing
 from gausslite_language import lexicon, verbs
 from gausslite_language.lexicon import DISTANCE_SUPERLATIVES, SUPERLATIVES, is_attribute, singular, word_set
+from gausslite_language.nouns import is_thing
 from gausslite_language.tags import Tag
 from gausslite_language.tokens import Bounds
 

@@ -6,11 +6,8 @@ import hashlib
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 from gausslite.domain.errors import TaskError
-from gausslite.domain.nouns import are_one_kind
-from gausslite.domain.objects import same_kind
 from gausslite.domain.task import (
     EXAMPLE,
     LIMITS,
@@ -21,12 +18,14 @@ from gausslite.domain.task import (
     require_graph,
     require_task_text,
 )
+from gausslite.nouns import same_kind
 from gausslite_language import lexicon
 from gausslite_language.chunk import noun_phrase
 from gausslite_language.chunker import chunk_sentence
 from gausslite_language.graph_builder import build_draft
 from gausslite_language.graph_draft import GraphDraft
 from gausslite_language.lexicon import DescribedNoun, singular, split_attributes, word_set
+from gausslite_language.nouns import are_one_kind
 from gausslite_language.tokens import tokenize
 
 
@@ -80,15 +79,6 @@ def _known_name(noun: DescribedNoun, described: Mapping[str, DescribedNoun]) -> 
 
 
 _TASK_ID_HEX_DIGITS = 12
-
-
-@runtime_checkable
-class TaskParser(Protocol):
-    """Parse a task given as an English sentence."""
-
-    def parse(self, text: str) -> TaskGraph:
-        """Return the graph of one task. Raises TaskError if the text is empty, too long or names no object."""
-        ...
 
 
 def normalise_text(text: str) -> str:

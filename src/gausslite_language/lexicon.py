@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from gausslite.domain.nouns import is_thing
 from gausslite.domain.task import Superlative
+from gausslite_language.nouns import is_thing
 from gausslite_language.verbs import TABLES, words
 from gausslite_language.verbs import word_set as word_set
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from gausslite.domain.nouns import is_thing
 from gausslite_language import lexicon
 from gausslite_language.chunk import Chunk, ChunkBuffer, ChunkKind
 from gausslite_language.clause_types import INABILITIES, WISHES
 from gausslite_language.lexicon import is_attribute, singular, word_set
+from gausslite_language.nouns import is_thing
 from gausslite_language.tags import Tag
 from gausslite_language.verbs import HOLDING_VERBS, POSTURE_VERBS, TOOL_VERBS, verb_base
 

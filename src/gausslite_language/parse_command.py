@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from dataclasses import MISSING, dataclass
 
 from gausslite.codec.json import graph_as_json
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import build, option
+from gausslite.config.option import option
 from gausslite.config.program import Program
+from gausslite.config.task_parser import chosen_parser, parser_options
 from gausslite.domain.task import TargetRole, TaskGraph
-from gausslite_language.rules import BackendSettings, open_parser
 
 
 @dataclass(frozen=True, slots=True)
 class ParseOptions:
-    """The options of `gausslite parse` beside those of the backend."""
+    """The options of `gausslite parse` beside those of the parser."""
 
     text: str = option(MISSING, 'for example "Pick up the mug on the table"', metavar="TEXT")
     json: bool = option(False, "print JSON for scripts")
@@ -25,14 +24,14 @@ class ParseOptions:
 
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite parse`."""
-    Program.of(ParseOptions, BackendSettings, flags="json backend llm-model llm-url", positional="text").add_to(parser)
+    flags = "json backend llm-model llm-url"
+    Program.of(ParseOptions, *parser_options(), flags=flags, positional="text").add_to(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Parse the sentence and print its graph. Returns the exit code."""
-    key = os.environ.get(options.llm_key_variable) or None
-    graph = open_parser(build(BackendSettings, options, api_key=key)).parse(options.text)
+    graph = chosen_parser(options).open().parse(options.text)
     print(json.dumps(graph_as_json(graph)) if options.json else _as_text(graph))
     return 0
 

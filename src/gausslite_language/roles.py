@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from gausslite.domain.nouns import is_thing
 from gausslite.domain.task import TargetRole
 from gausslite_language import lexicon, verbs
 from gausslite_language.chunk import Chunk, ChunkKind, NounPhrase, phrase_from_text
 from gausslite_language.graph_draft import Clause, GraphDraft, RelationAssigner, RelationTerms
 from gausslite_language.lexicon import word_set
+from gausslite_language.nouns import is_thing
 
 _ORIGIN_RELATIONS: Final = {f"from_{place}": place for place in ("on", "under", "inside", "behind", "near")}
 # after "on the table" these state the destination; other prepositions locate the table

@@ -1,118 +1,21 @@
-"""Parse tasks by rules, without a model or a network, in less than a millisecond; or choose another parser."""
+"""Parse tasks by rules, without a model or a network, in less than a millisecond."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
-from enum import StrEnum
-from pathlib import Path
 from typing import Final
 
-from gausslite.config.option import check_options, option
-from gausslite.domain.errors import InvalidInputError, TaskError
+from gausslite.domain.errors import TaskError
 from gausslite.domain.task import EXAMPLE, TargetRole, TaskGraph, require_task_text
 from gausslite_language.chunk import Chunk, ChunkKind
 from gausslite_language.chunker import chunk_sentence
 from gausslite_language.graph_builder import build_draft
 from gausslite_language.graph_draft import GraphDraft
-from gausslite_language.grounding import ParsedPhrases, TaskParser, grounded_graph, normalise_text
-from gausslite_language.models.parsers import LanguageModel
+from gausslite_language.grounding import ParsedPhrases, grounded_graph, normalise_text
 from gausslite_language.tags import is_english
 from gausslite_language.tokens import comparisons, tokenize
 
 _CODE: Final = re.compile(r"[{}\[\]<=|\\$*]|(?<![-=])>|\w\(|&&|^import ")
-RESPONSE_FORMATS: Final = ("json_schema", "json_object", "none")
-
-
-class Backend(StrEnum):
-    """Kind of task parser."""
-
-    RULES = "rules"
-    ONNX = "onnx"
-    HTTP = "http"
-
-
-@dataclass(frozen=True, slots=True)
-class BackendSettings:
-    """The task parser and its language model. key_variable: the environment variable whose value is api_key."""
-
-    backend: Backend = option(
-        Backend.RULES,
-        "parse tasks by rules, by a language model in this process (onnx) or on a server (http)",
-    )
-    model: str | None = option(
-        None,
-        "http: the model's name; onnx: a folder with genai_config.json",
-        key="llm-model",
-        metavar="NAME|FOLDER",
-        needs="backend=onnx|http",
-    )
-    url: str | None = option(
-        None,
-        "base of an OpenAI-compatible server, http://localhost:8000/v1",
-        key="llm-url",
-        metavar="URL",
-        needs="backend=http",
-    )
-    response_format: str = option(
-        RESPONSE_FORMATS[0],
-        "response format to request",
-        key="llm-format",
-        choices=RESPONSE_FORMATS,
-        needs="backend=http",
-    )
-    timeout_s: float = option(
-        10.0,
-        "longest wait for the model; rules parse the task after that",
-        key="llm-timeout",
-        unit="s",
-        low=0.001,
-        high=600,
-    )
-    key_variable: str = option(
-        "GAUSSLITE_LLM_API_KEY",
-        "environment variable that holds the API key of the server",
-        key="llm-key-variable",
-        metavar="NAME",
-    )
-
-    api_key: str | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        check_options(self)
-        if self.backend is not Backend.RULES and not self.model:
-            expected = "a folder" if self.backend is Backend.ONNX else "the model's name at the server"
-            raise InvalidInputError(f"backend {self.backend}: expected --llm-model, {expected}, got none")
-        if self.backend is Backend.HTTP and not self.url:
-            raise InvalidInputError("backend http: expected --llm-url, such as http://localhost:8000/v1, got none")
-
-
-def open_parser(settings: BackendSettings) -> TaskParser:
-    """Return the parser of these settings; a language model's answers are cached, and it falls back to rules.
-
-    Loads the model of the onnx backend. Raises InvalidInputError, ModelFileError.
-    """
-    rules = RuleParser()
-    if settings.backend is Backend.RULES:
-        return rules
-    from gausslite_language.models.parsers import CachedParser, FallbackParser, LanguageParser
-
-    language_parser = LanguageParser(_open_model(settings))
-    name = str(settings.backend)
-    return FallbackParser(CachedParser(language_parser, name, language_parser.version), name, rules)
-
-
-def _open_model(settings: BackendSettings) -> LanguageModel:
-    if settings.backend is Backend.ONNX:
-        from gausslite_language.models.onnx import OnnxLanguageModel
-
-        return OnnxLanguageModel(Path(settings.model or ""), settings.timeout_s)
-    from gausslite_language.models.http import HttpLanguageModel, HttpSettings, ResponseFormat
-
-    response_format = ResponseFormat(settings.response_format)
-    return HttpLanguageModel(
-        HttpSettings(settings.url or "", settings.model or "", response_format, settings.timeout_s, settings.api_key)
-    )
 
 
 class RuleParser:

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Final
 
-from gausslite.domain.nouns import is_thing
 from gausslite_language import lexicon, verbs
 from gausslite_language.lexicon import UNCHANGED, is_attribute, singular, word_set
+from gausslite_language.nouns import is_thing
 from gausslite_language.tokens import PREPOSITIONS, split_bounds
 from gausslite_language.verbs import TABLES
 

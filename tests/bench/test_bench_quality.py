@@ -16,8 +16,8 @@ from quality_results import CONDITIONS, PLAN, TASK, UNIFORM, finished
 
 from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.objects import same_kind
 from gausslite.domain.recording import PoseExposurePrior
+from gausslite.nouns import same_kind
 from gausslite_bench.quality.ablation import cumulative_variants
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import HOME_TASKS, WHOLE_HOMES, TaskKind, choose_home_tasks

@@ -114,9 +114,9 @@ def test_a_taken_port_is_a_warning() -> None:
 def test_the_checked_ports_are_those_that_the_services_take_by_default() -> None:
     from gausslite_agent.settings import parse_arguments as agent_settings
     from gausslite_fusion_server.settings import ServerSettings
-    from gausslite_parser.program import ParserSettings
+    from gausslite_parser.program import parse_arguments as parser_settings
 
-    assert ParserSettings().listen == PARSER_ADDRESS
+    assert parser_settings([]).listen == PARSER_ADDRESS
     assert ServerSettings().listen == FUSION_ADDRESS
     assert agent_settings([]).listen == AGENT_ADDRESS
 

@@ -11,9 +11,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from gausslite.domain.errors import LanguageModelError
+from gausslite_language.backends import HttpBackend, ModelSettings
 from gausslite_language.models.http import HttpLanguageModel, HttpSettings, ResponseFormat
 from gausslite_language.models.parsers import ANSWER_SCHEMA, messages_for
-from gausslite_language.rules import Backend, BackendSettings, open_parser
 
 GOOD = json.dumps(
     {
@@ -142,11 +142,12 @@ def test_a_slow_hostile_or_broken_server_fails_in_one_line_and_in_time(act: Act,
     assert "\n" not in str(caught.value)
 
 
-def test_the_key_is_sent_to_the_server_only(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_key_is_sent_to_the_server_only(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KEY", "secret")
     caplog.set_level(0)
     with server(send_response(b"secret", 403)) as (url, requests):
-        settings = BackendSettings(Backend.HTTP, "phi", url, api_key="secret")
-        graph = open_parser(settings).parse("Pick up the mug on the table")
+        backend = HttpBackend(ModelSettings("phi", url, key_variable="KEY"))
+        graph = backend.open().parse("Pick up the mug on the table")
     assert requests[0][1]["Authorization"] == "Bearer secret"
     assert "secret" not in caplog.text
     assert "secret" not in repr(graph)
@@ -154,7 +155,7 @@ def test_the_key_is_sent_to_the_server_only(caplog: pytest.LogCaptureFixture) ->
 
 def test_answers_are_cached_and_failures_are_warnings() -> None:
     with server(send_response(completion(GOOD))) as (url, requests):
-        parser = open_parser(BackendSettings(Backend.HTTP, "phi", url))
+        parser = HttpBackend(ModelSettings("phi", url)).open()
         graphs = [parser.parse("Pick up the mug on the table") for _ in range(2)]
         assert graphs[0].warnings == ()
         assert graphs[0] == graphs[1]

@@ -16,6 +16,7 @@ import pytest
 
 from gausslite.domain.errors import LanguageModelError, ModelFileError
 from gausslite_bench.parser_scores import load_sentences
+from gausslite_language.backends import ModelSettings, OnnxBackend
 from gausslite_language.models.onnx import OnnxLanguageModel, phi3_chat
 from gausslite_language.models.parsers import (
     MAX_PHRASE_CHARS,
@@ -26,13 +27,12 @@ from gausslite_language.models.parsers import (
     MessageRole,
     messages_for,
 )
-from gausslite_language.rules import Backend, BackendSettings, open_parser
 
 TASKS = int(os.environ.get("GAUSSLITE_ONNX_TASKS", "5"))
 _NEEDED = ("onnxruntime_genai", "transformers", "tokenizers", "torch", "onnx_ir")
 MISSING = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
 needs_genai = pytest.mark.skipif(bool(MISSING), reason=f"needs {', '.join(MISSING)} to build and run a tiny model")
-BUILD = Path(__file__).resolve().parents[2] / "support" / "tiny_phi3.py"
+BUILD = Path(__file__).resolve().parents[1] / "support" / "tiny_phi3.py"
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_a_truncated_or_late_answer_is_an_error(tiny: Path) -> None:
 
 @needs_genai
 def test_a_failed_answer_falls_back_to_rules_with_a_warning(tiny: Path) -> None:
-    graph = open_parser(BackendSettings(Backend.ONNX, str(tiny), timeout_s=60.0)).parse("Pick up the mug on the table")
+    graph = OnnxBackend(ModelSettings(str(tiny), timeout_s=60.0)).open().parse("Pick up the mug on the table")
     assert (graph.targets, graph.anchors) == (("mug",), ("table",))
     assert graph.warnings[0].startswith("backend onnx failed (language model")
 

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from gausslite.domain.errors import InvalidInputError, LanguageModelError, TaskError
 from gausslite.domain.task import Predicate, Relation, TargetRole, require_graph
+from gausslite_language.backends import HttpBackend, ModelSettings, OnnxBackend
+from gausslite_language.models.http import HttpSettings
 from gausslite_language.models.parsers import (
     MAX_PHRASES,
     MAX_RELATIONS,
@@ -22,7 +24,7 @@ from gausslite_language.models.parsers import (
     messages_for,
     parse_answer,
 )
-from gausslite_language.rules import Backend, BackendSettings, RuleParser, open_parser
+from gausslite_language.rules import RuleParser
 
 TASK = "Pick up the mugs on the table"
 
@@ -215,23 +217,24 @@ def test_the_prompts_own_examples_are_graphs_by_its_own_schema():
 
 
 @pytest.mark.parametrize(
-    ("settings", "expected"),
+    ("backend", "settings", "expected"),
     [
-        ({"backend": Backend.HTTP}, "expected --llm-model"),
-        ({"backend": Backend.ONNX}, "expected --llm-model"),
-        ({"backend": Backend.HTTP, "model": "m"}, "expected --llm-url"),
-        ({"timeout_s": float("nan")}, "expected 0.001 to 600 s, got nan"),
-        ({"backend": Backend.HTTP, "model": "m", "url": "ftp://host"}, "backend http url"),
-        ({"backend": Backend.HTTP, "model": "m", "url": "http://me:secret@host/v1"}, "no user, password"),
-        ({"backend": Backend.HTTP, "model": "m", "url": "http://host", "api_key": "a\nb"}, "backend http key"),
-        ({"backend": Backend.ONNX, "model": "/nowhere"}, "/nowhere: expected a folder with genai_config.json"),
+        (HttpBackend, {}, "expected --llm-model"),
+        (OnnxBackend, {}, "expected --llm-model"),
+        (HttpBackend, {"model": "m"}, "expected --llm-url"),
+        (HttpBackend, {"timeout_s": float("nan")}, "expected 0.001 to 600 s, got nan"),
+        (HttpBackend, {"model": "m", "url": "ftp://host"}, "backend http url"),
+        (HttpBackend, {"model": "m", "url": "http://me:secret@host/v1"}, "no user, password"),
+        (HttpBackend, {"model": "m", "url": "http://host", "key_variable": "WRONG_KEY"}, "backend http key"),
+        (OnnxBackend, {"model": "/nowhere"}, "/nowhere: expected a folder with genai_config.json"),
     ],
 )
-def test_wrong_settings_are_refused(settings, expected):
+def test_wrong_settings_are_refused(backend, settings, expected, monkeypatch):
+    monkeypatch.setenv("WRONG_KEY", "secret\nb")
     with pytest.raises(InvalidInputError, match=expected) as caught:
-        open_parser(BackendSettings(**settings))
+        backend(ModelSettings(**settings)).open()
     assert "secret" not in str(caught.value)
 
 
 def test_the_key_is_never_in_the_repr():
-    assert "secret" not in repr(BackendSettings(api_key="secret"))
+    assert "secret" not in repr(HttpSettings("http://host", "m", api_key="secret"))

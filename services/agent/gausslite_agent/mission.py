@@ -14,7 +14,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchE
 from gausslite.domain.frame import ClockJumps, Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import match_warnings
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mission.checkpoint import ResumeConfig
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
@@ -34,7 +34,6 @@ from gausslite_agent.state import (
     MissionSummary,
     WorkerStatus,
 )
-from gausslite_language.grounding import TaskParser
 
 _OF_UPLINK = (
     *("handover_bytes", "keyframe_bytes", "keyframes_sent", "keyframes_waiting", "gaussians_sent"),

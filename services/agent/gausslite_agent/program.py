@@ -11,11 +11,12 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 
+from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import NONE
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
@@ -35,8 +36,6 @@ from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_ar
 from gausslite_agent.state import SavedMission
 from gausslite_agent.team_map import TeamMapFollower
 from gausslite_calibration.calibrate import recording_notes
-from gausslite_language.grounding import TaskParser
-from gausslite_language.rules import RuleParser
 from gausslite_places.agent_prior import PriorFrames
 from gausslite_places.prior_map import SavedMap
 from gausslite_places.prior_run import PriorRun, require_other_folder
@@ -258,7 +257,7 @@ async def _run_mission(mission: _Mission, settings: AgentSettings) -> None:
 
 def _open_parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:
     if settings.link.parser is None:
-        return RuleParser()
+        return DefaultParser()
     return stack.enter_context(ParserClient(settings.link.parser, tls=settings.tls))
 
 

@@ -15,7 +15,7 @@ from gausslite.codec.subset_codec import split_batch
 from gausslite.domain.errors import InvalidInputError, MismatchError, RevisionGoneError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.domain.voxel_changes import RevisionLog, VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxels import (
     AxisAlignedBox,
@@ -53,7 +53,6 @@ from gausslite_agent.messages import (
 )
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
-from gausslite_language.grounding import TaskParser
 
 
 @dataclass(frozen=True, slots=True, eq=False)

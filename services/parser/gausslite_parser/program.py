@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import build, option
+from gausslite.config.option import build, option, options_of
 from gausslite.config.program import Program, parse_options
+from gausslite.config.task_parser import ParserBackend, chosen_parser, parser_options
 from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.task import TaskParser
 from gausslite.process import print_message
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire.channel import PARSER_ADDRESS
@@ -19,8 +20,6 @@ from gausslite.wire.convert_task import graph_to_message
 from gausslite.wire.process import run_service
 from gausslite.wire.security import Tls, TlsFiles
 from gausslite.wire.server import Service, serve_until_stopped
-from gausslite_language.grounding import TaskParser
-from gausslite_language.rules import BackendSettings, open_parser
 
 SERVICE_NAME = parser_service_pb2.DESCRIPTOR.services_by_name["ParserService"].full_name
 
@@ -49,26 +48,18 @@ def parser_service(parser: TaskParser) -> Service:
 
 @dataclass(frozen=True, slots=True)
 class ParserSettings:
-    """Address of the service, and the backend that parses tasks."""
+    """Address of the service, and the parser."""
 
+    backend: ParserBackend
     listen: str = option(PARSER_ADDRESS, "HOST:PORT (port 0: any free one) or unix:PATH", metavar="ADDRESS")
-    backend: BackendSettings = field(default_factory=BackendSettings)
     tls: Tls | None = None
-
-
-PROGRAM = Program.of(
-    *(ParserSettings, TlsFiles),
-    flags="listen backend llm-model llm-url tls-cert tls-key tls-ca",
-    removed={"traces": "the package opentelemetry-instrumentation-grpc traces calls"},
-)
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> ParserSettings:
     """Return the settings of the options. Ends the process with code 2 for wrong flags. Raises InvalidInputError."""
     options = parse_options(build_parser(), arguments, warn=print_message)
-    key = os.environ.get(options.llm_key_variable) or None
-    backend = build(BackendSettings, options, api_key=key)
-    return build(ParserSettings, options, backend=backend, tls=build(TlsFiles, options).read_for_server())
+    tls = build(TlsFiles, options).read_for_server()
+    return build(ParserSettings, options, backend=chosen_parser(options), tls=tls)
 
 
 def build_parser() -> CommandParser:
@@ -76,7 +67,12 @@ def build_parser() -> CommandParser:
     parser = CommandParser(
         prog="gausslite-parser", description="Serve gausslite.v1.ParserService: parse task texts into task graphs."
     )
-    PROGRAM.add_to(parser)
+    settings = (ParserSettings, *parser_options(), TlsFiles)
+    Program.of(
+        *settings,
+        flags=" ".join(key for of in settings for key in options_of(of)),
+        removed={"traces": "the package opentelemetry-instrumentation-grpc traces calls"},
+    ).add_to(parser)
     return parser
 
 
@@ -84,7 +80,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """Return 0 after a clean end, 2 with one line on stderr if the service cannot start."""
     try:
         settings = parse_arguments(arguments)
-        parser = open_parser(settings.backend)
+        parser = settings.backend.open()
     except GaussLiteError as error:
         print_message(f"gausslite-parser: {error}")
         return 2

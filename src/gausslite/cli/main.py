@@ -26,7 +26,6 @@ _SUMMARIES: Final = {
     "fetch": "download the fused map of a running team",
     "evict": "delete the data of an agent from a fusion server, and keep it out on request",
     "unban": "let a banned agent join a fusion server again",
-    "objects": "print where objects are, or which ones a question means, from a fusion server or the results of a run",
 }
 _TEAM = ("status", "end", "refine", "fetch", "evict", "unban")
 

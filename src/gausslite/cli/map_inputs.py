@@ -10,6 +10,7 @@ from typing import Any
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, stated_values
 from gausslite.codec.json import graph_as_json
 from gausslite.config.option import build, option
+from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.open import default_world_frame, open_source
 from gausslite.datasets.source import Source, frame_step
@@ -174,9 +175,7 @@ def parse_task(options: argparse.Namespace) -> TaskGraph | None:
                 "--set target-at=X,Y,Z[,R]"
             )
         return None
-    from gausslite_language.rules import RuleParser
-
-    return RuleParser().parse(options.task)
+    return DefaultParser().parse(options.task)
 
 
 def _open_recorded(options: argparse.Namespace, require_poses: bool) -> Source:
@@ -241,6 +240,4 @@ def _schedule(first: TaskGraph | None, switches: Sequence[TaskSwitch]) -> TaskSc
     for frame in frames:
         if frames.count(frame) > 1:
             raise InvalidInputError(f"task-at: expected one task for a frame, got {frames.count(frame)} for {frame}")
-    from gausslite_language.rules import RuleParser
-
-    return TaskSchedule(first, tuple((switch.frame, RuleParser().parse(switch.text)) for switch in switches))
+    return TaskSchedule(first, tuple((switch.frame, DefaultParser().parse(switch.text)) for switch in switches))

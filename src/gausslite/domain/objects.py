@@ -1,15 +1,11 @@
-"""The objects of a task in world coordinates, their names, and what a detector searches for each noun."""
+"""The objects of a task in world coordinates, and what a detector searches for each noun."""
 
 from __future__ import annotations
 
-import functools
 import math
-import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from importlib import resources
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +15,6 @@ from numpy import ndarray
 from gausslite.domain.checks import quote_name, require_name
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.nouns import are_one_kind, is_thing, kinds_among, nearest_above, synonymous_classes
 from gausslite.domain.pose import UpAxis, transform_points
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.domain.voxels import AxisAlignedBox
@@ -112,109 +107,6 @@ class NounReport:
 def match_warnings(matches: Sequence[NounMatch]) -> tuple[str, ...]:
     """Return one message for each noun that cannot be found or may be a different thing."""
     return tuple(match.warning for match in matches if match.warning is not None)
-
-
-@functools.cache
-def words() -> dict[str, Any]:
-    """Return the tables of `words.toml`: nouns, sizes, heights and colours. The file is read once."""
-    return tomllib.loads(resources.files("gausslite.domain").joinpath("words.toml").read_text(encoding="utf-8"))
-
-
-@functools.cache
-def synonyms() -> dict[str, str]:
-    """Return the canonical name of each noun that has one."""
-    return {name: row[0] for row in words()["nouns"]["synonyms"] for name in row}
-
-
-def head_of(phrase: str) -> str:
-    """Return the head noun: "lawn chair" → "chair", "mug_2" → "mug"."""
-    return normalised_noun(phrase).rpartition(" ")[2]
-
-
-def normalised_noun(phrase: str) -> str:
-    """Return the phrase without a trailing number and with plain spaces: "dining_table_1" → "dining table"."""
-    parts = phrase.casefold().replace("_", " ").replace("-", " ").split()
-    while len(parts) > 1 and parts[-1].isdigit():
-        parts.pop()
-    return " ".join(parts)
-
-
-def is_generic(phrase: str) -> bool:
-    """Return True if the phrase means any object."""
-    return head_of(phrase) in words()["nouns"]["generic"]
-
-
-def is_structure(phrase: str) -> bool:
-    """Return True for parts of a building or of the ground: walls, floors, doors, rooms, roads."""
-    return head_of(phrase) in words()["nouns"]["structure"]
-
-
-def is_convex(phrase: str) -> bool:
-    """Return False for a kind of object with other things inside its convex outline: chairs, plants, animals."""
-    return head_of(phrase) not in words()["nouns"]["non_convex"]
-
-
-@functools.cache
-def lengths_m() -> dict[str, float]:
-    """Return the longest side of each kind in `sizes.txt`. The file is read once."""
-    text = resources.files("gausslite.domain").joinpath("sizes.txt").read_text(encoding="utf-8")
-    rows = (line.split("|") for line in text.splitlines() if not line.startswith("#"))
-    return {_as_one_word(kind): float(length_m) for kind, length_m in rows}
-
-
-def _as_one_word(kind: str) -> str:
-    """Return "houseplant" for "house plant" if only that is a noun."""
-    joined = kind.replace(" ", "")
-    return joined if is_thing(joined) and not is_thing(kind) else kind
-
-
-@functools.cache
-def usual_length_m(phrase: str) -> float | None:
-    """Return the longest side that things of this kind have; None if it is unknown.
-
-    The kind, its synonyms and its kinds count; without any of them what it is a kind of.
-    """
-    known = lengths_m()
-    for noun in dict.fromkeys((normalised_noun(phrase), head_of(phrase))):
-        row = {noun, *(name for name in known if noun in synonyms() and synonyms().get(name) == synonyms()[noun])}
-        if kinds := {*row & known.keys(), *synonymous_classes(noun, known), *kinds_among(noun, known)}:
-            return max(known[kind] for kind in kinds)
-        if above := nearest_above(noun, known):
-            return usual_length_m(above[0])
-    return None
-
-
-def largest_size(phrase: str) -> tuple[float, float]:
-    """Return the longest plausible side of an object in metres, and its largest share of an image without depth.
-
-    Things may be longer than the models of their kind in `sizes.txt`.
-    """
-    head, usual_m = head_of(phrase), usual_length_m(phrase)
-    row = next(row for row in words()["sizes"] if head in row.get("nouns", (head,)))
-    return row["longest_m"] if usual_m is None else words()["lengths"]["slack"] * usual_m, row["image_share"]
-
-
-def same_kind(phrase: str, name: str) -> bool:
-    """Return True if a task's phrase means objects of this name: equal heads, or synonyms."""
-    if is_generic(phrase):
-        return not is_structure(name)
-    noun, other = normalised_noun(phrase), normalised_noun(name)
-    if noun == other or head_of(noun) == head_of(other):
-        return True
-    if are_one_kind(noun, other):
-        return True
-    canonical = synonyms().get(noun, synonyms().get(head_of(noun)))
-    return canonical is not None and canonical == synonyms().get(other, synonyms().get(head_of(other)))
-
-
-def meant_by(phrase: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of objects that a task's phrase means: those with its head, or its synonyms if there are none.
-
-    "table" means a coffee table and not the counter, but a counter where there is no table; "chair" includes armchairs.
-    """
-    same = tuple(name for name in names if same_kind(phrase, name))
-    head = head_of(normalised_noun(phrase))
-    return tuple(name for name in same if head_of(normalised_noun(name)).endswith(head)) or same
 
 
 MAX_OBJECTS_PER_AGENT = 200

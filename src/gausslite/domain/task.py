@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 from gausslite.domain.errors import TaskError
 
@@ -155,6 +155,15 @@ class TaskGraph:
         """The nouns of excluded objects that no target has: their pixels belong to no target."""
         targets = {noun_of(name) for name in self.targets}
         return tuple(dict.fromkeys(noun for noun in map(noun_of, self.excluded) if noun not in targets))
+
+
+@runtime_checkable
+class TaskParser(Protocol):
+    """Parse a task given as a sentence."""
+
+    def parse(self, text: str) -> TaskGraph:
+        """Return the graph of one task. Raises TaskError if the text is empty, too long or names no object."""
+        ...
 
 
 def noun_of(name: str) -> str:

@@ -27,11 +27,11 @@ from gausslite.domain.objects import (
     ObjectReport,
     ObjectRole,
     TeamObject,
-    same_kind,
 )
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.store import FusionStore
+from gausslite.nouns import same_kind
 
 _MIN_MATCH_DISTANCE_M = 0.15
 _MATCH_DISTANCE_SHARE = 0.5

@@ -26,13 +26,13 @@ from gausslite.config.values import (
     write_target_points,
 )
 from gausslite.datasets.source import Source
-from gausslite.domain.objects import meant_by
 from gausslite.domain.pose import UpAxis, require_up_axis
 from gausslite.domain.recording import TRACKED_PRIOR, CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
 from gausslite.mapping.policies import EXTENSION_FLAGS, POLICIES, TASK, UNIFORM, disable, follows_task, policy
 from gausslite.mapping.settings import MapperSettings
 from gausslite.mission.frame_scheduler import SchedulerSettings
+from gausslite.nouns import meant_by
 from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
 from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.render.choose import BACKENDS

@@ -17,8 +17,8 @@ from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
 from gausslite.domain.frame import linear_light
-from gausslite.domain.objects import words
 from gausslite.domain.task import TaskGraph, noun_of
+from gausslite.nouns import words
 from gausslite.perception.settings import ColourSettings
 
 _ANY: Final = (-np.inf, np.inf)

@@ -13,8 +13,9 @@ from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import MatchBasis, NounMatch, largest_size, meant_by
+from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox, Detection, Region
+from gausslite.nouns import largest_size, meant_by
 from gausslite.perception.settings import require_plausible
 
 

@@ -12,8 +12,8 @@ from numpy import ndarray
 
 from gausslite.domain.camera import project
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import same_kind
 from gausslite.domain.pose import inverse, transform_points
+from gausslite.nouns import same_kind
 from gausslite.perception.object_map import Landmark
 from gausslite.perception.settings import EvidenceSettings
 

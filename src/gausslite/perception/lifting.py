@@ -12,9 +12,9 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera, back_project, lift
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import is_convex
 from gausslite.domain.pose import transform_points, unit_up_axis
 from gausslite.domain.relevance import Detection
+from gausslite.nouns import is_convex
 from gausslite.perception.object_map import Observation
 from gausslite.perception.settings import LiftingSettings, RelevanceTrackerSettings
 from gausslite.perception.surface import mask_colours, mask_votes

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.objects import ObjectLandmark, meant_by
+from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.task import Relation, Superlative, TaskGraph, noun_of
+from gausslite.nouns import meant_by
 from gausslite.perception.object_map import Landmark, Observation
 from gausslite.perception.relations import RelationFilter, select_extreme
 from gausslite.perception.settings import RelationSettings

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import NounMatch, NounReport, ObjectLandmark, is_generic
+from gausslite.domain.objects import NounMatch, NounReport, ObjectLandmark
 from gausslite.domain.pose import require_rigid, rotation_angle_deg, translation_m, unit_up_axis
 from gausslite.domain.relevance import NO_TARGET, Detection, PointM, RelevanceMap
 from gausslite.domain.state import (
@@ -28,6 +28,7 @@ from gausslite.domain.state import (
     select_prefix,
 )
 from gausslite.domain.task import TaskGraph, noun_of
+from gausslite.nouns import is_generic
 from gausslite.perception.colours import ColourFilter, no_colours
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck

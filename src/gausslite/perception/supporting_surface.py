@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.frame import Frame
-from gausslite.domain.objects import MatchBasis, NounMatch, head_of, words
+from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
+from gausslite.nouns import head_of, words
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.object_map import Landmark, Observation
 from gausslite.perception.settings import HeightSettings

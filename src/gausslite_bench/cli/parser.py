@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import build, option
+from gausslite.config.option import option
 from gausslite.config.program import Program
+from gausslite.config.task_parser import chosen_parser, parser_options
 from gausslite_bench.parser_scores import SENTENCES, ParserScore, load_sentences, score_parser
-from gausslite_language.rules import BackendSettings, open_parser
 
 
 @dataclass(frozen=True, slots=True)
 class ParserBenchOptions:
-    """The options of `bench parser` beside those of the backend."""
+    """The options of `bench parser` beside those of the parser."""
 
     sentences: Path = option(
         SENTENCES, "sentences with their expected graphs (default: the set in the package)", metavar="FILE.json"
@@ -29,15 +28,15 @@ class ParserBenchOptions:
 
 def configure_parser(parser: CommandParser) -> None:
     """Add the options of `bench parser`."""
-    Program.of(ParserBenchOptions, BackendSettings, flags="sentences json backend llm-model llm-url").add_to(parser)
+    flags = "sentences json backend llm-model llm-url"
+    Program.of(ParserBenchOptions, *parser_options(), flags=flags).add_to(parser)
     parser.set_defaults(run=run_parser)
 
 
 def run_parser(options: argparse.Namespace) -> int:
     """Score the selected backend and print its scores."""
     sentences = load_sentences(options.sentences)
-    settings = build(BackendSettings, options, api_key=os.environ.get(options.llm_key_variable) or None)
-    score = score_parser(str(options.backend), open_parser(settings), sentences)
+    score = score_parser(options.backend, chosen_parser(options).open(), sentences)
     if options.json:
         print(json.dumps({"command": shlex.join(sys.argv), **asdict(score)}, indent=2))
     else:

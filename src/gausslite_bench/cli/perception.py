@@ -22,11 +22,12 @@ from gausslite.config.plain_values import split_names
 from gausslite.config.program import Program
 from gausslite.datasets.source import Source, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.objects import NounMatch, head_of, same_kind
+from gausslite.domain.objects import NounMatch
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.relevance import Region
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.mission.settings import PerceptionSettings, SourceSettings
+from gausslite.nouns import head_of, same_kind
 from gausslite.perception.detector import Detector, Tiling
 from gausslite_bench.perception.absent_nouns import AbsentSummary, absent_queries, choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet

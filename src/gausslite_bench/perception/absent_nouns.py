@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.objects import NounMatch, is_generic, is_structure, normalised_noun, same_kind
+from gausslite.domain.objects import NounMatch
 from gausslite.domain.task import TaskGraph
+from gausslite.nouns import is_generic, is_structure, normalised_noun, same_kind
 from gausslite_bench.perception.stage_scores import PerceptionStage, TaskQuery, TaskScore
 
 _MAX_MARKED_SHARE = 0.005

@@ -16,10 +16,10 @@ from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 from gausslite.datasets.source import HeldOutSplit, Source
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.objects import head_of
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.mission.settings import SceneInfo
+from gausslite.nouns import head_of
 from gausslite_bench.quality.scenes import PosePolicy, Scene, UnseenRegionError, make_scene, require_count
 from gausslite_evaluation.views import MIN_ROI_PIXELS, HeldOutView
 

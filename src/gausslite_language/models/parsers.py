@@ -12,8 +12,8 @@ from enum import StrEnum
 from typing import Any, Final, NoReturn, Protocol, runtime_checkable
 
 from gausslite.domain.errors import LanguageModelError, TaskError
-from gausslite.domain.task import LIMITS, Predicate, Relation, TargetRole, TaskGraph, require_task_text
-from gausslite_language.grounding import ParsedPhrases, TaskParser, grounded_graph
+from gausslite.domain.task import LIMITS, Predicate, Relation, TargetRole, TaskGraph, TaskParser, require_task_text
+from gausslite_language.grounding import ParsedPhrases, grounded_graph
 
 MAX_ANSWER_BYTES = 64 * 1024
 

@@ -1,4 +1,7 @@
-"""The vocabulary of nouns: which words name things, and which class of a detector a noun is, by WordNet's hypernyms."""
+"""Know nouns: which words name things, of which kinds by WordNet's hypernyms, and how long such things are.
+
+The module is the `NounVocabulary` that the core finds.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Final
+
+from gausslite.nouns import head_of, normalised_noun, synonyms
 
 _MAX_STEPS: Final = 3
 # a class with more kinds than this is no other name of each of them: "container", "kitchen utensil", "tool"
@@ -46,7 +51,7 @@ class Vocabulary:
 @functools.cache
 def vocabulary() -> Vocabulary:
     """Return the nouns of `nouns.txt`. The file is read once."""
-    text = resources.files("gausslite.domain").joinpath("nouns.txt").read_text(encoding="utf-8")
+    text = resources.files("gausslite_language").joinpath("nouns.txt").read_text(encoding="utf-8")
     main: dict[str, tuple[int, ...]] = {}
     other: dict[str, tuple[int, ...]] = {}
     above: list[tuple[int, ...]] = []
@@ -193,3 +198,33 @@ def _all_above(known: Vocabulary, sense: int | None) -> dict[int, int]:
         found.update({at: steps for at in reached if at not in found})
         reached, steps = {parent for at in reached for parent in known.above[at]}, steps + 1
     return found
+
+
+@functools.cache
+def lengths_m() -> dict[str, float]:
+    """Return the longest side of each kind in `sizes.txt`. The file is read once."""
+    text = resources.files("gausslite_language").joinpath("sizes.txt").read_text(encoding="utf-8")
+    rows = (line.split("|") for line in text.splitlines() if not line.startswith("#"))
+    return {_as_one_word(kind): float(length_m) for kind, length_m in rows}
+
+
+def _as_one_word(kind: str) -> str:
+    """Return "houseplant" for "house plant" if only that is a noun."""
+    joined = kind.replace(" ", "")
+    return joined if is_thing(joined) and not is_thing(kind) else kind
+
+
+@functools.cache
+def usual_length_m(phrase: str) -> float | None:
+    """Return the longest side that things of this kind have; None if it is unknown.
+
+    The kind, its synonyms and its kinds count; without any of them what it is a kind of.
+    """
+    known = lengths_m()
+    for noun in dict.fromkeys((normalised_noun(phrase), head_of(phrase))):
+        row = {noun, *(name for name in known if noun in synonyms() and synonyms().get(name) == synonyms()[noun])}
+        if kinds := {*row & known.keys(), *synonymous_classes(noun, known), *kinds_among(noun, known)}:
+            return max(known[kind] for kind in kinds)
+        if above := nearest_above(noun, known):
+            return usual_length_m(above[0])
+    return None

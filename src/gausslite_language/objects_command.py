@@ -27,7 +27,9 @@ from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import merge_objects
 from gausslite.mission.results import TRAJECTORY, as_text, read_report, stated_up
+from gausslite.perception.questions import answer
 from gausslite.wire.security import TlsFiles
+from gausslite_language.rules import RuleParser
 
 _NS_PER_S = 1e9
 _EPOCH_TIMES_S = 1e8
@@ -91,9 +93,6 @@ def _select(place: _Place, question: str) -> tuple[Sequence[TeamObject], Sequenc
     """Return the objects that a noun or a question means, with notes. Raises InvalidInputError, TaskError."""
     if not question:
         return place.objects, ()
-    from gausslite.perception.questions import answer
-    from gausslite_language.rules import RuleParser
-
     try:
         graph = RuleParser().parse(question)
     except TaskError as error:

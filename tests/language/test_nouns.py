@@ -6,7 +6,8 @@ from importlib import resources
 
 import pytest
 
-from gausslite.domain.objects import meant_by, usual_length_m
+from gausslite.nouns import meant_by
+from gausslite_language.nouns import usual_length_m
 
 KITCHEN = ("chair_1", "chair_2", "stool", "table", "counter", "mug_1", "wall")
 
@@ -40,7 +41,7 @@ def test_a_noun_means_objects_of_its_name_and_synonyms_where_there_are_none(phra
     ],
 )
 def test_the_usual_length_is_that_of_the_noun_its_synonyms_and_its_kinds(noun, kinds):
-    text = resources.files("gausslite.domain").joinpath("sizes.txt").read_text(encoding="utf-8")
+    text = resources.files("gausslite_language").joinpath("sizes.txt").read_text(encoding="utf-8")
     rows = dict(line.split("|") for line in text.splitlines() if not line.startswith("#"))
     assert usual_length_m(noun) == max(float(rows[kind]) for kind in kinds)
 
