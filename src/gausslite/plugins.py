@@ -6,10 +6,11 @@ chooses another, that one has the name "default".
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any, Final
 
 from gausslite.domain.errors import MissingPluginError
@@ -45,19 +46,19 @@ class Command:
 
 def names(group: Group) -> tuple[str, ...]:
     """Return the names that are registered in a group, sorted."""
-    return tuple(sorted(entry_points(group=group).names))
+    return tuple(sorted(_registered(group)))
 
 
 def default_name(group: Group) -> str:
     """Return the other name of the plug-in that is used unless somebody chooses; "default" if it has none."""
-    values = {entry.name: entry.value for entry in entry_points(group=group)}
+    values = {name: entry.value for name, entry in _registered(group).items()}
     others = sorted(name for name, value in values.items() if name != DEFAULT and value == values.get(DEFAULT))
     return others[0] if others else DEFAULT
 
 
 def load(group: Group, name: str = DEFAULT) -> Any:
     """Import a plug-in. Raises MissingPluginError if it is not registered, or its package is not installed."""
-    entry = next(iter(entry_points(group=group, name=name)), None)
+    entry = _registered(group).get(name)
     if entry is None:
         known = ", ".join(names(group)) or "none"
         raise MissingPluginError(f"{name}: expected a plug-in of {group}; installed are: {known}")
@@ -78,6 +79,15 @@ def installed(group: Group) -> Iterator[tuple[str, Any]]:
         plugin = find(group, name)
         if plugin is not None:
             yield name, plugin
+
+
+@functools.cache
+def _all_entry_points() -> EntryPoints:
+    return entry_points()
+
+
+def _registered(group: Group) -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in _all_entry_points().select(group=group)}
 
 
 def _import(entry: EntryPoint) -> Any:
