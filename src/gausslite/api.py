@@ -16,6 +16,7 @@ from numpy import ndarray
 
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.config.task_parser import DefaultParser
+from gausslite.datasets.calibration import StatedValues, as_recorded_notes, open_calibrator
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
@@ -44,7 +45,6 @@ from gausslite.perception.questions import Z_UP, Answer, answer
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
 from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
-from gausslite_calibration.calibrate import StatedValues, as_recorded_notes, calibrate
 from gausslite_evaluation.views import view_map
 
 __all__ = [
@@ -141,7 +141,7 @@ def open_calibrated(spec: str | Path, *, up_axis: UpAxis | None = None, force: b
     depth that contradict the images; otherwise they raise DatasetError. Raises DatasetError, PoseError,
     InvalidInputError.
     """
-    found = calibrate(open_source(str(spec), up_axis), StatedValues(force=force))
+    found = open_calibrator().calibrate(open_source(str(spec), up_axis), StatedValues(force=force))
     notes = tuple(str(evidence) for evidence in found.evidence if not evidence.guaranteed)
     return CalibratedSequence(found.source, found.pose_prior, (*found.notes, *notes))
 

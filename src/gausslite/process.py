@@ -160,10 +160,6 @@ class DeferredInterrupt:
 class Sibling(StrEnum):
     """A module of a package beside the core; what the core calls in it."""
 
-    SIMULATOR = "gausslite_sim.source"
-    """open_simulated."""
-    BAGS = "gausslite_ros.bag_source"
-    """open_bag."""
     PAGES = "gausslite_view.pages"
     """live_page, service_page."""
     MISSION_PAGE = "gausslite_view.mission_view"

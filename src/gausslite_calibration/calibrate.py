@@ -1,5 +1,7 @@
 """Decide what a recording does not state: the registration of its depth, its camera, and its poses' errors.
 
+This module is the default plug-in of the group `gausslite.calibrators`; the protocol is `Calibrator` of the core.
+
 A value that the user states is used. Where the source guarantees a value, no estimate is made. The rest is estimated
 from the frames: registration first, then the camera from registered frames, then the pose prior from corrected ones.
 Before all of it, poses and depth that contradict the images are refused.
@@ -7,12 +9,13 @@ Before all of it, poses and depth that contradict the images are refused.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from gausslite.datasets.calibration import Calibration, Evidence, StatedValues
 from gausslite.datasets.corrected import CorrectedSource
+from gausslite.datasets.registered import RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, PoseError
@@ -20,63 +23,9 @@ from gausslite.domain.recording import CameraCorrection, DepthRegistration, Pose
 from gausslite_calibration.camera_estimate import estimate_camera
 from gausslite_calibration.consistency import Contradiction, find_contradiction
 from gausslite_calibration.depth_registration import find_registration
-from gausslite_calibration.errors import estimate_pose_exposure_prior
-from gausslite_calibration.registered_source import RegisteredSource
+from gausslite_calibration.pose_errors import estimate_pose_exposure_prior
 
 _NONE = "none"
-
-
-@dataclass(frozen=True, slots=True)
-class StatedValues:
-    """What the user states of a recording; None leaves a value to the source's guarantee or to an estimate.
-
-    depth_as_recorded: depth is used without registration. lens: kept where the camera is estimated, in place of the
-    lens that the source's files state. force: poses and depth are used although they contradict the images. checked:
-    they are not compared with the images, because that was done before, or because given poses are not used.
-    """
-
-    registration: DepthRegistration | None = None
-    depth_as_recorded: bool = False
-    correction: CameraCorrection | None = None
-    lens: Lens | None = None
-    pose_prior: PoseExposurePrior | None = None
-    force: bool = False
-    checked: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """Why a value that the user did not state was chosen.
-
-    option: name of the option that states it. value: as the option reads it. guaranteed: by the source; False for an
-    estimate.
-    """
-
-    option: str
-    value: str
-    reasons: tuple[str, ...]
-    guaranteed: bool = False
-
-    def __str__(self) -> str:
-        """Return option, value and reasons as one line."""
-        return f"{self.option} {shlex.quote(self.value)}: {'; '.join(self.reasons)}"
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """A source with registered depth and corrected images, what was applied to it, and the errors of its poses.
-
-    registration: None if depth is used as recorded. correction: the identity if images are. evidence: of each value
-    that the user did not state. notes: on poses or depth that contradict the images; if they do everywhere, nothing is
-    estimated from pairs of frames.
-    """
-
-    source: Source
-    registration: DepthRegistration | None
-    correction: CameraCorrection
-    pose_prior: PoseExposurePrior
-    evidence: tuple[Evidence, ...]
-    notes: tuple[str, ...] = ()
 
 
 def calibrate(
@@ -120,24 +69,28 @@ def calibrate(
     )
 
 
-def as_recorded_notes(source: Source) -> tuple[str, ...]:
-    """Return the notes of a source that is mapped as it is, and what is not estimated or corrected then."""
-    depth = (
-        "this layout does not state whether depth is registered to colour, and it is used as recorded; "
-        "`gausslite calibrate` estimates register-depth"
+def intentions(source: Source, stated: StatedValues) -> tuple[str, ...]:
+    """Return what `calibrate` will estimate and how long it takes, as messages for the operator."""
+    registration = (
+        "this layout does not state whether depth is registered to colour; the registration is estimated now; "
+        f'"depth_registered": true in cam_params.json states it, register-depth={_NONE} uses depth as it is'
     )
-    lens = f"the files state the lens {source.lens}, which is not corrected; gl.open_calibrated corrects it"
-    return (*source.notes, *(() if source.depth_registered else (depth,)), *(() if source.lens is None else (lens,)))
+    others = (
+        f"{len(source)} frames; up to half a minute for estimates of {', '.join(stated.open_values(source))} "
+        f"(`gausslite calibrate` prints all values)"
+    )
+    first = (registration,) if stated.leaves_registration_open(source) else ()
+    return (*first, others) if stated.open_values(source) else first
 
 
-def recording_notes(source: Source) -> tuple[str, ...]:
-    """Return the notes of `as_recorded_notes`, and how poses or depth contradict the images."""
-    notes = list(as_recorded_notes(source))
-    if not (source.poses_exact or source.camera_ideal):
-        with suppress(DatasetError, PoseError):  # a damaged pose is reported with its frame
-            found = find_contradiction(source)
-            notes += [] if found is None else [str(found)]
-    return tuple(notes)
+def contradictions(source: Source) -> tuple[str, ...]:
+    """Return how poses or depth contradict the images; none for damaged poses, which are reported with their frames."""
+    if source.poses_exact or source.camera_ideal:
+        return ()
+    with suppress(DatasetError, PoseError):
+        found = find_contradiction(source)
+        return () if found is None else (str(found),)
+    return ()
 
 
 def _contradiction(source: Source, force: bool) -> Contradiction | None:

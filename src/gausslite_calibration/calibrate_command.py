@@ -10,9 +10,10 @@ from gausslite.cli.source_options import open_recorded
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import to_toml
 from gausslite.config.values import read_correction, read_up_axis
+from gausslite.datasets.calibration import Calibration, Evidence, StatedValues
 from gausslite.mission.results import CALIBRATION_FILE, as_text, prepare_file
 from gausslite.process import print_message
-from gausslite_calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
+from gausslite_calibration.calibrate import calibrate
 
 _STEPS = 3
 _KNOWN_HELP = "keep these values, and estimate what they leave out (default: the lens that the files state)"

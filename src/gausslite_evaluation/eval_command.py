@@ -24,6 +24,7 @@ from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
 from gausslite.config.program import Program
 from gausslite.config.values import NONE, read_correction, read_registration_or_auto
+from gausslite.datasets.calibration import StatedValues
 from gausslite.datasets.open import default_world_frame
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import DatasetError, PoseError
@@ -47,7 +48,6 @@ from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import PoseMode, SourceSettings, TaskSettings
 from gausslite.process import print_message
 from gausslite.render.cpu import MAX_THREADS, choose_threads
-from gausslite_calibration.calibrate import StatedValues
 from gausslite_evaluation.compare import CorrectedScores, MapScores, ViewScore, average, score_view
 from gausslite_evaluation.lpips import LPIPS_HELP, NAME, Lpips, load_lpips
 from gausslite_evaluation.pictures import comparison_sheet

@@ -21,10 +21,10 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
 from gausslite.domain.relevance import Region
+from gausslite.pose_fit.exposure import fit_exposure
 from gausslite.pose_fit.photometric import fit_pose
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer, Rendering, gaussians_to_rows
-from gausslite_calibration.errors import fit_exposure
 
 MIN_ROI_PIXELS = 64
 """Views with fewer region pixels are not scored inside the region."""

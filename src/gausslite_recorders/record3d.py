@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.files import DepthUnits, RgbdImage, decode_image, require_pixel_count, resize_depth, resize_rgbd
-from gausslite.datasets.folder import FolderSource, estimate_up, is_lost, pose_from_quaternion
+from gausslite.datasets.folder import FolderReader, FolderSource, estimate_up, is_lost, pose_from_quaternion
 from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError
@@ -339,3 +339,7 @@ class Record3dSource(FolderSource):
         if self._metadata.depth_size is None:
             raise DatasetError(f"{self._metadata_path}: expected the size of the depth images, dw and dh, got none")
         return self._metadata.depth_size
+
+
+RECORD3D: Final = FolderReader(Record3dSource, "Record3D (metadata, rgbd/0.jpg)", f"an {_FILE_ENDING} file")
+"""The reader of the group `gausslite.sources`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,7 +13,7 @@ from numpy import ndarray
 
 from gausslite.datasets.camera_files import example_camera_file, read_folder_camera
 from gausslite.datasets.files import DepthUnits, first_readable_size, parse_numbers, read_rows
-from gausslite.datasets.folder import FIRST_VIEW_UP, NumberedFolderSource, is_lost, pose_from_quaternion
+from gausslite.datasets.folder import FIRST_VIEW_UP, FolderReader, NumberedFolderSource, is_lost, pose_from_quaternion
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.pose import UpAxis, unit_up_axis
 
@@ -93,3 +94,7 @@ def _read_pose_rows(folder: Path, required: bool) -> Mapping[int, tuple[str, Flo
             raise DatasetError(f"{location}: expected a frame's number, such as 12 for left000012.png, got {fields[0]}")
         rows[int(numbers[0])] = location, np.array(numbers[1:])
     return rows
+
+
+ZED: Final = FolderReader(ZedSource, "ZED (left000000.png, depth000000.png)")
+"""The reader of the group `gausslite.sources`."""

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 
-PREFIX = "bag:"
 _CHOICES = {"aligned": ("yes", "no"), "axes": ("optical", "body")}
 _QUANTITIES = {
     "depth_unit": ("depth_unit_m", re.compile(r"([0-9]{1,4}(?:\.[0-9]{1,9})?)(mm|m)")),
@@ -66,22 +65,28 @@ class BagAddress:
     options: BagOptions = BagOptions()
 
     @classmethod
-    def parse(cls, spec: str) -> BagAddress | None:
-        """Return the address of "bag:PATH?color=TOPIC&...", or of a path that is a bag; None for other sources.
+    def parse(cls, address: str) -> BagAddress:
+        """Return the address of "PATH?color=TOPIC&...".
 
-        Raises DatasetError for unknown options, and if there is no bag behind the prefix.
+        Raises DatasetError for unknown options, and if there is no bag.
         """
-        text = spec.removeprefix(PREFIX)
-        name, _, query = text.partition("?")
-        if Path(text).expanduser().exists():
-            # a name may have a question mark
-            name, query = text, ""
-        path = Path(name).expanduser()
-        if not (has_bag if spec.startswith(PREFIX) else is_bag)(path):
-            if spec.startswith(PREFIX):
-                raise DatasetError(f"{spec}: {_reason(path)}")
-            return None
-        return cls(path, _parse_options(spec, query))
+        path, query = _path_and_query(address)
+        if not (has_bag(path) or is_bag(path)):
+            raise DatasetError(f"{address}: {_reason(path)}")
+        return cls(path, _parse_options(address, query))
+
+
+def is_bag_address(address: str) -> bool:
+    """True for the path of a bag, with or without options; a folder with other files too is none."""
+    return is_bag(_path_and_query(address)[0])
+
+
+def _path_and_query(address: str) -> tuple[Path, str]:
+    name, _, query = address.partition("?")
+    if Path(address).expanduser().exists():
+        # a name may have a question mark
+        name, query = address, ""
+    return Path(name).expanduser(), query
 
 
 def _reason(path: Path) -> str:
@@ -91,7 +96,7 @@ def _reason(path: Path) -> str:
     return f"{expected}; got {'a file ' + path.name if path.exists() else 'nothing there'}"
 
 
-def _parse_options(spec: str, query: str) -> BagOptions:
+def _parse_options(address: str, query: str) -> BagOptions:
     with_form = (*_CHOICES, *(field for field, _ in _QUANTITIES.values()))
     names = [field.name for field in fields(BagOptions) if field.name not in with_form]
     chosen: dict[str, Any] = {}
@@ -105,7 +110,7 @@ def _parse_options(spec: str, query: str) -> BagOptions:
         else:
             choices = (f"{name}={'|'.join(values)}" for name, values in _CHOICES.items())
             expected = "&".join([*(f"{name}=..." for name in names), *choices, "depth_unit=Xmm", "tolerance=Xms"])
-            raise DatasetError(f"{spec}: {key}={value}: expected {expected}, each optional")
+            raise DatasetError(f"{address}: {key}={value}: expected {expected}, each optional")
     return BagOptions(**chosen)
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,6 +16,7 @@ from numpy import ndarray
 from gausslite.datasets.camera_files import FolderCamera, read_camera_file
 from gausslite.datasets.folder import FIRST_VIEW_UP, Origin, PoseTrack
 from gausslite.datasets.source import (
+    Source,
     excluded_frames_note,
     repeated_times_note,
     require_matches,
@@ -25,8 +26,7 @@ from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, UpAxis, unit_up_axis
-from gausslite.domain.relevance import Region
-from gausslite_ros.bag_file import BagAddress, BagFile, BagOptions, MessageKey, StampedMessage
+from gausslite_ros.bag_file import BagAddress, BagFile, BagOptions, MessageKey, StampedMessage, is_bag_address
 from gausslite_ros.cameras import (
     CameraPeriods,
     FrameConverter,
@@ -222,16 +222,7 @@ class _Match:
     T_world_camera: Float64[ndarray, "4 4"]
 
 
-def open_bag(spec: str, up_axis: UpAxis | None, require_poses: bool) -> BagSource | None:
-    """Return the sequence of "bag:PATH?color=TOPIC&...", or of a path that is a bag; None for other sources.
-
-    Raises DatasetError, PoseError, InvalidInputError.
-    """
-    address = BagAddress.parse(spec)
-    return None if address is None else BagSource(address, up_axis, require_poses)
-
-
-class BagSource:
+class BagSource(Source):
     """The frames of a bag's colour topic, each with the nearest depth image and the camera's pose at its stamp.
 
     Depth images that are not aligned to colour are registered to it. Colour images without depth or pose are excluded,
@@ -309,29 +300,19 @@ class BagSource:
         return True
 
     @property
-    def camera_ideal(self) -> bool:
-        """False: a recording may have any camera."""
-        return False
-
-    @property
-    def poses_exact(self) -> bool:
-        """False: poses of transforms and of odometry have errors."""
-        return False
-
-    @property
     def depth_unit_stated(self) -> bool:
         """True: ROS defines it, or the bag's address states it."""
         return True
 
     @property
+    def depth_unit_setting(self) -> str:
+        """An option of the address."""
+        return "depth_unit=Xmm in the address of the bag"
+
+    @property
     def world_frame(self) -> str:
         """Name of the bag, with an origin that is not zero."""
         return self._origin.frame(self.name)
-
-    @property
-    def regions_file(self) -> Path | None:
-        """None: a bag has no regions."""
-        return None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -363,10 +344,6 @@ class BagSource:
         """Return the interpolated pose of every colour image."""
         times_s = seconds(match.stamp_ns for match in self._matches)
         return Trajectory(times_s, np.array([match.T_world_camera for match in self._matches]))
-
-    def regions(self) -> Mapping[str, Region]:
-        """Return no regions."""
-        return {}
 
     def _read_cameras(self, tree: TransformTree, first_ns: int) -> RgbdCamera:
         colour = self._read_colour_camera()
@@ -446,3 +423,21 @@ class BagSource:
             if lag_s <= self._options.tolerance_s and T is not None:
                 matches.append(_Match(number, colour.stamp_ns, colour.key, depths[nearest].key, T))
         return matches
+
+
+class BagReader:
+    """The SourceReader of bags."""
+
+    layout, address = "", "a ROS bag"
+
+    def recognises(self, address: str) -> bool:
+        """True for the path of a bag, with or without options."""
+        return is_bag_address(address)
+
+    def open(self, address: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
+        """Return the sequence of "PATH?color=TOPIC&...". Raises DatasetError, PoseError, InvalidInputError."""
+        return BagSource(BagAddress.parse(address), up_axis, require_poses)
+
+
+BAGS: Final = BagReader()
+"""The reader of the group `gausslite.sources`."""

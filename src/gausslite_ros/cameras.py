@@ -14,10 +14,10 @@ from numpy import ndarray
 from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.corrected import undistort_colour, undistort_depth
 from gausslite.datasets.files import RgbdImage, resize_rgbd
+from gausslite.datasets.registered import register_depth
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite_calibration.registered_source import register_depth
 from gausslite_ros.messages import (
     CompressedImageMessage,
     decode_colour,

@@ -1,4 +1,4 @@
 """Simulated homes: textured rooms with named objects, a noisy RGB-D camera and exact poses.
 
-`gausslite_sim.source.open_simulated` opens a home as a Source; `gausslite` finds it for sources named sim:...
+`gausslite_sim.source.HomeReader` opens a home as a Source; `gausslite` finds it for addresses such as sim:home.
 """

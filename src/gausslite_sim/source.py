@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from pathlib import Path
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.source import Source, require_position
-from gausslite.domain.camera import Camera, Lens
+from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_size
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
@@ -61,8 +61,8 @@ def _build_home(home: int, seed: int, changes: tuple[tuple[str, tuple[float, flo
     return _BuiltHome(plan, scene, regions)
 
 
-class SimulatedHome:
-    """A trajectory through a home, with z up. Frames are deterministic on every machine.
+class SimulatedHome(Source):
+    """A trajectory through a home, with z up. Frames are deterministic on every machine. No file states its lens.
 
     Frame numbers run from 0 to frames - 1, with timestamps at 30 Hz. The first request for a frame or region builds
     the home, which takes seconds. Raises DatasetError without the extra `sim`.
@@ -85,11 +85,6 @@ class SimulatedHome:
     def camera(self) -> Camera:
         """A horizontal field of view of 61 degrees."""
         return self._camera
-
-    @property
-    def lens(self) -> Lens | None:
-        """None, also if the settings have a lens: a recording without a camera file does not state its lens."""
-        return None
 
     @property
     def up_axis(self) -> UpAxis:
@@ -121,16 +116,6 @@ class SimulatedHome:
     def world_frame(self) -> str:
         """Home and seed: all trajectories through one home share its frame."""
         return f"{self._settings.home_name.replace(':', '-')}-seed-{self._settings.seed}"
-
-    @property
-    def regions_file(self) -> Path | None:
-        """None: regions are computed from the scene."""
-        return None
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Empty: every frame is used."""
-        return ()
 
     def __len__(self) -> int:
         return self._settings.frames
@@ -171,6 +156,10 @@ class SimulatedHome:
     def regions(self) -> Mapping[str, Region]:
         """Return the region of every object by name: table, chair_1, mug, ...; without walls, floors and ceilings."""
         return dict(self._home.regions)
+
+    def with_true_poses(self) -> Source:
+        """Return the sequence without the drift of its odometry."""
+        return SimulatedHome(replace(self._settings, drift_percent=0.0), self._up_axis)
 
     @cached_property
     def _home(self) -> _BuiltHome:
@@ -229,11 +218,24 @@ class SimulatedHome:
         return replace(view, rgb=view.rgb * camera_gain(i / len(self), amplitude, self._settings.trajectory))
 
 
-def open_simulated(spec: str, up_axis: UpAxis | None = None) -> Source:
-    """Return the source of a spec without "sim:": "home", "home-3" or "home-3?seed=0&...". Raises DatasetError."""
-    world, _, query = spec.partition("?")
-    name = re.fullmatch(r"home(?:-([1-9]))?", world)
-    home = int(name.group(1) or 0) if name else HOME_COUNT + 1
-    if home > HOME_COUNT:
-        raise DatasetError(f"sim:{world}: expected sim:home, or one of sim:home-1 to sim:home-{HOME_COUNT}")
-    return SimulatedHome(HomeSettings.parse(query, home), up_axis)
+class HomeReader:
+    """The SourceReader of simulated homes."""
+
+    layout, address = "", "sim:home"
+
+    def recognises(self, _address: str) -> bool:
+        """False: a home has no files."""
+        return False
+
+    def open(self, address: str, up_axis: UpAxis | None = None, _require_poses: bool = True) -> Source:
+        """Return the source of "home", "home-3" or "home-3?seed=0&...". Raises DatasetError."""
+        world, _, query = address.partition("?")
+        name = re.fullmatch(r"home(?:-([1-9]))?", world)
+        home = int(name.group(1) or 0) if name else HOME_COUNT + 1
+        if home > HOME_COUNT:
+            raise DatasetError(f"sim:{world}: expected sim:home, or one of sim:home-1 to sim:home-{HOME_COUNT}")
+        return SimulatedHome(HomeSettings.parse(query, home), up_axis)
+
+
+HOMES: Final = HomeReader()
+"""The reader of the group `gausslite.sources`."""

@@ -14,10 +14,11 @@ from gausslite.cli.map_command import configure
 from gausslite.cli.map_inputs import MapInputs
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.program import parse_options
+from gausslite.datasets.calibration import StatedValues
 from gausslite.datasets.open import open_source
 from gausslite.domain.recording import CameraCorrection
 from gausslite.process import print_message
-from gausslite_calibration.calibrate import StatedValues, calibrate
+from gausslite_calibration.calibrate import calibrate
 
 HOME = "sim:home-1?frames=24&size=120x90&noise=0&exposure=0"
 CLIP_FRAMES = 8

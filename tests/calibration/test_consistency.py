@@ -10,6 +10,7 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.datasets.calibration import StatedValues, as_recorded_notes
 from gausslite.datasets.folder import pose_from_quaternion, quat_xyzw
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source, WrappedSource
@@ -18,7 +19,7 @@ from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, transform_of
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
-from gausslite_calibration.calibrate import StatedValues, calibrate, recording_notes
+from gausslite_calibration.calibrate import calibrate, contradictions
 from gausslite_calibration.consistency import find_contradiction
 
 Poses = Float64[ndarray, "n 4 4"]
@@ -283,7 +284,8 @@ class Distorted(Recording):
 def test_a_recording_used_as_it_is_has_notes_on_its_depth_lens_and_poses(home: Source) -> None:
     recording = Distorted(home, list(range(14)))
     recording.poses = np.linalg.inv(recording.poses)
-    depth, lens, poses = recording_notes(recording)
+    depth, lens = as_recorded_notes(recording)
+    [poses] = contradictions(recording)
     assert "does not state whether depth is registered" in depth
     assert "the lens radtan:0.0001,0,0,0, which is not corrected" in lens
     assert "world-to-camera poses would agree" in poses

@@ -10,26 +10,25 @@ import pytest
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
-from gausslite.datasets.source import Source
+from gausslite.datasets.source import Source, WrappedSource
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory
-from gausslite.domain.relevance import Region
-from gausslite_calibration.errors import estimate_pose_exposure_prior
+from gausslite_calibration.pose_errors import estimate_pose_exposure_prior
 
 FRAMES = 40
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
 
-class Recording:
+class Recording(WrappedSource):
     """A trajectory through a simulated home with pose errors and automatic exposure."""
 
+    name = "recording"
+    camera_ideal = poses_exact = depth_unit_stated = False
+
     def __init__(self, home: Source, translation_m: float, rotation_deg: float, gain: float = 0.0) -> None:
+        super().__init__(home)
         self._frames = [home.frame(i) for i in range(FRAMES)]
-        self.name, self.camera, self.up_axis = "recording", home.camera, home.up_axis
-        self.depth_registered, self.notes = True, ()
-        self.camera_ideal = self.poses_exact = self.depth_unit_stated = False
-        self.lens, self.world_frame, self.regions_file = None, "recording", None
         self.damaged: set[int] = set()
         rng = np.random.default_rng(0)
         self._T_true_recorded = [np.eye(4) for _ in range(FRAMES)]
@@ -55,9 +54,6 @@ class Recording:
 
     def trajectory(self) -> Trajectory:
         return Trajectory(np.arange(FRAMES) / 30, np.array([self.frame(i).T_world_camera for i in range(FRAMES)]))
-
-    def regions(self) -> dict[str, Region]:
-        return {}
 
 
 @pytest.fixture(scope="module")

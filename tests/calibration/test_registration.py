@@ -11,14 +11,14 @@ from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
+from gausslite.datasets.registered import register_depth
+from gausslite.datasets.source import WrappedSource
 from gausslite.domain.camera import Camera, FileIntrinsics
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import Trajectory, inverse
+from gausslite.domain.pose import inverse
 from gausslite.domain.recording import DepthRegistration
-from gausslite.domain.relevance import Region
 from gausslite_calibration.depth_registration import RegistrationEstimate, estimate_from_frames, find_registration
-from gausslite_calibration.registered_source import register_depth
 
 DEPTH_CAMERA = Camera(300.0, 300.0, 162.0, 118.5, 320, 240)
 
@@ -67,37 +67,21 @@ def test_an_estimate_is_reliable_only_with_a_clearly_higher_score() -> None:
     assert not RegistrationEstimate(camera, score=1.27, unregistered_score=0.76, edge_points=4_000).is_reliable
 
 
-class EnlargedSource:
+class EnlargedSource(WrappedSource):
     """Another source, enlarged four times in both directions."""
 
-    def __init__(self, small: UnregisteredSource) -> None:
-        self._small = small
-        k = small.camera
-        self.camera = k.resized(4 * k.width_px, 4 * k.height_px)
-        self.name, self.up_axis, self.depth_registered = "enlarged", small.up_axis, False
-        self.notes = ()
-        self.camera_ideal = self.poses_exact = self.depth_unit_stated = False
-        self.lens, self.world_frame, self.regions_file = None, self.name, None
-
-    def __len__(self) -> int:
-        return len(self._small)
+    @property
+    def camera(self) -> Camera:
+        k = self._source.camera
+        return k.resized(4 * k.width_px, 4 * k.height_px)
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
-        frame = self._small.frame(i)
+        frame = self._source.frame(i)
         big = RgbdImage(
             np.repeat(np.repeat(frame.rgb, 4, 0), 4, 1), np.repeat(np.repeat(frame.depth_m, 4, 0), 4, 1), self.camera
         )
         image = resize_rgbd(big, size)
         return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
-
-    def indices(self) -> list[int]:
-        return self._small.indices()
-
-    def trajectory(self) -> Trajectory:
-        return self._small.trajectory()
-
-    def regions(self) -> dict[str, Region]:
-        return {}
 
 
 def test_the_camera_of_large_images_is_estimated() -> None:
@@ -113,36 +97,22 @@ def test_the_camera_of_large_images_is_estimated() -> None:
     assert found.intrinsics.cy == pytest.approx(large.cy_px - 0.5, abs=4.0)
 
 
-class UnregisteredSource:
+class UnregisteredSource(WrappedSource):
     """The simulated home with a displaced depth camera, as in a recording without registration."""
 
-    def __init__(self, truth: DepthRegistration) -> None:
-        self._home = open_source("sim:home?seed=0&trajectory=0&frames=6&size=320x240&noise=0")
-        self._T_colour_depth = truth.extrinsics()
-        self.name, self.camera, self.up_axis = "unregistered", DEPTH_CAMERA, self._home.up_axis
-        self.depth_registered = False
-        self.notes = ()
-        self.camera_ideal = self.poses_exact = self.depth_unit_stated = False
-        self.lens, self.world_frame, self.regions_file = None, self.name, None
-        self.damaged: int | None = None
+    camera = DEPTH_CAMERA
+    depth_registered = camera_ideal = poses_exact = depth_unit_stated = False
 
-    def __len__(self) -> int:
-        return len(self._home)
+    def __init__(self, truth: DepthRegistration) -> None:
+        super().__init__(open_source("sim:home?seed=0&trajectory=0&frames=6&size=320x240&noise=0"))
+        self._T_colour_depth = truth.extrinsics()
+        self.damaged: int | None = None
 
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         assert size is None
         if i == self.damaged:
             raise DatasetError("unregistered: expected a whole image file, got one cut short")
-        return unregister(self._home.frame(i), self._T_colour_depth)
-
-    def indices(self) -> list[int]:
-        return list(range(len(self)))
-
-    def trajectory(self) -> Trajectory:
-        return self._home.trajectory()
-
-    def regions(self) -> dict[str, Region]:
-        return {}
+        return unregister(self._source.frame(i), self._T_colour_depth)
 
 
 def test_unregistered_depth_gets_the_estimated_registration() -> None:

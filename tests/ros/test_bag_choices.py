@@ -34,8 +34,9 @@ from small_bag import (
     time_of,
     write_small_bag,
 )
+from tiny_sequences import write_tum
 
-from gausslite.cli.source_options import depth_unit_advice
+from gausslite.datasets.open import open_source
 from gausslite.domain.errors import DatasetError
 from gausslite_ros.bag_file import BagAddress
 from gausslite_ros.bag_source import BagSource
@@ -168,9 +169,9 @@ def test_the_unit_of_depth_may_be_stated(tmp_path: Path, encoding: str, per_metr
 
 
 def test_the_advice_on_the_unit_of_a_bag_is_one_that_bags_read(tmp_path: Path) -> None:
-    bag = write_small_bag(tmp_path / "b.mcap")
-    assert "depth_unit=Xmm in the address of the bag" in depth_unit_advice(f"bag:{bag}")
-    assert "cam_params.json" in depth_unit_advice(str(tmp_path / "folder"))
+    bag, folder = open_source(str(write_small_bag(tmp_path / "b.mcap"))), open_source(str(write_tum(tmp_path / "fr1")))
+    assert "depth_unit=Xmm in the address of the bag" in bag.depth_unit_setting
+    assert "cam_params.json" in folder.depth_unit_setting
 
 
 def test_a_camera_file_states_intrinsics_lens_and_unit_as_in_a_folder(tmp_path: Path) -> None:
@@ -178,8 +179,7 @@ def test_a_camera_file_states_intrinsics_lens_and_unit_as_in_a_folder(tmp_path: 
     camera = {"w": SIZE[0], "h": SIZE[1], "fx": 25.0, "fy": 25.0, "cx": 15.0, "cy": 12.0, "scale": 5000}
     lens = {"distortion_model": "plumb_bob", "distortion": [0.1, 0.0, 0.0, 0.0], "depth_registered": True}
     (tmp_path / "camera.json").write_text(json.dumps({"camera": camera | lens}))
-    address = BagAddress.parse(f"bag:{bag}?camera_file={tmp_path / 'camera.json'}")
-    assert address is not None
+    address = BagAddress.parse(f"{bag}?camera_file={tmp_path / 'camera.json'}")
     source = BagSource(address)
     assert (source.camera.fx_px, source.camera.cx_px) == (25.0, 15.5)
     assert source.lens is not None
@@ -306,8 +306,7 @@ def test_tf_far_from_the_origin_is_mapped_from_a_stated_origin(tmp_path: Path) -
     def far(bag: Writer) -> None:
         bag.write("/tf_static", TF, START_NS, link(START_NS, "utm", "odom", 5_429_380.0))
 
-    address = BagAddress.parse(f"bag:{write_small_bag(tmp_path / 'b.mcap', extra=far)}?frame=utm")
-    assert address is not None
+    address = BagAddress.parse(f"{write_small_bag(tmp_path / 'b.mcap', extra=far)}?frame=utm")
     source = BagSource(address)
     assert source.world_frame == "b from 5430000 0 0"
     np.testing.assert_allclose(source.frame(2).T_world_camera[:3, 3], (-620 + 0.02, 0, 0), atol=1e-8)
@@ -361,7 +360,6 @@ def change_camera(at: int, *intrinsics: float) -> Callable[[Writer], None]:
 def test_images_after_the_camera_has_changed_are_left_out_with_a_message(tmp_path: Path, name: str) -> None:
     path = write_small_bag(tmp_path / name, extra=change_camera(5, 45.0, 45.0, 15.5, 11.5))
     address = BagAddress.parse(str(path))
-    assert address is not None
     source = BagSource(address)
     require_small_bag(frames_of(path), count=5)
     (note,) = source.notes

@@ -113,7 +113,6 @@ def test_a_file_that_was_cut_gives_what_is_whole_and_says_so(tmp_path: Path, in_
     path = tmp_path / "b.mcap"
     path.write_bytes(data[: len(data) * 7 // 10] + bytes(0 if in_chunk else zeros))
     address = BagAddress.parse(str(path))
-    assert address is not None
     source = BagSource(address)
     assert any("b.mcap was cut short after" in note for note in source.notes)
     assert 3 <= len(source) < FRAMES
@@ -266,7 +265,6 @@ def test_a_missing_part_is_named(tmp_path: Path) -> None:
 def test_topics_of_all_parts_are_listed(tmp_path: Path) -> None:
     split(write_small_bag(tmp_path / "a.bag"), tmp_path / "run", ("run_0.bag", "run_1.bag"))
     address = BagAddress.parse(str(tmp_path / "run"))
-    assert address is not None
     assert f"color={COLOUR}" in BagSource(address).description
 
 

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 from robot_bag import load_write_bag
 
+from gausslite.datasets.open import open_source
 from gausslite.domain.frame import Frame
-from gausslite_ros.bag_file import BagAddress
-from gausslite_ros.bag_source import BagSource
 
 START_NS, FRAME_NS, FRAMES = 1_000_000_000_000, 33_333_333, 8
 SIZE = (32, 24)
@@ -93,9 +92,7 @@ def write_small_bag(
 
 def frames_of(address: str | Path) -> list[Frame]:
     """Return all frames of a bag's address."""
-    parsed = BagAddress.parse(str(address))
-    assert parsed is not None
-    source = BagSource(parsed)
+    source = open_source(str(address))
     return [source.frame(i) for i in range(len(source))]
 
 

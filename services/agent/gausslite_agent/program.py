@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import NONE
+from gausslite.datasets.calibration import as_recorded_notes, open_calibrator
 from gausslite.datasets.source import Source
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
@@ -23,7 +24,7 @@ from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
 from gausslite.process import Sibling, sibling
 from gausslite.wire.clients import FusionClient, ParserClient
-from gausslite.wire.process import run_service
+from gausslite.wire.run_service import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
@@ -35,7 +36,6 @@ from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_arguments
 from gausslite_agent.state import SavedMission
 from gausslite_agent.team_map import TeamMapFollower
-from gausslite_calibration.calibrate import recording_notes
 from gausslite_places.agent_prior import PriorFrames
 from gausslite_places.prior_map import SavedMap
 from gausslite_places.prior_run import PriorRun, require_other_folder
@@ -219,7 +219,9 @@ def _read_saved(settings: AgentSettings) -> SavedMission | None:
 
 def _report_source(settings: SourceSettings, source: Source) -> tuple[str, ...]:
     """Log what the recording leaves out or contradicts, and return it for the status."""
-    notes = recording_notes(source) if settings.require_poses else source.notes
+    notes = source.notes
+    if settings.require_poses:
+        notes = (*as_recorded_notes(source), *open_calibrator().contradictions(source))
     for note in notes:
         _log.warning("%s: %s", settings.spec, note)
     return notes

@@ -21,7 +21,7 @@ from gausslite.fusion.store_maintenance import StoreReport
 from gausslite.process import Sibling, import_extra, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
-from gausslite.wire.process import LogFormat, log_to_stderr, run_service
+from gausslite.wire.run_service import LogFormat, log_to_stderr, run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite_fusion_server.metrics import metrics_server
 from gausslite_fusion_server.refinement_worker import RefinementWorker

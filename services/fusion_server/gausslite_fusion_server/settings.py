@@ -20,7 +20,7 @@ from gausslite.fusion.refinement import RefineSettings
 from gausslite.process import print_message
 from gausslite.render.choose import BACKENDS
 from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port, require_callable
-from gausslite.wire.process import LogFormat
+from gausslite.wire.run_service import LogFormat
 from gausslite.wire.security import CallLimits, Tls, TlsFiles
 
 PROGRAM = "gausslite-fusion-server"

@@ -17,7 +17,7 @@ from gausslite.process import print_message
 from gausslite.v1 import parser_service_pb2, parser_service_pb2_grpc
 from gausslite.wire.channel import PARSER_ADDRESS
 from gausslite.wire.convert_task import graph_to_message
-from gausslite.wire.process import run_service
+from gausslite.wire.run_service import run_service
 from gausslite.wire.security import Tls, TlsFiles
 from gausslite.wire.server import Service, serve_until_stopped
 

@@ -277,7 +277,7 @@ class _Run:
             raise self._corrupt.first_error
         self._gaussians = self._mapper.gaussians()
         if len(self._gaussians) == 0 and result.processed > 0:
-            require_mappable_depth(options.source, result, self._mapper.keyframes())
+            require_mappable_depth(options.source, inputs.stream.source, result, self._mapper.keyframes())
         return result
 
     def write_results(self, result: MissionResult) -> None:
@@ -288,7 +288,7 @@ class _Run:
             *self._mapper.notes,
             *_unseen_notes(options, result),
             *_unreached_notes(self._inputs.schedule, result.last_index),
-            *depth_notes(options.source, self._mapper.keyframes()),
+            *depth_notes(self._inputs.stream.source, self._mapper.keyframes()),
         )
         objects: Sequence[ObjectLandmark] = self._mapper.objects
         if self._prior is not None:

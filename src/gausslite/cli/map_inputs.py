@@ -12,6 +12,7 @@ from gausslite.codec.json import graph_as_json
 from gausslite.config.option import build, option
 from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import AUTO, NONE
+from gausslite.datasets.calibration import StatedValues
 from gausslite.datasets.open import default_world_frame, open_source
 from gausslite.datasets.source import Source, frame_step
 from gausslite.domain.errors import DatasetError, GaussLiteError, InvalidInputError, PoseError
@@ -30,7 +31,6 @@ from gausslite.mission.settings import (
     default_policy,
 )
 from gausslite.process import print_message
-from gausslite_calibration.calibrate import StatedValues
 
 FRAMES_KEY = "frames"
 """Name of the text of --frames among the extra arrays of a saved run."""

@@ -23,6 +23,7 @@ from gausslite.config.values import (
     write_correction,
     write_prior,
 )
+from gausslite.datasets.calibration import Calibration, Evidence, StatedValues, open_calibrator
 from gausslite.datasets.folder import up_note
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source, usable_frames
@@ -33,8 +34,7 @@ from gausslite.domain.relevance import Region, TargetPoint
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.runner import MissionResult, region_file_note
 from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
-from gausslite.process import Sibling, print_message, sibling
-from gausslite_calibration.calibrate import Calibration, Evidence, StatedValues, calibrate
+from gausslite.process import print_message
 
 _MESSAGE_WIDTH, _VALUE_WIDTH = 150, 30
 """Characters of a message on an estimate, and of the value in it; `gausslite calibrate` prints longer ones."""
@@ -76,11 +76,9 @@ class RecordingOptions:
 
 
 def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True) -> Source:
-    """Open a sequence as recorded; report a bag's topics and all notes. Raises DatasetError, InvalidInputError."""
+    """Open a sequence as recorded; report what is read of it, and all notes. Raises DatasetError, InvalidInputError."""
     source = open_source(spec, up_axis, require_poses=require_poses)
-    if isinstance(source, sibling(Sibling.BAGS).BagSource):
-        print_message(f"{spec}: {source.description}")
-    for note in source.notes:
+    for note in filter(None, (source.description, *source.notes)):
         print_message(f"{spec}: {note}")
     if up_axis is None and require_poses and not source.poses_exact:
         # `frame` reports a damaged pose if it is used
@@ -90,11 +88,8 @@ def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True)
     return source
 
 
-def depth_unit_advice(spec: str) -> str:
-    """Return how to state the unit of a sequence's depth images."""
-    is_bag = sibling(Sibling.BAGS).BagAddress.parse(spec) is not None
-    way = "depth_unit=Xmm in the address of the bag" if is_bag else "`scale` in cam_params.json"
-    return f"check the depth unit, {way}"
+def _depth_unit_advice(source: Source) -> str:
+    return ", ".join(filter(None, ("check the depth unit", source.depth_unit_setting)))
 
 
 def stated_values(
@@ -112,20 +107,11 @@ def stated_values(
 
 
 def calibrate_with_messages(spec: str, source: Source, stated: StatedValues) -> Calibration:
-    """Calibrate an opened sequence as `calibrate` does; the start and each estimate's reason go to stderr."""
-    if not source.depth_registered and stated.registration is None and not stated.depth_as_recorded:
-        print_message(
-            f"{spec}: this layout does not state whether depth is registered to colour; the registration is estimated "
-            f'now; "depth_registered": true in cam_params.json states it, register-depth={NONE} uses depth as it is'
-        )
-    estimates = ["lens", "shutter"] if stated.correction is None and not source.camera_ideal else []
-    estimates += ["errors of the poses"] if stated.pose_prior is None and not source.poses_exact else []
-    if estimates:
-        print_message(
-            f"{spec}: {len(source)} frames; up to half a minute for estimates of {', '.join(estimates)} "
-            f"(`gausslite calibrate` prints all values)"
-        )
-    found = calibrate(source, stated, _report_estimate)
+    """Calibrate an opened sequence by the installed calibrator; the start and each estimate's reason go to stderr."""
+    calibrator = open_calibrator()
+    for note in calibrator.intentions(source, stated):
+        print_message(f"{spec}: {note}")
+    found = calibrator.calibrate(source, stated, _report_estimate)
     for note in found.notes:
         print_message(f"{spec}: {note}")
     return found
@@ -175,24 +161,24 @@ def report_region_file(spec: str, source: Source) -> None:
 _LEAST_DEPTH_M = 0.05
 
 
-def require_mappable_depth(source: str, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
+def require_mappable_depth(spec: str, source: Source, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
     """Raise DatasetError for frames that gave no Gaussian: without depth, or with depth too far away."""
     if result.totals.frames == 0:
         reasons = ", ".join(f"in {count} {reason}" for reason, count in result.totals.reasons.items())
-        raise DatasetError(f"{source}: expected frames with depth, got none in {result.processed}: {reasons}")
+        raise DatasetError(f"{spec}: expected frames with depth, got none in {result.processed}: {reasons}")
     if result.stopped_by is None:
         raise DatasetError(
-            f"{source}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
-            f"{_median_depth_m(keyframes):.3g} m; {depth_unit_advice(source)}"
+            f"{spec}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
+            f"{_median_depth_m(keyframes):.3g} m; {_depth_unit_advice(source)}"
         )
 
 
-def depth_notes(source: str, keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
+def depth_notes(source: Source, keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
     """Return a note if the median depth is nearer than any depth camera measures."""
     median_m = _median_depth_m(keyframes)
     if median_m >= _LEAST_DEPTH_M:
         return ()
-    return (f"the median depth is {median_m:.2g} m; {depth_unit_advice(source)}",)
+    return (f"the median depth is {median_m:.2g} m; {_depth_unit_advice(source)}",)
 
 
 def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from numpy import ndarray
 from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.files import DepthUnits, load_rgbd, parse_numbers, read_rows
 from gausslite.datasets.regions import REGIONS_FILE, balls_for_small_objects, load_voxel_regions
-from gausslite.datasets.source import excluded_frames_note, require_frames, require_position
+from gausslite.datasets.source import Source, excluded_frames_note, require_frames, require_position
 from gausslite.domain.camera import Camera, Lens
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import MAX_COORDINATE_M, Frame
@@ -169,7 +170,7 @@ class Origin:
 _RATE_HZ = 30
 
 
-class FolderSource:
+class FolderSource(Source):
     """Name, camera, upward direction and regions of a sequence in a folder."""
 
     _camera: Camera
@@ -230,19 +231,14 @@ class FolderSource:
         return self._layout_has_registered_depth if stated is None else stated
 
     @property
-    def camera_ideal(self) -> bool:
-        """False: a recording may have any camera."""
-        return False
-
-    @property
-    def poses_exact(self) -> bool:
-        """False: the files do not state how the poses were found."""
-        return False
-
-    @property
     def depth_unit_stated(self) -> bool:
         """True if a camera file states it."""
         return self._unit_stated
+
+    @property
+    def depth_unit_setting(self) -> str:
+        """A field of the camera file."""
+        return "`scale` in cam_params.json"
 
     @property
     def world_frame(self) -> str:
@@ -261,7 +257,7 @@ class FolderSource:
         return {} if path is None else balls_for_small_objects(load_voxel_regions(path))
 
 
-class NumberedFolderSource(FolderSource, ABC):
+class NumberedFolderSource(FolderSource):
     """Numbered image files at 30 Hz. Frames without a pose are excluded, or have the identity if none is required."""
 
     _colours: dict[int, Path]
@@ -339,6 +335,35 @@ class NumberedFolderSource(FolderSource, ABC):
             return not is_lost(T[:3, 3], T[:3, :3])
         except (DatasetError, PoseError):
             return False
+
+
+class FolderSourceClass(Protocol):
+    """A class of sequences in folders or files, which it recognises by the names of files."""
+
+    def __call__(self, path: Path, up_axis: UpAxis | None, require_poses: bool, /) -> Source:
+        """Return the sequence. Raises DatasetError, PoseError."""
+        ...
+
+    def recognises(self, path: Path, /) -> bool:
+        """True if the path has this layout."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FolderReader:
+    """A SourceReader for a class of sequences in folders or files."""
+
+    sources: FolderSourceClass
+    layout: str
+    address: str = ""
+
+    def recognises(self, address: str) -> bool:
+        """True if the path has this layout."""
+        return self.sources.recognises(Path(address).expanduser())
+
+    def open(self, address: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
+        """Return the sequence at the path. Raises DatasetError, PoseError."""
+        return self.sources(Path(address).expanduser(), up_axis, require_poses)
 
 
 _MEANING = "time tx ty tz qx qy qz qw"

@@ -1,32 +1,29 @@
-"""Open a sequence: a folder of a known layout, a Record3D file, a ROS bag, or a simulated home."""
+"""Open a sequence: a folder of a known layout, or what a package beside the core reads, such as a bag."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from gausslite.datasets.corrected import UndistortedColourSource
+from gausslite.datasets.folder import FolderReader
+from gausslite.datasets.registered import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
-from gausslite.datasets.source import Source
+from gausslite.datasets.source import Source, SourceReader
 from gausslite.datasets.tum import TumSource
 from gausslite.domain.checks import require_name
-from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError
+from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import DepthRegistration
-from gausslite.process import Sibling, sibling
-from gausslite_calibration.registered_source import RegisteredSource
-from gausslite_recorders.record3d import Record3dSource
-from gausslite_recorders.zed import ZedSource
+from gausslite.plugins import Group, installed, load, names
 
-_READERS = (TumSource, SevenScenesSource, ReplicaSource, ZedSource, Record3dSource)
-_LAYOUTS = (
-    "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt), 7-Scenes (frame-000000.color.png ...), "
-    "Replica (results/frame000000.jpg, traj.txt), ZED (left000000.png, depth000000.png) "
-    "or Record3D (metadata, rgbd/0.jpg)"
+_LAYOUTS: Final[tuple[SourceReader, ...]] = (
+    FolderReader(TumSource, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"),
+    FolderReader(SevenScenesSource, "7-Scenes (frame-000000.color.png ...)"),
+    FolderReader(ReplicaSource, "Replica (results/frame000000.jpg, traj.txt)"),
 )
-_SIMULATED = "sim:"
 _COMPRESSED = (".zip", ".gz", ".tgz", ".tar", ".bz2", ".xz", ".7z", ".zst", ".zstd", ".lz4")
 
 
@@ -36,70 +33,97 @@ def open_source(
     depth_registration: DepthRegistration | None = None,
     require_poses: bool = True,
 ) -> Source:
-    """Return the sequence in a folder, a Record3D file, a ROS bag or a simulated home ("sim:home").
+    """Return the sequence in a folder, or at an address of an installed reader, such as "sim:home".
 
-    A bag may state topics ("bag:run1.mcap?depth=/cam/depth"); a path that is a bag needs no prefix. A folder that
-    contains exactly one sequence also works.
+    "NAME:REST" with the name of a reader goes to this reader; a path that a reader recognises needs no name. A folder
+    that contains exactly one sequence also works.
     depth_registration: the colour camera to which depth is registered; None if the recording is registered. A lens that
     is stated for unregistered depth is the colour camera's alone; colour images are undistorted. require_poses: False
     also accepts frames and sequences without poses, for tracking; these frames get the identity. Raises DatasetError,
-    PoseError, InvalidInputError.
+    PoseError, InvalidInputError, MissingPluginError.
     """
-    source = _open(spec, up_axis, require_poses)
-    if source.lens is not None and not source.depth_registered:
-        source = UndistortedColourSource(source)
-    return source if depth_registration is None else RegisteredSource(source, depth_registration)
+    return _registered(_open(spec, up_axis, require_poses), depth_registration)
 
 
 def open_reference(spec: str, depth_registration: DepthRegistration | None = None) -> Source | None:
     """Return the sequence with its true poses, for scoring a trajectory; None if it has no poses.
 
-    The poses of a recording count as true. A simulated home's are exact, whatever its drift= is.
+    The poses of a recording count as true.
     """
     try:
-        return open_source(re.sub(r"[?&]drift=[^&]*$|drift=[^&]*&", "", spec), None, depth_registration)
+        return _registered(_open(spec, None, require_poses=True).with_true_poses(), depth_registration)
     except (DatasetError, PoseError):
         return None
 
 
+def _registered(source: Source, registration: DepthRegistration | None) -> Source:
+    if source.lens is not None and not source.depth_registered:
+        source = UndistortedColourSource(source)
+    return source if registration is None else RegisteredSource(source, registration)
+
+
 def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
-    if spec.startswith(_SIMULATED):
-        open_simulated: Callable[[str, UpAxis | None], Source] = sibling(Sibling.SIMULATOR).open_simulated
-        return open_simulated(spec.removeprefix(_SIMULATED), up_axis)
-    open_bag: Callable[[str, UpAxis | None, bool], Source | None] = sibling(Sibling.BAGS).open_bag
-    bag = open_bag(spec, up_axis, require_poses)
-    if bag is not None:
-        return bag
-    folder = Path(spec).expanduser()
-    if not folder.is_dir() and not _recognised(folder):
-        found = "nothing there"
-        if folder.is_file():
-            found = "a compressed file; unpack it first" if folder.suffix.lower() in _COMPRESSED else "a file"
-        raise DatasetError(
-            f"{spec}: expected a folder with a sequence, a ROS bag, an .r3d file, or sim:home; got {found}"
-        )
-    source = _open_folder(folder, up_axis, require_poses)
-    if source is not None:
-        return source
-    inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and _recognised(path)]
+    name, colon, address = spec.partition(":")
+    if colon and name in names(Group.SOURCES):
+        named: SourceReader = load(Group.SOURCES, name)
+        return named.open(address, up_axis, require_poses)
+    reader, path = _reader_of(spec), Path(spec).expanduser()
+    if reader is None and path.is_dir():
+        reader, spec = _only_one_inside(path)
+    elif reader is None:
+        raise _unknown_address(spec, path)
+    return reader.open(spec, up_axis, require_poses)
+
+
+def _readers() -> Iterator[SourceReader]:
+    """Yield those of the core first: the packages of others are imported only if they are asked."""
+    yield from _LAYOUTS
+    for _, reader in installed(Group.SOURCES):
+        yield reader
+
+
+def _reader_of(spec: str) -> SourceReader | None:
+    return next((reader for reader in _readers() if reader.recognises(spec)), None)
+
+
+def _only_one_inside(folder: Path) -> tuple[SourceReader, str]:
+    """Return the only sequence in a folder, and its reader. Raises DatasetError for none and for several."""
+    folders = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+    inside = [(reader, path) for path in folders if (reader := _reader_of(str(path))) is not None]
     if len(inside) == 1:
-        source = _open_folder(inside[0], up_axis, require_poses)
-        if source is not None:
-            return source
+        [(reader, path)] = inside
+        return reader, str(path)
     if inside:
-        names = ", ".join(path.name for path in inside)
-        raise DatasetError(f"{folder}: holds {len(inside)} sequences; expected one of them: {names}")
+        found = ", ".join(path.name for _, path in inside)
+        raise DatasetError(f"{folder}: holds {len(inside)} sequences; expected one of them: {found}")
     if not any(folder.iterdir()):
         raise DatasetError(f"{folder}: expected a sequence, got an empty folder")
-    raise DatasetError(f"{folder}: unknown layout; expected {_LAYOUTS}")
+    layouts = _alternatives([reader.layout for reader in _readers()])
+    raise DatasetError(f"{folder}: unknown layout; expected {layouts}{_absent_readers()}")
 
 
-def _recognised(folder: Path) -> bool:
-    return any(reader.recognises(folder) for reader in _READERS)
+def _unknown_address(spec: str, path: Path) -> DatasetError:
+    found = "nothing there"
+    if path.is_file():
+        found = "a compressed file; unpack it first" if path.suffix.lower() in _COMPRESSED else "a file"
+    expected = _alternatives(["a folder with a sequence", *(reader.address for reader in _readers())])
+    return DatasetError(f"{spec}: expected {expected}; got {found}{_absent_readers()}")
 
 
-def _open_folder(folder: Path, up_axis: UpAxis | None, require_poses: bool) -> Source | None:
-    return next((reader(folder, up_axis, require_poses) for reader in _READERS if reader.recognises(folder)), None)
+def _alternatives(texts: Sequence[str]) -> str:
+    *others, last = filter(None, texts)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _absent_readers() -> str:
+    """Return why readers that are registered cannot be used; empty if all can be."""
+    reasons = []
+    for name in names(Group.SOURCES):
+        try:
+            load(Group.SOURCES, name)
+        except MissingPluginError as error:
+            reasons.append(f"; {error}")
+    return "".join(reasons)
 
 
 def default_world_frame(source: Source) -> str:

@@ -1,8 +1,9 @@
-"""The protocol of every sequence of posed RGB-D frames, and the choice of its frames for training and test."""
+"""The protocols of a sequence of posed RGB-D frames and of its reader, and the choice of its frames."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -41,82 +42,126 @@ class HeldOutSplit:
 
 @runtime_checkable
 class Source(Protocol):
-    """A sequence with random access. Positions run from 0 to len - 1; `indices` returns the sequence's own numbers."""
+    """A sequence with random access. Positions run from 0 to len - 1; `indices` returns the sequence's own numbers.
+
+    A class of sources derives from it: what it does not state has the value of a recording that states nothing.
+    """
 
     @property
+    @abstractmethod
     def name(self) -> str:
         """Short name for reports."""
-        ...
 
     @property
+    @abstractmethod
     def camera(self) -> Camera:
         """Camera at the sequence's own resolution (pixel centres at +0.5)."""
-        ...
 
     @property
     def lens(self) -> Lens | None:
         """Distortion of the colour images that the sequence's files state; None if they state none."""
-        ...
+        return None
 
     @property
+    @abstractmethod
     def up_axis(self) -> UpAxis:
         """Unit vector of the world frame that points up."""
-        ...
 
     @property
+    @abstractmethod
     def depth_registered(self) -> bool:
         """True if each depth pixel belongs to the colour pixel at the same place."""
-        ...
 
     @property
     def camera_ideal(self) -> bool:
         """True if images have no lens distortion, rolling shutter and motion blur; no estimate is made then."""
-        ...
+        return False
 
     @property
     def poses_exact(self) -> bool:
         """True if the poses have no error; no estimate is made then, and poses are not refined."""
-        ...
+        return False
 
     @property
     def depth_unit_stated(self) -> bool:
         """True if the files or the format state the unit of depth; False if it is the layout's usual one."""
-        ...
+        return False
+
+    @property
+    def depth_unit_setting(self) -> str:
+        """Where a user states another unit of depth, such as "`scale` in cam_params.json"; empty for nowhere."""
+        return ""
 
     @property
     def world_frame(self) -> str:
         """Name of the poses' frame, the same for sequences that share it."""
-        ...
+        return self.name
 
     @property
     def regions_file(self) -> Path | None:
         """File of the ground-truth regions; None if there are none, or if the sequence computes them."""
-        ...
+        return None
+
+    @property
+    def description(self) -> str:
+        """What is read, for the operator, where the address leaves it open, as the topics of a bag; else empty."""
+        return ""
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Messages for the operator: excluded frames and why, a camera file of another folder, a moved origin."""
-        ...
+        return ()
 
+    @abstractmethod
     def __len__(self) -> int: ...
 
+    @abstractmethod
     def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
         """Return the frame at position i, resized to (width, height): colour by area, depth by nearest pixel.
 
         Raises DatasetError or PoseError with the name of the file.
         """
-        ...
 
+    @abstractmethod
     def indices(self) -> Sequence[int]:
         """Return the frame number of each position, ascending."""
-        ...
 
+    @abstractmethod
     def trajectory(self) -> Trajectory:
         """Return the pose at every position, at the frames' capture times. Raises DatasetError, PoseError."""
-        ...
 
     def regions(self) -> Mapping[str, Region]:
         """Return ground-truth regions by object name; empty if the sequence has none."""
+        return {}
+
+    def with_true_poses(self) -> Source:
+        """Return the sequence with the poses that estimates are scored against: its own, unless it has better ones."""
+        return self
+
+
+class SourceReader(Protocol):
+    """Opens one kind of sequences. A package registers its readers in the group `gausslite.sources` of entry points.
+
+    "NAME:REST", with the name of the entry point, is opened as REST by this reader. An address without a name goes to
+    the first reader that recognises it.
+    """
+
+    @property
+    def layout(self) -> str:
+        """The folders that it opens, by names of their files, for messages; empty for none."""
+        ...
+
+    @property
+    def address(self) -> str:
+        """What it opens that is no folder, such as "a ROS bag", for messages; empty for none."""
+        ...
+
+    def recognises(self, address: str) -> bool:
+        """True if an address without a name is of this kind, by the names of files."""
+        ...
+
+    def open(self, address: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
+        """Return the sequence, as `open_source` does. Raises DatasetError, PoseError, InvalidInputError."""
         ...
 
 
@@ -261,7 +306,7 @@ def _is_whole(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) <= 20
 
 
-class WrappedSource:
+class WrappedSource(Source):
     """All of a Source except `frame`, as the wrapped source has it; subclasses override what they change."""
 
     def __init__(self, source: Source) -> None:
@@ -308,6 +353,11 @@ class WrappedSource:
         return self._source.depth_unit_stated
 
     @property
+    def depth_unit_setting(self) -> str:
+        """As the wrapped source has it."""
+        return self._source.depth_unit_setting
+
+    @property
     def world_frame(self) -> str:
         """World frame of the wrapped source."""
         return self._source.world_frame
@@ -316,6 +366,11 @@ class WrappedSource:
     def regions_file(self) -> Path | None:
         """Region file of the wrapped source."""
         return self._source.regions_file
+
+    @property
+    def description(self) -> str:
+        """As the wrapped source has it."""
+        return self._source.description
 
     @property
     def notes(self) -> tuple[str, ...]:

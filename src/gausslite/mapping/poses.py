@@ -19,9 +19,9 @@ from gausslite.domain.pose import CorrectionTrack, PoseCorrection, Trajectory, i
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.mapping.keyframes import Keyframe, WindowView
+from gausslite.pose_fit.exposure import fit_exposure
 from gausslite.pose_fit.photometric import fit_pose
 from gausslite.render.rasterizer import Rendering
-from gausslite_calibration.errors import fit_exposure
 
 _MAX_PIXELS = 4_000
 """Pixels that a fit compares: an evaluation gains from more, a map that still grows does not."""

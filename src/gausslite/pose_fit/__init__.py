@@ -1,1 +1,1 @@
-"""Fits of camera poses to images, by brightness and by features."""
+"""Fits of camera poses and of exposure to images, by brightness and by features."""

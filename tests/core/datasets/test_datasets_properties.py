@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -11,27 +11,22 @@ from hypothesis import strategies as st
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.folder import estimate_up, nearest_rigid, pose_from_quaternion, slerp
-from gausslite.datasets.source import select_frames
+from gausslite.datasets.source import Source, select_frames
 from gausslite.domain.camera import Camera, back_project, project
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, require_rigid, rotation_angle_deg
-from gausslite.domain.relevance import Region
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-class Numbered:
+class Numbered(Source):
     """A source that has frame numbers only."""
 
     name = "numbered"
     camera = Camera(1.0, 1.0, 1.0, 1.0, 2, 2)
     up_axis = (0.0, 0.0, 1.0)
     depth_registered = True
-    camera_ideal = poses_exact = depth_unit_stated = True
-    world_frame, regions_file = "numbered", None
-    notes = ()
-    lens = None
 
     def __init__(self, numbers: list[int]) -> None:
         self._numbers = numbers
@@ -47,9 +42,6 @@ class Numbered:
 
     def trajectory(self) -> Trajectory:
         raise DatasetError("numbered: expected no pose to be read")
-
-    def regions(self) -> Mapping[str, Region]:
-        return {}
 
 
 def random_quat(rng: np.random.Generator) -> np.ndarray:

@@ -13,10 +13,10 @@ from tiny_sequences import write_seven_scenes, write_tum
 from gausslite.cli.main import main
 from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.config.values import AUTO, NONE
+from gausslite.datasets.calibration import Calibration
 from gausslite.datasets.open import open_source
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
-from gausslite_calibration.calibrate import Calibration
 
 EXACT = PoseExposurePrior()
 CAMERA = DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0")

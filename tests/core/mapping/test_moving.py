@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
@@ -15,7 +16,6 @@ from gausslite.mission.build import build_mapper, region_estimator
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite_sim.home_settings import HomeSettings
-from gausslite_sim.source import open_simulated
 
 CAMERA = Camera(160.0, 160.0, 80.0, 60.0, 160, 120)
 WALL_M, BOX_M = 2.0, 1.2
@@ -78,7 +78,7 @@ def test_a_keyframe_loses_what_has_left_its_place_later() -> None:
 
 
 def test_a_simulated_home_has_a_box_that_moves() -> None:
-    empty, visited = (open_simulated(f"home?frames=20&size=64x48&noise=0&movers={count}") for count in (0, 1))
+    empty, visited = (open_source(f"sim:home?frames=20&size=64x48&noise=0&movers={count}") for count in (0, 1))
     changed = [empty.frame(i).depth_m != visited.frame(i).depth_m for i in (5, 10, 15)]
     assert sum(map(np.count_nonzero, changed)) > 100
     assert any((a != b).any() for a, b in pairwise(changed))

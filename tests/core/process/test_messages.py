@@ -8,7 +8,7 @@ import pytest
 
 from gausslite.cli.main import main
 from gausslite.process import printable
-from gausslite.wire.process import _OneLine
+from gausslite.wire.run_service import _OneLine
 
 
 def test_names_with_newlines_and_escape_sequences_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:

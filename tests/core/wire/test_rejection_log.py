@@ -62,7 +62,7 @@ def test_a_server_logs_the_calls_that_it_refuses(caplog: pytest.LogCaptureFixtur
 
 def test_logs_as_json_are_one_object_a_line() -> None:
     program = (
-        "import logging; from gausslite.wire.process import LogFormat, log_to_stderr; "
+        "import logging; from gausslite.wire.run_service import LogFormat, log_to_stderr; "
         "log_to_stderr('prog', LogFormat.TEXT); log_to_stderr('prog', LogFormat.JSON); "
         "logging.getLogger('gausslite.x').warning('agent %s: \\n%s', 'ant', '\\x1b[31m')\n"
         "try:\n    1 / 0\nexcept ZeroDivisionError:\n    logging.exception('failed')"

@@ -21,6 +21,7 @@ from tiny_yolo import write_tiny_yolo
 
 from gausslite.codec.ply import read_ply
 from gausslite.codec.run_files import read_map_history
+from gausslite.datasets.source import Source
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError, InvalidInputError, StorageError, TaskError
 from gausslite.domain.frame import Frame
@@ -35,7 +36,7 @@ from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.v1.agent_service_pb2 import FRAME_OUTCOME_MAPPED, AssignTaskRequest
 from gausslite.v1.agent_service_pb2_grpc import AgentServiceStub
 from gausslite.wire.clients import AgentClient, FusionClient
-from gausslite.wire.process import run_service
+from gausslite.wire.run_service import run_service
 from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
@@ -51,7 +52,7 @@ MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
 
 
 @dataclass
-class Wall:
+class Wall(Source):
     """A sequence of frames of one wall."""
 
     count: int = 8
@@ -60,11 +61,6 @@ class Wall:
     depth_registered: bool = True
     camera_ideal: bool = True
     poses_exact: bool = True
-    depth_unit_stated: bool = True
-    world_frame: str = "wall"
-    regions_file: None = None
-    notes: tuple[str, ...] = ()
-    lens: None = None
     camera: Camera = CAMERA
     broken_at: int | None = None
     read: list[int] = field(default_factory=list)

@@ -18,10 +18,10 @@ from gausslite.mapping.keyframes import Keyframe, window_view
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.poses import RefinementSettings, ViewRefiner
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
+from gausslite.pose_fit.exposure import AffineExposure, fit_exposure
 from gausslite.pose_fit.photometric import fit_pose
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import Rendering
-from gausslite_calibration.errors import AffineExposure, fit_exposure
 from gausslite_evaluation.metrics import psnr
 from gausslite_evaluation.views import MapViewer, render_fitted
 

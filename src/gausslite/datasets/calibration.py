@@ -1,0 +1,147 @@
+"""The protocol of what estimates the values that a recording does not state, and the use of a recording without one."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from gausslite.datasets.corrected import CorrectedSource
+from gausslite.datasets.registered import RegisteredSource
+from gausslite.datasets.source import Source
+from gausslite.domain.camera import Lens
+from gausslite.domain.errors import MissingPluginError
+from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
+from gausslite.plugins import Group, load
+
+
+@dataclass(frozen=True, slots=True)
+class StatedValues:
+    """What the user states of a recording; None leaves a value to the source's guarantee or to an estimate.
+
+    depth_as_recorded: depth is used without registration. lens: kept where the camera is estimated, in place of the
+    lens that the source's files state. force: poses and depth are used although they contradict the images. checked:
+    they are not compared with the images, because that was done before, or because given poses are not used.
+    """
+
+    registration: DepthRegistration | None = None
+    depth_as_recorded: bool = False
+    correction: CameraCorrection | None = None
+    lens: Lens | None = None
+    pose_prior: PoseExposurePrior | None = None
+    force: bool = False
+    checked: bool = False
+
+    def leaves_registration_open(self, source: Source) -> bool:
+        """True if neither the user nor the source states whether depth is registered to colour."""
+        return not source.depth_registered and self.registration is None and not self.depth_as_recorded
+
+    def open_values(self, source: Source) -> tuple[str, ...]:
+        """Return which errors of camera and poses neither the user nor the source states, for messages."""
+        camera = ("lens", "shutter") if self.correction is None and not source.camera_ideal else ()
+        return (*camera, *(("errors of the poses",) if self.pose_prior is None and not source.poses_exact else ()))
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Why a value that the user did not state was chosen.
+
+    option: name of the option that states it. value: as the option reads it. guaranteed: by the source; False for an
+    estimate.
+    """
+
+    option: str
+    value: str
+    reasons: tuple[str, ...]
+    guaranteed: bool = False
+
+    def __str__(self) -> str:
+        """Return option, value and reasons as one line."""
+        return f"{self.option} {shlex.quote(self.value)}: {'; '.join(self.reasons)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A source with registered depth and corrected images, what was applied to it, and the errors of its poses.
+
+    registration: None if depth is used as recorded. correction: the identity if images are. evidence: of each value
+    that the user did not state. notes: on poses or depth that contradict the images, and on values that nobody states.
+    """
+
+    source: Source
+    registration: DepthRegistration | None
+    correction: CameraCorrection
+    pose_prior: PoseExposurePrior
+    evidence: tuple[Evidence, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+class Calibrator(Protocol):
+    """Decides what neither the user nor the source states; the default of the group `gausslite.calibrators`."""
+
+    def calibrate(
+        self, source: Source, stated: StatedValues, report: Callable[[Evidence], None] | None = None, /
+    ) -> Calibration:
+        """Return the source as it should be mapped, and its pose prior.
+
+        report: gets the evidence of each value as soon as it is known. Raises DatasetError, also for poses or depth
+        that contradict the images, PoseError, InvalidInputError.
+        """
+        ...
+
+    def intentions(self, source: Source, stated: StatedValues, /) -> tuple[str, ...]:
+        """Return what `calibrate` will estimate and how long it takes, as messages for the operator."""
+        ...
+
+    def contradictions(self, source: Source, /) -> tuple[str, ...]:
+        """Return how poses or depth contradict the images, as messages for the operator."""
+        ...
+
+
+class StatedOnly:
+    """The Calibrator without a plug-in: applies what is stated, and returns a note on what nobody states."""
+
+    def __init__(self, reason: str) -> None:
+        self._reason = reason
+
+    def calibrate(
+        self, source: Source, stated: StatedValues, _report: Callable[[Evidence], None] | None = None
+    ) -> Calibration:
+        """Return the source with what the user and its files state. Raises InvalidInputError."""
+        registration = ("registration of depth",) if stated.leaves_registration_open(source) else ()
+        unknown = (*registration, *stated.open_values(source))
+        if stated.registration is not None:
+            source = RegisteredSource(source, stated.registration)
+        correction = stated.correction or CameraCorrection(stated.lens or source.lens)
+        if not correction.is_identity:
+            source = CorrectedSource(source, correction)
+        notes = (f"not estimated: {', '.join(unknown)}; {self._reason}",) if unknown else ()
+        return Calibration(source, stated.registration, correction, stated.pose_prior or PoseExposurePrior(), (), notes)
+
+    def intentions(self, _source: Source, _stated: StatedValues) -> tuple[str, ...]:
+        """Return none: nothing is estimated."""
+        return ()
+
+    def contradictions(self, _source: Source) -> tuple[str, ...]:
+        """Return none: nothing is compared."""
+        return ()
+
+
+def open_calibrator() -> Calibrator:
+    """Return the installed calibrator, else one that applies what is stated."""
+    try:
+        calibrator: Calibrator = load(Group.CALIBRATORS)
+    except MissingPluginError as error:
+        return StatedOnly(str(error))
+    return calibrator
+
+
+def as_recorded_notes(source: Source) -> tuple[str, ...]:
+    """Return the notes of a source that is mapped as it is, and what is not estimated or corrected then."""
+    depth = (
+        "this layout does not state whether depth is registered to colour, and it is used as recorded; "
+        "`gausslite calibrate` estimates register-depth"
+    )
+    lens = f"the files state the lens {source.lens}, which is not corrected; gl.open_calibrated corrects it"
+    return (*source.notes, *(() if source.depth_registered else (depth,)), *(() if source.lens is None else (lens,)))
