@@ -9,7 +9,7 @@ from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
+from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, mission_settings, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
     RecordingOptions,
@@ -178,9 +178,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _map(options: argparse.Namespace) -> int:
-    inputs = MapInputs.of(options)
     saved = None if options.resume is None else SavedRun.read(options.resume)
-    prior = open_prior_map(options.prior, {} if saved is None else saved.extra, inputs.mission)
+    prior = open_prior_map(options.prior, {} if saved is None else saved.extra, mission_settings(options))
+    inputs = MapInputs.of(options)
     if saved is not None:
         inputs = inputs.resumed(options, saved)
     if options.save_state is not None:
