@@ -56,13 +56,16 @@ def default_name(group: Group) -> str:
     return others[0] if others else DEFAULT
 
 
-def load(group: Group, name: str = DEFAULT) -> Any:
-    """Import a plug-in. Raises MissingPluginError if it is not registered, or its package is not installed."""
+def load(group: Group, name: str = DEFAULT, purpose: str = "") -> Any:
+    """Import a plug-in. Raises MissingPluginError if it is not registered, or its package is not installed.
+
+    purpose: what the error names in place of the plug-in, such as the option that needs it.
+    """
     entry = _registered(group).get(name)
     if entry is None:
         known = ", ".join(names(group)) or "none"
-        raise MissingPluginError(f"{name}: expected a plug-in of {group}; installed are: {known}")
-    return _import(entry)
+        raise MissingPluginError(f"{purpose or name}: expected a plug-in of {group}; installed are: {known}")
+    return _import(entry, purpose)
 
 
 def find(group: Group, name: str = DEFAULT) -> Any | None:
@@ -90,12 +93,12 @@ def _registered(group: Group) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in _all_entry_points().select(group=group)}
 
 
-def _import(entry: EntryPoint) -> Any:
+def _import(entry: EntryPoint, purpose: str) -> Any:
     try:
         return entry.load()
     except ModuleNotFoundError as error:
         package = entry.module.partition(".")[0]
         missing = (error.name or package).partition(".")[0]
         needs = f"the package {package}" if missing == package else f"the package {missing}, for {package}"
-        name = entry.group if entry.name == DEFAULT else entry.name
+        name = purpose or (entry.group if entry.name == DEFAULT else entry.name)
         raise MissingPluginError(f"{name}: needs {needs}, which is not installed") from error

@@ -15,7 +15,7 @@ from importlib import import_module
 from types import FrameType, TracebackType
 from typing import Any, Final
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import MissingPluginError
 
 # exit code of a command that did its work, while nothing of its task was found
 TASK_NOT_FOUND: Final = 3
@@ -191,10 +191,10 @@ def size_text(count: float) -> str:
 
 
 def import_extra(package: str, extra: str, purpose: str) -> Any:
-    """Import a package of an extra. Raises InvalidInputError, which names the command that installs it."""
+    """Import a package of an extra. Raises MissingPluginError, which names the command that installs it."""
     try:
         return import_module(package)
     except ImportError as error:
-        raise InvalidInputError(
+        raise MissingPluginError(
             f"{purpose}: expected the package {package!r}; install it with: pip install 'gausslite[{extra}]'"
         ) from error

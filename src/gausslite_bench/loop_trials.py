@@ -60,7 +60,7 @@ class LoopTrials:
         """Recorded: the frames of the run's keyframes."""
         table = SplatTable(len(saved.gaussians))
         table.append(saved.gaussians, anchor=0)
-        self._closer = LoopCloser(table, choose_rasterizer(threads=threads), _PRIOR)
+        self._table, self._closer = table, LoopCloser(choose_rasterizer(threads=threads), _PRIOR)
         self._kept = [
             _keyframe(replace(frame, T_world_camera=view.T_world_camera), number)
             for number, (view, frame) in enumerate(zip(saved.keyframes, recorded, strict=True))
@@ -69,7 +69,7 @@ class LoopTrials:
         last = self._kept[-1].frame
         outside = [_keyframe(_shifted(last, x_m), len(self._kept) + i) for i, x_m in enumerate(walk_m)]
         for keyframe in (*self._kept, *outside):
-            self._closer.add(keyframe, keyframe.frame, ())
+            self._closer.add(keyframe, keyframe.frame, (), table)
         self._state = {name: array.copy() for name, array in self._closer.state().items()}
 
     def score(self, frames: Iterable[Frame], elsewhere: bool) -> LoopScore:
@@ -82,7 +82,7 @@ class LoopTrials:
             self._closer.restore(self._state)
             keyframe = _keyframe(given, self._closer.keyframes)
             start_s = time.process_time()
-            motions = self._closer.add(keyframe, given, self._kept)
+            motions = self._closer.add(keyframe, given, self._kept, self._table)
             seconds.append(time.process_time() - start_s)
             counts = self._closer.counts
             refused += counts.refused

@@ -10,7 +10,6 @@ counted and reported, and does not correct the map.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,6 +21,7 @@ from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, tran
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.mapping.keyframes import Keyframe
+from gausslite.mapping.pose_corrector import LoopCounts, PoseCorrector
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
 from gausslite.pose_fit.photometric import align_images
 from gausslite.process import print_message
@@ -54,38 +54,12 @@ _NOISE_STDS = 2.0 * 2.0**0.5
 """So does a loop within this many standard deviations of a pose's error: it is noise of single poses and no drift."""
 
 
-@dataclass(frozen=True, slots=True)
-class LoopCounts:
-    """What became of the loops so far.
+class LoopCloser(PoseCorrector):
+    """Finds loops of one map and owns the pose graph of its keyframes. Not thread-safe."""
 
-    refused: keyframes whose image, or the map, did not agree with the pose of a loop. accepted, rejected: loops
-    by the latest solution of the pose graph. withdrawn: accepted by one solution and rejected by a later one.
-    corrections: how often the map moved.
-    """
-
-    refused: int = 0
-    accepted: int = 0
-    rejected: int = 0
-    withdrawn: int = 0
-    corrections: int = 0
-
-    def describe(self) -> str:
-        """Return the counts as one line; empty while there is nothing to report."""
-        if not (self.corrections or self.refused or self.rejected or self.withdrawn):
-            return ""
-        return (
-            f"loops: corrections of the map {self.corrections}; not used: {self.refused} contradict the map, "
-            f"{self.rejected} other loops; taken back: {self.withdrawn}"
-        )
-
-
-class LoopCloser:
-    """Finds loops of the map in `table` and owns the pose graph of its keyframes. Not thread-safe."""
-
-    def __init__(self, table: SplatTable, rasterizer: Rasterizer, prior: PoseExposurePrior) -> None:
-        """Prior: of the error of single poses. Raises InvalidInputError if GTSAM is not installed."""
+    def __init__(self, rasterizer: Rasterizer, prior: PoseExposurePrior) -> None:
+        """Prior: of the error of single poses. Raises MissingPluginError if GTSAM is not installed."""
         require_graph_solver()
-        self._table = table
         self._rasterizer = rasterizer
         self._graph = PoseGraph(prior)
         self._noise = (
@@ -108,10 +82,12 @@ class LoopCloser:
         """The number of keyframes so far."""
         return len(self._graph)
 
-    def add(self, keyframe: Keyframe, prior: Frame, kept: Sequence[Keyframe]) -> Float64[ndarray, "k 4 4"] | None:
+    def add(
+        self, keyframe: Keyframe, prior: Frame, kept: Sequence[Keyframe], table: SplatTable
+    ) -> Float64[ndarray, "k 4 4"] | None:
         """Add the next keyframe; return the motion of each keyframe in world axes if a loop corrects them, else None.
 
-        prior: the frame with the pose before refinement, by the odometry or by tracking. kept: keyframes with images.
+        See `PoseCorrector.add`.
         """
         last = None
         for old in kept:
@@ -123,7 +99,7 @@ class LoopCloser:
         self._times_ns.append(keyframe.frame.capture_time_ns)
         view = View.of(keyframe.frame)
         self._descriptors.append(view.descriptor)
-        loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - MIN_GAP])
+        loop = self._find(keyframe, view, [old for old in kept if old.anchor <= keyframe.anchor - MIN_GAP], table)
         # until a loop has shown a drift, images may err more than the odometry from one keyframe to the next
         step = self._graph.newest_step if self._corrections else None
         is_noise = (loop is None or self._is_noise(loop)) and (step is None or self._is_noise(step, _NOISE))
@@ -163,21 +139,21 @@ class LoopCloser:
         self._corrections += 1
         return self._graph.apply(solution)
 
-    def _find(self, keyframe: Keyframe, view: View, earlier: Sequence[Keyframe]) -> Loop | None:
+    def _find(self, keyframe: Keyframe, view: View, earlier: Sequence[Keyframe], table: SplatTable) -> Loop | None:
         """Return the loop of a keyframe with one of these; None if it saw the place of none, or images disagree."""
         if not earlier:
             return None
-        frame = keyframe.frame
+        frame, earlier_map = keyframe.frame, self._earlier_map(keyframe, table)
         nearest = min(earlier, key=lambda old: _distance(old.frame, frame))
         if _distance(nearest.frame, frame) < _MAX_DISTANCE:
-            loop = self._registered(keyframe, view, nearest, _relative(nearest, keyframe))
+            loop = self._registered(keyframe, view, nearest, _relative(nearest, keyframe), earlier_map)
             if loop is not None:
                 return loop
         similar = max(earlier, key=self._similarity)
         if similar is nearest or self._similarity(similar) < _MIN_SIMILARITY:
             return None
         for guess in guessed_motions(view, View.of(similar.frame)):
-            loop = self._registered(keyframe, view, similar, guess)
+            loop = self._registered(keyframe, view, similar, guess, earlier_map)
             if loop is not None:
                 return loop
         return None
@@ -186,7 +162,9 @@ class LoopCloser:
         """Return the similarity of an earlier keyframe to the newest one."""
         return self._descriptors[old.anchor].similarity(self._descriptors[-1])
 
-    def _registered(self, keyframe: Keyframe, view: View, old: Keyframe, guess: Float64[ndarray, "4 4"]) -> Loop | None:
+    def _registered(
+        self, keyframe: Keyframe, view: View, old: Keyframe, guess: Float64[ndarray, "4 4"], earlier_map: RenderMap
+    ) -> Loop | None:
         """Return the loop of two keyframes if their surfaces fit and, if it moves the map, the rendering agrees."""
         registration = register(view.surface, View.of(old.frame).surface, guess)
         T_old_keyframe = None if registration is None else _aligned(old, keyframe, registration.T_target_source)
@@ -194,17 +172,22 @@ class LoopCloser:
             return None
         T_world_camera = old.frame.T_world_camera @ T_old_keyframe
         loop = Loop(old.anchor, keyframe.anchor, inverse(self._graph.poses[old.anchor]) @ T_world_camera)
-        if self._is_noise(loop) or self._is_verified(keyframe, old, loop, T_world_camera):
+        if self._is_noise(loop) or self._is_verified(keyframe, old, loop, T_world_camera, earlier_map):
             return loop
         self._refused += 1
         return None
 
     def _is_verified(
-        self, keyframe: Keyframe, old: Keyframe, loop: Loop, T_world_camera: Float64[ndarray, "4 4"]
+        self,
+        keyframe: Keyframe,
+        old: Keyframe,
+        loop: Loop,
+        T_world_camera: Float64[ndarray, "4 4"],
+        earlier_map: RenderMap,
     ) -> bool:
         """True if the map does not draw a loop's pose back, and it or the earlier image shows the same from there."""
         frame, error_m, error_deg = keyframe.frame, *self._graph.residual(loop)
-        shown = verify(self._earlier_map(keyframe), frame, T_world_camera)
+        shown = verify(earlier_map, frame, T_world_camera)
         moved_m = translation_m(shown.T_world_camera, T_world_camera)
         moved_deg = rotation_angle_deg(shown.T_world_camera, T_world_camera)
         max_m, max_deg = np.clip(_MAX_SHARE * error_m, *_MOVED_M), np.clip(_MAX_SHARE * error_deg, *_MOVED_DEG)
@@ -212,9 +195,8 @@ class LoopCloser:
             return False
         return shown.is_accepted or verify(_render_image(old.frame), frame, T_world_camera).is_accepted
 
-    def _earlier_map(self, keyframe: Keyframe) -> RenderMap:
+    def _earlier_map(self, keyframe: Keyframe, table: SplatTable) -> RenderMap:
         """Return a function that renders what earlier keyframes have mapped."""
-        table = self._table
         earlier = (table.anchor <= keyframe.anchor - MIN_GAP) & (table.anchor != NO_ANCHOR)
         subset = Subset(None, np.flatnonzero(earlier).astype(np.uint32))
 

@@ -72,7 +72,7 @@ class _Step:
 
 
 def require_graph_solver() -> Any:
-    """Import GTSAM. Raises InvalidInputError, which names the command that installs it."""
+    """Import GTSAM. Raises MissingPluginError, which names the command that installs it."""
     return import_extra("gtsam", "slam", "loops")
 
 

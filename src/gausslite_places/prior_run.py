@@ -3,43 +3,47 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.datasets.source import Source
+from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark
 from gausslite.domain.pose import require_rigid
-from gausslite.domain.state import State, encode_text, get_array, get_counts, get_text, int_array
+from gausslite.domain.state import State, encode_text, get_array, get_counts, int_array
 from gausslite.mapping.free_space import DepthView
 from gausslite.mapping.keyframes import Keyframe
+from gausslite.mission.prior_map import PRIOR_FOLDER, MapChanges, PriorMap
+from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import MissionSettings
 from gausslite_evaluation.views import view_map
 from gausslite_places.map_diff import Change, Visit, compare_visits, with_earlier_objects
-from gausslite_places.prior_map import SavedMap, SequenceLocaliser
+from gausslite_places.moved_source import MovedSource, moved_frame
+from gausslite_places.prior_map import MAX_LOCALISED_FRAMES, SavedMap, SequenceLocaliser
 
 
-def require_other_folder(prior: Path | None, out: Path) -> None:
-    """Raise InvalidInputError for a saved map in the folder of the new run, which would replace it."""
-    if prior is not None and prior.resolve() == out.resolve():
-        raise InvalidInputError(f"--prior {prior}: expected another folder than --out, whose map is replaced")
-
-
-class PriorRun:
+class PriorRun(PriorMap):
     """A saved map and the place of a sequence in it. Not thread-safe."""
 
-    def __init__(self, saved: SavedMap, settings: MissionSettings) -> None:
-        """settings: those of the new run. Renders the keyframes of the saved map."""
+    def __init__(self, folder: Path, settings: MissionSettings, saved: State) -> None:
+        """Read the saved map and render its keyframes. Raises MapFileError, PoseError.
+
+        settings: those of the new run. saved: its state if it is resumed.
+        """
+        self.saved = SavedMap.read(folder)
         start_s = time.monotonic()
-        self.saved = saved
-        self._viewer = view_map(saved.gaussians, settings.backend, settings.threads)
-        self._localiser = SequenceLocaliser(saved.places(self._viewer))
+        self._viewer = view_map(self.saved.gaussians, settings.backend, settings.threads)
+        self._localiser = SequenceLocaliser(self.saved.places(self._viewer))
         self._seconds = time.monotonic() - start_s
+        if PRIOR_FOLDER in saved:
+            self._restore(saved)
 
     @property
     def motion(self) -> Float64[ndarray, "4 4"] | None:
@@ -47,15 +51,27 @@ class PriorRun:
         return self._localiser.T_map_sequence
 
     @property
+    def world_frame(self) -> str:
+        """The name of the saved map's frame; empty if the sequence is not recognised there."""
+        return "" if self.motion is None else self.saved.world_frame
+
+    @property
     def is_done(self) -> bool:
         """True if the sequence is localised, or enough frames were tried."""
         return self._localiser.is_done
 
-    def offer(self, frame: Frame) -> None:
-        """Localise a frame, whose pose is in the sequence's frame."""
-        start_s = time.monotonic()
-        self._localiser.offer(frame)
-        self._seconds += time.monotonic() - start_s
+    def localise(self, stream: FrameStream, spread: bool) -> None:
+        """Localise frames of a recording: spread over it, or its first ones."""
+        for frame in _frames(stream, spread):
+            if self.is_done:
+                return
+            self._offer(frame)
+
+    def place(self, frame: Frame) -> Frame | None:
+        """Localise a live frame and return it in the map's frame, or as it is if that fails; None until it is done."""
+        if not self.is_done:
+            self._offer(frame)
+        return moved_frame(frame, self.motion) if self.is_done else None
 
     def describe(self) -> str:
         """Return one line: whether the sequence is localised."""
@@ -71,52 +87,58 @@ class PriorRun:
         """Return the Gaussians that a run of this task continues with; None if the sequence is not recognised."""
         return None if self.motion is None else self.saved.gaussians_for(task)
 
-    def changes(
+    def moved(self, source: Source) -> Source:
+        """Return a sequence of the run with poses and regions in the saved map's frame, once it is recognised."""
+        return MovedSource(source, lambda: self.motion, self.saved.world_frame)
+
+    def compare(
         self, gaussians: Gaussians, objects: Sequence[ObjectLandmark], keyframes: Sequence[Keyframe]
-    ) -> list[Change]:
+    ) -> MapChanges:
         """Return what the run's map, objects and keyframes show to have changed since the saved map."""
-        if self.motion is None:
-            return []
-        before = Visit(self.saved.gaussians, self.saved.objects, self.saved.depth_views(self._viewer))
-        views = [DepthView.of_frame(keyframe.frame) for keyframe in keyframes]
-        return compare_visits(before, Visit(gaussians, objects, views))
-
-    def objects(self, found: Sequence[ObjectLandmark], changes: Sequence[Change]) -> list[ObjectLandmark]:
-        """Return the run's objects, and the earlier ones that it has neither found again nor seen to be gone."""
-        earlier = () if self.motion is None else self.saved.objects
-        return with_earlier_objects(found, earlier, changes)
-
-    def report(self, changes: Sequence[Change]) -> dict[str, object]:
-        """Return the prior and what changed as parts of report.json."""
-        motion = self.motion
-        return {
-            "prior": {
-                "run": str(self.saved.folder),
-                "localised": motion is not None,
-                "T_map_sequence": None if motion is None else motion.tolist(),
-                "frames_tried": self._localiser.tried,
-                "seconds": self._seconds,
-            },
-            "changes": [change.as_json() for change in changes],
-        }
+        changes: list[Change] = []
+        if self.motion is not None:
+            before = Visit(self.saved.gaussians, self.saved.objects, self.saved.depth_views(self._viewer))
+            views = [DepthView.of_frame(keyframe.frame) for keyframe in keyframes]
+            changes = compare_visits(before, Visit(gaussians, objects, views))
+            objects = with_earlier_objects(objects, self.saved.objects, changes)
+        report = {"prior": self._report(), "changes": [change.as_json() for change in changes]}
+        return MapChanges(objects, tuple(map(Change.describe, changes)), report)
 
     def state(self) -> State:
         """Return what a resumed run needs."""
         motion = self.motion
         return {
-            "prior_folder": encode_text(str(self.saved.folder)),
+            PRIOR_FOLDER: encode_text(str(self.saved.folder)),
             "prior_T_map_sequence": np.zeros((0, 4, 4)) if motion is None else motion[None],
             "prior_tried": int_array(self._localiser.tried),
         }
 
-    @classmethod
-    def resumed(cls, extra: State, settings: MissionSettings) -> PriorRun | None:
-        """Return the prior of a saved run; None without one. Raises MapFileError."""
-        if "prior_folder" not in extra:
-            return None
-        prior = cls(SavedMap.read(Path(get_text(extra, "prior_folder"))), settings)
-        for T in get_array(extra, "prior_T_map_sequence", (None, 4, 4), np.float64):
+    def _restore(self, state: State) -> None:
+        for T in get_array(state, "prior_T_map_sequence", (None, 4, 4), np.float64):
             require_rigid("state prior motion", T)
-            prior._localiser.T_map_sequence = T.copy()
-        [prior._localiser.tried] = get_counts(extra, "prior_tried", 1)
-        return prior
+            self._localiser.T_map_sequence = T.copy()
+        [self._localiser.tried] = get_counts(state, "prior_tried", 1)
+
+    def _offer(self, frame: Frame) -> None:
+        start_s = time.monotonic()
+        self._localiser.offer(frame)
+        self._seconds += time.monotonic() - start_s
+
+    def _report(self) -> dict[str, object]:
+        motion = self.motion
+        return {
+            "run": str(self.saved.folder),
+            "localised": motion is not None,
+            "T_map_sequence": None if motion is None else motion.tolist(),
+            "frames_tried": self._localiser.tried,
+            "seconds": self._seconds,
+        }
+
+
+def _frames(stream: FrameStream, spread: bool) -> Iterator[Frame]:
+    """Yield the frames to localise."""
+    positions = stream.positions
+    step = max(len(positions) // MAX_LOCALISED_FRAMES, 1) if spread else 1
+    for position in positions[::step][:MAX_LOCALISED_FRAMES]:
+        with suppress(DatasetError, PoseError):  # a frame that cannot be read is reported where it is mapped
+            yield stream.source.frame(position, stream.size)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,18 +15,18 @@ from place_scenes import CAMERA, MapCamera, looking, room
 
 from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, write_keyframe_views
+from gausslite.datasets.source import WrappedSource
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse, transform_of
-from gausslite.domain.relevance import BallRegion
+from gausslite.domain.relevance import BallRegion, Region
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mission.checkpoint import ResumeConfig
+from gausslite.mission.prior_map import PriorMap, open_prior_map
 from gausslite.mission.settings import MissionSettings
-from gausslite_agent.mapping_worker import MappingWorker
+from gausslite_agent.mapping_worker import LOCALISING, MappingWorker
 from gausslite_agent.settings import AgentIdentity
 from gausslite_agent.state import Outcome, SavedMission
 from gausslite_language.rules import RuleParser
-from gausslite_places.agent_prior import LOCALISING, PriorFrames
-from gausslite_places.prior_map import SavedMap
 from gausslite_places.prior_run import PriorRun
 
 SETTINGS = MissionSettings(max_gaussians=30_000, iterations=1, threads=1)
@@ -35,12 +35,12 @@ T_ODOMETRY_MAP = transform_of(np.array([4.0, -1.0, 0.2, 0.0, 0.0, 2.5]))
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory: pytest.TempPathFactory) -> SavedMap:
+def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("earlier")
     write_ply(folder / "map.ply", room(3), "yesterday")
     (folder / "report.json").write_text(json.dumps({"objects": [], "task": "Find the mug"}))
     write_keyframe_views(folder, [KeyframeView(i, i, CAMERA, looking(*pose), 0) for i, pose in enumerate(POSES[:1])])
-    return SavedMap.read(folder)
+    return folder
 
 
 def _frames(seed: int = 3) -> list[Frame]:
@@ -50,8 +50,8 @@ def _frames(seed: int = 3) -> list[Frame]:
 
 
 @contextmanager
-def _worker(prior: PriorRun | None) -> Iterator[MappingWorker]:
-    worker = MappingWorker(SETTINGS, VoxelGrid(), ball_estimator, prior=PriorFrames(prior))
+def _worker(prior: PriorMap) -> Iterator[MappingWorker]:
+    worker = MappingWorker(SETTINGS, VoxelGrid(), ball_estimator, prior=prior)
     try:
         worker.assign(RuleParser().parse("Find the mug")).result()
         yield worker
@@ -59,50 +59,57 @@ def _worker(prior: PriorRun | None) -> Iterator[MappingWorker]:
         worker.close()
 
 
-def test_an_agent_continues_a_map_from_any_start_and_after_a_restart(saved: SavedMap, tmp_path: Path) -> None:
+def test_an_agent_continues_a_map_from_any_start_and_after_a_restart(earlier: Path, tmp_path: Path) -> None:
     first, second, third, fourth = _frames()
     identity = AgentIdentity("robot", 0.1)
-    with _worker(PriorRun(saved, SETTINGS)) as worker:
+    prior = PriorRun(earlier, SETTINGS, {})
+    with _worker(prior) as worker:
         report = worker.submit(first).result()
         assert (report.outcome, report.reason, report.gaussians) == (Outcome.SKIPPED, LOCALISING, 0)
-        assert worker.submit(second).result().gaussians >= len(saved.gaussians)
+        assert worker.submit(second).result().gaussians >= len(prior.saved.gaussians)
         worker.submit(third).result()
         correction = worker.status().correction
         assert correction is not None
         np.testing.assert_allclose(correction.T_map_odometry, inverse(T_ODOMETRY_MAP), atol=0.05)
         worker.save(tmp_path / "a.state", ResumeConfig.of(SETTINGS, identity), "Find the mug").result()
-        motion = worker.prior.run.motion  # type: ignore[union-attr]
         worker.submit(fourth).result()
         whole = worker.run(lambda mapper: mapper.gaussians()).result()
-    with _worker(None) as restarted:
-        restarted.restore(SavedMission.read(tmp_path / "a.state", SETTINGS, identity)).result()
-        assert restarted.prior.run is not None
-        np.testing.assert_array_equal(restarted.prior.run.motion, motion)
+    saved = SavedMission.read(tmp_path / "a.state", SETTINGS, identity)
+    with _worker(open_prior_map(None, saved.run.extra, SETTINGS)) as restarted:
+        restarted.restore(saved).result()
+        np.testing.assert_array_equal(restarted.prior.motion, prior.motion)
         restarted.submit(fourth).result()
         assert restarted.run(lambda mapper: mapper.gaussians()).result().means_m.tobytes() == whole.means_m.tobytes()
 
 
-def test_an_agent_in_another_place_maps_on_its_own(saved: SavedMap) -> None:
-    prior = PriorRun(saved, SETTINGS)
-    frames = PriorFrames(prior)
+def test_an_agent_in_another_place_maps_on_its_own(earlier: Path) -> None:
+    prior = PriorRun(earlier, SETTINGS, {})
     with _worker(prior) as worker:
         for index in range(12):
             frame = replace(_frames(seed=8)[index % 4], index=index)
             report = worker.submit(frame).result()
         assert (report.outcome, prior.motion) == (Outcome.MAPPED, None)
-        assert 0 < report.gaussians < len(saved.gaussians)
+        assert 0 < report.gaussians < len(prior.saved.gaussians)
     assert "begins a map of its own" in prior.describe()
-    assert frames.correction(worker.status().correction) is worker.status().correction
 
 
-def test_ground_truth_regions_follow_the_motion(saved: SavedMap) -> None:
-    prior, frame = PriorRun(saved, SETTINGS), MapCamera(room(3)).frame(looking(*POSES[0]))
-    frames = PriorFrames(prior)
+class _Sequence(WrappedSource):
+    """A sequence of which only the regions are known."""
+
+    def __init__(self, regions: Mapping[str, Region]) -> None:
+        self._regions = regions
+
+    def regions(self) -> Mapping[str, Region]:
+        return self._regions
+
+
+def test_ground_truth_regions_follow_the_motion(earlier: Path) -> None:
+    prior, frame = PriorRun(earlier, SETTINGS, {}), MapCamera(room(3)).frame(looking(*POSES[0]))
     region = BallRegion((1.5, 1.2, 0.6), 0.5)
-    moved = frames.regions({"mug": region})["mug"]
+    moved = prior.moved(_Sequence({"mug": region})).regions()["mug"]
     np.testing.assert_array_equal(moved.mask(frame), region.mask(frame))
     for source_frame in _frames()[:2]:
-        prior.offer(source_frame)
+        prior.place(source_frame)
     assert prior.motion is not None
     in_sequence = replace(frame, T_world_camera=T_ODOMETRY_MAP @ frame.T_world_camera)
     in_map = replace(frame, T_world_camera=prior.motion @ in_sequence.T_world_camera)

@@ -138,7 +138,7 @@ def test_two_frames_must_agree_on_the_motion() -> None:
 def test_a_moved_source_keeps_its_regions_and_turns_its_up_axis() -> None:
     source = open_source(HOME)
     T = transform_of(np.array([5.0, -2.0, 1.0, 0.0, np.pi / 2, 0.0]))
-    moved = MovedSource(source, T, "map")
+    moved = MovedSource(source, lambda: T, "map")
     frame, moved_frame = source.frame(3), moved.frame(3)
     np.testing.assert_allclose(moved_frame.T_world_camera, T @ frame.T_world_camera, atol=1e-9)
     np.testing.assert_allclose(moved.trajectory().T_world_camera[3], moved_frame.T_world_camera, atol=1e-9)

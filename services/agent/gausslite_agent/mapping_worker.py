@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -22,6 +22,7 @@ from gausslite.domain.errors import InvalidInputError, MismatchError, StorageErr
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport
+from gausslite.domain.pose import PoseCorrection
 from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
@@ -30,6 +31,7 @@ from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
+from gausslite.mission.prior_map import NoPriorMap, PriorMap
 from gausslite.mission.schedule import MapRecorder, Timeline
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
@@ -39,7 +41,6 @@ from gausslite.wire.uplink import Uplink
 from gausslite_agent.background import IdleTraining, KeyframeUpload
 from gausslite_agent.settings import LoadSettings, QueuePolicy
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
-from gausslite_places.agent_prior import LOCALISING, PriorFrames
 
 
 def _running_future() -> Future[FrameReport]:
@@ -89,6 +90,7 @@ class FrameQueue:
 
 _Result = TypeVar("_Result")
 _log = logging.getLogger(__name__)
+LOCALISING = "the agent localises itself in the map of --prior"
 
 
 class MappingWorker:
@@ -104,11 +106,11 @@ class MappingWorker:
         load: LoadSettings | None = None,
         clock: Clock = time.monotonic,
         keyframe_upload: KeyframeUpload | None = None,
-        prior: PriorFrames | None = None,
+        prior: PriorMap | None = None,
     ) -> None:
         """build_estimator and on_change run on the worker thread, the latter after each mapped frame."""
         self._keyframe_upload = keyframe_upload
-        self.prior = prior or PriorFrames(None)
+        self.prior = prior or NoPriorMap()
         self._settings, self._build_estimator = settings, build_estimator
         self.grid, self.uplink = grid, uplink
         self._on_change = on_change
@@ -274,7 +276,6 @@ class MappingWorker:
         checkpoint = saved.checkpoint
         task_mapper = self._switch(checkpoint.graph)
         saved.run.restore(task_mapper)
-        self.prior.restore(saved.run.extra, self._settings)
         # not before: the fusion server replaces what it has by each report
         self._report_task(task_mapper)
         self._last_index = checkpoint.last_index
@@ -318,8 +319,7 @@ class MappingWorker:
 
     def _map(self, queued: QueuedFrame) -> FrameReport:
         assert self._task_mapper is not None
-        graph = self.status().graph
-        frame = self.prior.in_map(queued.frame, self._mapper, "" if graph is None else graph.text)
+        frame = self._place(queued.frame)
         if frame is None:
             return self._count(FrameReport(queued.frame.index, Outcome.SKIPPED, LOCALISING))
         outcome = self._task_mapper.process(frame, self._clock() - queued.arrival_s)
@@ -344,12 +344,31 @@ class MappingWorker:
         self._status.add_outcome(outcome)
         self._timeline.add(outcome)
         self._recorder.record(self._mapper.poses, self._mapper.gaussians)
-        self._status.update(
-            correction=self.prior.correction(self._mapper.poses.latest()), corrected_at_s=time.monotonic()
-        )
+        self._status.update(correction=self._correction(), corrected_at_s=time.monotonic())
         self._count(report)
         self._on_change()
         return report
+
+    def _place(self, frame: Frame) -> Frame | None:
+        """Return the frame in the map's frame; None while the agent localises itself in an earlier map.
+
+        The frame that localises it adds the earlier map. Raises QuotaError if that does not fit.
+        """
+        was_done, graph = self.prior.is_done, self.status().graph
+        placed = self.prior.place(frame)
+        if not was_done and placed is not None:
+            _log.warning("%s", self.prior.describe())
+            earlier = self.prior.gaussians_for("" if graph is None else graph.text)
+            if earlier is not None:
+                self._mapper.continue_map(earlier)
+        return placed
+
+    def _correction(self) -> PoseCorrection | None:
+        """Return the correction of the odometry's own poses."""
+        latest, motion = self._mapper.poses.latest(), self.prior.motion
+        if latest is None or motion is None:
+            return latest
+        return replace(latest, T_map_odometry=latest.T_map_odometry @ motion)
 
     def _update_notes(self, notes: tuple[str, ...]) -> None:
         """Store the messages of the relevance estimator, and log each new one."""

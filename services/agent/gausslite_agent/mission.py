@@ -344,19 +344,15 @@ class AgentMission:
             "resumed_after_frame": None if self._resumed is None else self._resumed.last_index,
         }
         report["notes"] = [*self._source_notes, *report["notes"]]
-        prior, world_frame = self._worker.prior.run, self._settings.link.uplink.world_frame
-        motion = None if prior is None else prior.motion
+        prior = self._worker.prior
         keyframes = self._worker.run(lambda mapper: mapper.keyframes()).result()
-        if prior is not None:
-            objects = self._worker.status().objects
-            changes = prior.changes(gaussians, objects, keyframes)
-            for change in changes:
-                _log.info("since the earlier map: %s", change.describe())
-            objects_json = [object_as_json(landmark) for landmark in prior.objects(objects, changes)]
-            report |= {**prior.report(changes), "objects": objects_json}
-            world_frame = world_frame or ("" if motion is None else prior.saved.world_frame)
+        changes = prior.compare(gaussians, self._worker.status().objects, keyframes)
+        for line in changes.lines:
+            _log.info("since the earlier map: %s", line)
+        report |= {**changes.report, "objects": [object_as_json(landmark) for landmark in changes.objects]}
+        world_frame = self._settings.link.uplink.world_frame or prior.world_frame
         write_results(folder, gaussians, report, world_frame)
-        self._worker.run(lambda mapper: write_poses(folder, mapper.poses, motion)).result()
+        self._worker.run(lambda mapper: write_poses(folder, mapper.poses, prior.motion)).result()
         write_keyframes(folder, keyframes)
         self._worker.write_history(folder).result()
 

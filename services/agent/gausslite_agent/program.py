@@ -19,6 +19,7 @@ from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mission.build import EstimatorFactory
+from gausslite.mission.prior_map import PriorMap, open_prior_map, require_other_folder
 from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
@@ -36,9 +37,6 @@ from gausslite_agent.servicer import AgentServicer
 from gausslite_agent.settings import AgentSettings, ConnectionSettings, parse_arguments
 from gausslite_agent.state import SavedMission
 from gausslite_agent.team_map import TeamMapFollower
-from gausslite_places.agent_prior import PriorFrames
-from gausslite_places.prior_map import SavedMap
-from gausslite_places.prior_run import PriorRun, require_other_folder
 
 _log = logging.getLogger(__name__)
 _TIMEOUT_S = 30.0
@@ -162,9 +160,7 @@ async def _serve(settings: AgentSettings) -> int:
     with ExitStack() as stack:
         parser = _open_parser(settings, stack)
         uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
-        prior = PriorFrames(None)
-        if saved is None and settings.prior is not None:
-            prior = PriorFrames(PriorRun(SavedMap.read(settings.prior), settings.mission))
+        prior = _open_prior(settings, saved)
         estimators = _estimators(settings, stream, prior)
         worker = MappingWorker(
             settings.mission,
@@ -227,7 +223,7 @@ def _report_source(settings: SourceSettings, source: Source) -> tuple[str, ...]:
     return notes
 
 
-def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: PriorFrames) -> EstimatorFactory:
+def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: PriorMap) -> EstimatorFactory:
     """Return the estimator factory. Raises InvalidInputError if nothing can find the task of the command line."""
     needs_detector = settings.view is None
     estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream, prior), needs_detector)
@@ -296,10 +292,16 @@ def _keyframe_upload(link: ConnectionSettings, uplink: Uplink | None) -> Keyfram
     return KeyframeUpload(uplink, link.grid, link.keyframes, link.keyframes_during_mission)
 
 
-def _scene(settings: AgentSettings, stream: FrameStream | None, prior: PriorFrames) -> SceneInfo:
+def _open_prior(settings: AgentSettings, saved: SavedMission | None) -> PriorMap:
+    """Return the map that the agent continues; a saved mission has its own."""
+    if saved is None:
+        return open_prior_map(settings.prior, {}, settings.mission)
+    return open_prior_map(None, saved.run.extra, settings.mission)
+
+
+def _scene(settings: AgentSettings, stream: FrameStream | None, prior: PriorMap) -> SceneInfo:
     if stream is not None:
-        scene = SceneInfo.of(stream.source)
-        return replace(scene, regions=prior.regions(scene.regions))
+        return replace(SceneInfo.of(stream.source), regions=prior.moved(stream.source).regions())
     return SceneInfo() if settings.up_axis is None else SceneInfo(unit_up_axis(settings.up_axis))
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, policy_of
+from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, mission_settings, policy_of
 from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.cli.source_options import (
     RecordingOptions,
@@ -30,13 +30,14 @@ from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError, StorageError
 from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark, found_text
+from gausslite.domain.objects import found_text
 from gausslite.domain.relevance import Region
 from gausslite.domain.state import State, encode_text, get_text
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
+from gausslite.mission.prior_map import PriorMap, open_prior_map, require_other_folder
 from gausslite.mission.results import (
     MAP,
     PREVIEW,
@@ -68,10 +69,6 @@ from gausslite_evaluation.compare import TrainingFit, score_training_views
 from gausslite_evaluation.metrics import trajectory_error
 from gausslite_evaluation.pictures import render_preview
 from gausslite_evaluation.views import view_map
-from gausslite_places.map_diff import Change
-from gausslite_places.prior_localisation import in_frame_of, localised
-from gausslite_places.prior_map import SavedMap
-from gausslite_places.prior_run import PriorRun, require_other_folder
 
 
 def trajectory_report(settings: SourceSettings, source: Source, mapper: TaskMapper) -> dict[str, object]:
@@ -181,9 +178,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _map(options: argparse.Namespace) -> int:
-    earlier = None if options.prior is None else SavedMap.read(options.prior)
-    inputs = MapInputs.of(options)
     saved = None if options.resume is None else SavedRun.read(options.resume)
+    prior = open_prior_map(options.prior, {} if saved is None else saved.extra, mission_settings(options))
+    inputs = MapInputs.of(options)
     if saved is not None:
         inputs = inputs.resumed(options, saved)
     if options.save_state is not None:
@@ -203,22 +200,22 @@ def _map(options: argparse.Namespace) -> int:
     if saved is None:
         stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
         inputs = inputs.calibrated(replace(stated, force=options.force))
-    prior = None if saved is None else PriorRun.resumed(saved.extra, inputs.mission)
-    if earlier is not None:
-        prior = localised(earlier, inputs)
-    recorded = inputs
-    if prior is not None:
-        inputs = in_frame_of(prior, recorded)
+    if options.prior is not None:
+        # without given poses, frames far apart in time are in no common frame
+        prior.localise(inputs.stream, spread=inputs.mission.poses is not PoseMode.TRACK)
+        print_message(prior.describe())
+    if prior.motion is not None:
+        inputs = inputs.in_frame_of(prior)
         estimators = estimators.in_scene(lambda: SceneInfo.of(inputs.stream.source))
         roi = _first_roi(options, inputs, saved)
     task = "" if inputs.schedule.first is None else inputs.schedule.first.text
-    mapper = build_task_mapper(inputs.mission, estimators, roi, None if prior is None else prior.gaussians_for(task))
+    mapper = build_task_mapper(inputs.mission, estimators, roi, prior.gaussians_for(task))
     if saved is not None:
         saved.restore(mapper)
         saved = None  # its arrays, as large as the map and the keyframes, have been copied
     graph = roi if isinstance(roi, TaskGraph) else None
     scheduled = ScheduledTaskMapper(mapper, inputs.schedule, estimators, graph, resumed_after)
-    mapping = _Run(options, inputs, scheduled, recorded, prior)
+    mapping = _Run(options, inputs, scheduled, prior)
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
         result = mapping.map_frames(resumed_after)
@@ -236,17 +233,10 @@ class _Run:
     """One run: its frame loop and its results."""
 
     def __init__(
-        self,
-        options: argparse.Namespace,
-        inputs: MapInputs,
-        scheduled: ScheduledTaskMapper,
-        recorded: MapInputs,
-        prior: PriorRun | None,
+        self, options: argparse.Namespace, inputs: MapInputs, scheduled: ScheduledTaskMapper, prior: PriorMap
     ) -> None:
-        """Recorded: the inputs in the sequence's own world frame, which differs from theirs with a prior map."""
-        self._options, self._recorded, self._prior = options, recorded, prior
-        self._changes: list[Change] = []
-        self._inputs = inputs
+        self._options, self._inputs, self._prior = options, inputs, prior
+        self._changes: tuple[str, ...] = ()
         self._scheduled, self._mapper = scheduled, scheduled.mapper
         self._corrupt = CorruptFrames(print_above_bar)
         self._timeline, self._recorder = Timeline(), MapRecorder()
@@ -290,10 +280,8 @@ class _Run:
             *_unreached_notes(self._inputs.schedule, result.last_index),
             *depth_notes(self._inputs.stream.source, self._mapper.keyframes()),
         )
-        objects: Sequence[ObjectLandmark] = self._mapper.objects
-        if self._prior is not None:
-            self._changes = self._prior.changes(self._gaussians, objects, self._mapper.keyframes())
-            objects = self._prior.objects(objects, self._changes)
+        changes = self._prior.compare(self._gaussians, self._mapper.objects, self._mapper.keyframes())
+        self._changes = changes.lines
         self._report = {
             **self._inputs.report(),
             "resumed_from": None if options.resume is None else str(options.resume),
@@ -306,10 +294,10 @@ class _Run:
             "active_gaussians": int(self._gaussians.active.sum()),
             "peak_rss_mib": peak_rss_mib(),
             "memory_mib": self._mapper.memory_mib(),
-            "objects": [object_as_json(landmark) for landmark in objects],
+            "objects": [object_as_json(landmark) for landmark in changes.objects],
             "nouns": [noun_as_json(noun) for noun in self._mapper.nouns],
             "notes": list(self._notes),
-            **({} if self._prior is None else self._prior.report(self._changes)),
+            **changes.report,
         }
         prepare_folder(options.out)
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
@@ -318,7 +306,7 @@ class _Run:
             self._training_scores = score_training_views(viewer, keyframes)
             self._report["training_views"] = asdict(self._training_scores)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
-        write_poses(options.out, self._mapper.poses, None if self._prior is None else self._prior.motion)
+        write_poses(options.out, self._mapper.poses, self._prior.motion)
         self._timeline.write(options.out)
         self._recorder.write(options.out)
         write_keyframes(options.out, self._mapper.keyframes())
@@ -362,7 +350,7 @@ class _Run:
         for line in dict.fromkeys((*(noun.describe() for noun in self._mapper.nouns), *self._notes)):
             print(f"  {line}")
         for change in self._changes:
-            print(f"  {change.describe()}")
+            print(f"  {change}")
         print(self._outcome())
 
     def _outcome(self) -> str:
@@ -379,12 +367,10 @@ class _Run:
 
     def _save(self, last_index: int) -> None:
         prepare_folder(self._options.save_state.parent)
-        extra: State = {FRAMES_KEY: encode_text(self._options.frames)}
-        if self._prior is not None:
-            extra = {**extra, **self._prior.state()}
+        extra: State = {FRAMES_KEY: encode_text(self._options.frames), **self._prior.state()}
         if self._scheduled.graph is not None and self._scheduled.graph.pointed:
             extra = {**extra, _POINTED: encode_text("\n".join(self._scheduled.graph.pointed))}
-        fixed = replace(self._recorded, schedule=self._scheduled.schedule).fixed_settings(last_index)
+        fixed = replace(self._inputs, schedule=self._scheduled.schedule).fixed_settings(last_index)
         try:
             save_run(self._options.save_state, self._mapper, ResumeConfig.of(*fixed), last_index, extra)
         except StorageError as error:

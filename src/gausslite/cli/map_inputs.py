@@ -20,6 +20,7 @@ from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.state import get_text
 from gausslite.domain.task import TaskGraph
 from gausslite.mission.checkpoint import SavedRun
+from gausslite.mission.prior_map import PriorMap
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.schedule import TaskSchedule, TaskSwitch
 from gausslite.mission.settings import (
@@ -47,8 +48,8 @@ class _Sequence:
 class MapInputs:
     """The settings of one run, its frames and its tasks.
 
-    Depth registration and pose prior are not estimated yet, see `calibrated` and `resumed`. notes: on poses or depth
-    that contradict the images.
+    Depth registration and pose prior are not estimated yet, see `calibrated` and `resumed`. sequence: world frame of
+    the recording, which `in_frame_of` does not change. notes: on poses or depth that contradict the images.
     """
 
     mission: MissionSettings
@@ -57,6 +58,7 @@ class MapInputs:
     task: TaskSettings
     stream: FrameStream
     schedule: TaskSchedule
+    sequence: str
     notes: tuple[str, ...] = ()
 
     @classmethod
@@ -75,7 +77,7 @@ class MapInputs:
         if options.policy is None and options.task is None and not has_regions(options):
             print_message("no --task and no region: mapping everything equally (--policy uniform)")
         perception = build(PerceptionSettings, options).at_rate(mission)
-        return cls(mission, perception, source, task, stream, schedule)
+        return cls(mission, perception, source, task, stream, schedule, recorded.world_frame)
 
     def calibrated(self, stated: StatedValues) -> MapInputs:
         """Return the inputs with registration, correction and prior: those stated, else guaranteed or estimated."""
@@ -117,12 +119,15 @@ class MapInputs:
         _report_other_step(saved, self.source.frames)
         return inputs
 
+    def in_frame_of(self, prior: PriorMap) -> MapInputs:
+        """Return the inputs with the sequence in the world frame of the map that the run continues."""
+        return replace(self, stream=replace(self.stream, source=prior.moved(self.stream.source)))
+
     def fixed_settings(self, last_index: int) -> tuple[Any, ...]:
         """Return the settings that a run must have to continue after this frame."""
         graph = self.schedule.at(last_index)
         task = replace(self.task, task=None if graph is None else graph.text)
-        sequence = _Sequence(self.stream.source.world_frame)
-        return self.mission, self.perception, self.source, task, sequence
+        return self.mission, self.perception, self.source, task, _Sequence(self.sequence)
 
     def world_frame(self, options: argparse.Namespace) -> str:
         """Return the name of the world frame: that of the options, else the sequence's."""

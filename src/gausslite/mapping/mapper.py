@@ -31,6 +31,7 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.free_space import contradicted_rows, guessed_far, left_behind
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, WindowView, window_view
+from gausslite.mapping.pose_corrector import LoopCounts, PoseCorrector
 from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
 from gausslite.mapping.seeding import RenderedView, Seeder, SeedingContext, Seeds, insert_seeds
 from gausslite.mapping.settings import MapperSettings
@@ -39,7 +40,6 @@ from gausslite.mapping.task_change import add_roi_evidence, clear_roi, update_ro
 from gausslite.mapping.training import CountedScheduler, SkippableStage, Stage, StageScheduler, Trainer
 from gausslite.mapping.voxel_exchange import InsertedVoxels, insert_team_voxels
 from gausslite.render.rasterizer import Rasterizer, Rendering
-from gausslite_places.loops import LoopCloser, LoopCounts
 
 _MAX_KEYFRAMES = 2**31 - 1
 _STAYS = np.eye(4)
@@ -73,11 +73,16 @@ class GaussianMapper:
     """
 
     def __init__(
-        self, settings: MapperSettings, rasterizer: Rasterizer, seed: int = 0, initial_map: Gaussians | None = None
+        self,
+        settings: MapperSettings,
+        rasterizer: Rasterizer,
+        seed: int = 0,
+        initial_map: Gaussians | None = None,
+        corrector: PoseCorrector | None = None,
     ) -> None:
         """Allocate memory for `settings.max_gaussians` Gaussians; seed initialises all random choices.
 
-        initial_map: see `continue_map`.
+        initial_map: see `continue_map`. Without a corrector, poses are only refined.
         """
         self._settings = settings
         self._rasterizer = rasterizer
@@ -93,7 +98,7 @@ class GaussianMapper:
         )
         self._refiner = ViewRefiner(refinement, self.render)
         self._trainer = Trainer(settings, self._table, rasterizer, self._rng)
-        self._loops = LoopCloser(self._table, rasterizer, settings.pose_prior) if settings.closes_loops else None
+        self._corrector = corrector
         self._T_corrected_odometry: Float64[ndarray, "4 4"] | None = None
         self._extent_m = 0.0
         self._revision = 0
@@ -178,7 +183,7 @@ class GaussianMapper:
     @property
     def loops(self) -> LoopCounts:
         """What became of the loops so far."""
-        return LoopCounts() if self._loops is None else self._loops.counts
+        return LoopCounts() if self._corrector is None else self._corrector.counts
 
     def idle_step(self) -> bool:
         """Run one iteration on the window's keyframes. Return False if there are none yet."""
@@ -333,7 +338,7 @@ class GaussianMapper:
             **add_prefix("keyframes", self._keyframes.state()),
             **add_prefix("trainer", self._trainer.state()),
             **add_prefix("refiner", self._refiner.state()),
-            **add_prefix("loops", {} if self._loops is None else self._loops.state()),
+            **add_prefix("loops", {} if self._corrector is None else self._corrector.state()),
             **({} if self._T_corrected_odometry is None else {"T_corrected_odometry": self._T_corrected_odometry}),
             "generator": generator_state(self._rng),
             "extent_m": np.array([self._extent_m]),
@@ -350,8 +355,8 @@ class GaussianMapper:
         self._keyframes.restore(select_prefix(state, "keyframes"), self._window_view)
         self._trainer.restore(select_prefix(state, "trainer"))
         self._refiner.restore(select_prefix(state, "refiner"))
-        if self._loops is not None:
-            self._loops.restore(select_prefix(state, "loops"))
+        if self._corrector is not None:
+            self._corrector.restore(select_prefix(state, "loops"))
         if "T_corrected_odometry" in state:
             self._T_corrected_odometry = get_array(state, "T_corrected_odometry", (4, 4), np.float64).copy()
         restore_generator(self._rng, get_array(state, "generator", (6,), np.uint64))
@@ -367,8 +372,8 @@ class GaussianMapper:
         newest = max([int(self._table.anchor.max(initial=NO_ANCHOR)), self.poses.newest_anchor, *anchors])
         if newest >= count or self._table.anchor.min(initial=0) < NO_ANCHOR or count > _MAX_KEYFRAMES:
             raise MapFileError(f"state anchors: expected the numbers of {count} keyframes, got others")
-        if self._loops is not None and self._loops.keyframes != count:
-            raise MapFileError(f"state loops: expected {count} keyframes, got {self._loops.keyframes}")
+        if self._corrector is not None and self._corrector.keyframes != count:
+            raise MapFileError(f"state loops: expected {count} keyframes, got {self._corrector.keyframes}")
 
     def _prepare_view(self, frame: Frame, relevance: RelevanceMap) -> WindowView:
         """Prepare the frame for training; refine its pose and exposure if the prior allows an error."""
@@ -396,11 +401,11 @@ class GaussianMapper:
 
         prior: the frame with the pose before refinement.
         """
-        if self._loops is None:
+        if self._corrector is None:
             return None
         search = scheduler.has_time_for(Stage.LOOP_CLOSURE)
         with scheduler.timing(Stage.LOOP_CLOSURE):
-            motions = self._loops.add(keyframe, prior, self._keyframes.kept if search else ())
+            motions = self._corrector.add(keyframe, prior, self._keyframes.kept if search else (), self._table)
             if motions is None:
                 return None
             move_with_anchors(self._table, motions)

@@ -281,8 +281,7 @@ class MapperSettings:
     max_gaussians: hard cap; memory for exactly this number is allocated at the start. pose_prior: prior of the pose and
     exposure error of each view; keyframes are refined unless it is exact. pose_anchor_share: share of the mission's
     mean pose correction by which each refined pose moves back towards the odometry; 0 for poses without odometry.
-    closes_loops: keyframes that see an earlier pass again correct all poses and the map. leaves_out_moving: pixels of
-    things that move are neither seeded nor trained.
+    leaves_out_moving: pixels of things that move are neither seeded nor trained.
     """
 
     max_gaussians: int = 1_000_000
@@ -295,7 +294,6 @@ class MapperSettings:
     task_change: TaskChangeSettings = field(default_factory=TaskChangeSettings)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
     pose_anchor_share: float = 0.1
-    closes_loops: bool = False
     leaves_out_moving: bool = True
 
     def __post_init__(self) -> None:

@@ -8,15 +8,16 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, MissingPluginError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.relevance import Region
 from gausslite.domain.task import TaskGraph
 from gausslite.mapping.mapper import GaussianMapper
+from gausslite.mapping.pose_corrector import OpenCorrector, PoseCorrector
 from gausslite.mapping.tracking import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
-from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SceneInfo
+from gausslite.mission.settings import LoopMode, MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.detector import Tiling
 from gausslite.perception.relevance import (
@@ -27,7 +28,9 @@ from gausslite.perception.relevance import (
     TaskRelevanceEstimator,
 )
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
+from gausslite.plugins import Group, load
 from gausslite.render.choose import choose_rasterizer
+from gausslite.render.rasterizer import Rasterizer
 
 if TYPE_CHECKING:
     from gausslite.perception.detector import Detector
@@ -41,10 +44,28 @@ EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 def build_mapper(settings: MissionSettings, prior: Gaussians | None = None) -> GaussianMapper:
     """Return a mapper with an empty map, or with an earlier one to continue.
 
-    Raises KernelError, InvalidInputError, QuotaError if the earlier map exceeds max-gaussians.
+    Raises KernelError, InvalidInputError, MissingPluginError, QuotaError if the earlier map exceeds max-gaussians.
     """
     rasterizer = choose_rasterizer(settings.backend, settings.threads)
-    return GaussianMapper(settings.mapper_settings(), rasterizer, seed=settings.seed, initial_map=prior)
+    corrector = open_corrector(settings, rasterizer)
+    return GaussianMapper(settings.mapper_settings(), rasterizer, settings.seed, prior, corrector)
+
+
+def open_corrector(settings: MissionSettings, rasterizer: Rasterizer) -> PoseCorrector | None:
+    """Return what corrects poses by loops; None where poses are exact and, unless loops are on, if none is installed.
+
+    Raises MissingPluginError.
+    """
+    prior = settings.refinement_prior
+    if settings.loops is LoopMode.OFF or not prior.has_pose_error:
+        return None
+    try:
+        open_plugin: OpenCorrector = load(Group.CORRECTORS, purpose="loops")
+        return open_plugin(rasterizer, prior)
+    except MissingPluginError:
+        if settings.loops is LoopMode.ON:
+            raise
+        return None
 
 
 def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTracker | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field, replace
 from enum import StrEnum
-from importlib.util import find_spec
 from pathlib import Path
 
 from gausslite.config.option import check_options, option
@@ -359,15 +358,7 @@ class MissionSettings:
             optimization=optimization,
             pose_prior=self.refinement_prior,
             pose_anchor_share=0.0 if self.poses is PoseMode.TRACK else base.pose_anchor_share,
-            closes_loops=self.closes_loops,
         )
-
-    @property
-    def closes_loops(self) -> bool:
-        """True if loops correct the map: not where poses are exact, and only with GTSAM."""
-        if self.loops is LoopMode.OFF or not self.refinement_prior.has_pose_error:
-            return False
-        return self.loops is LoopMode.ON or find_spec("gtsam") is not None
 
     @property
     def refinement_prior(self) -> PoseExposurePrior:

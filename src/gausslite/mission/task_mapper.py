@@ -23,6 +23,7 @@ from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.moving import MovingSettings, moving_pixels
+from gausslite.mapping.pose_corrector import LoopCounts
 from gausslite.mapping.poses import PoseHistory
 from gausslite.mapping.seeding import RenderedView
 from gausslite.mapping.task_change import Reevaluation
@@ -33,7 +34,6 @@ from gausslite.mission.frame_scheduler import FrameScheduler, FrameTiming
 from gausslite.perception.pointing import pointed_masks
 from gausslite.perception.relevance import DelayedRelevance, RelevanceEstimate, RelevanceEstimator
 from gausslite.render.rasterizer import Rendering
-from gausslite_places.loops import LoopCounts
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
 REPEATED: Final = "the colour image is the one before, although the pose moved"

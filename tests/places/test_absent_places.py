@@ -1,0 +1,48 @@
+"""Without this package `map` works as before, and what needs the package names it in one line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from run_folders import write_run
+
+pytest.importorskip("embreex", reason="simulated homes come with the extra sim")
+
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
+_MAIN = "import sys; from gausslite.cli.main import main; sys.exit(main())"
+MISSING = "the package gausslite_places, which is not installed"
+
+
+def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command of `gausslite` in a process that does not see the package."""
+    paths = [str(SUPPORT / "without_extras"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return subprocess.run(
+        [sys.executable, "-c", _MAIN, *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HIDDEN_PACKAGES": "gausslite_places"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_a_sequence_with_a_drift_is_mapped(tmp_path: Path) -> None:
+    options = ("--frames", "0:3", "--size", "80x60", "--set", "pose-prior=0.006,0.15")
+    done = _run("map", "sim:home?drift=1%", *options, "--out", str(tmp_path / "map"))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "map" / "map.ply").exists()
+
+
+def test_what_needs_the_package_names_it(tmp_path: Path) -> None:
+    run, out = str(write_run(tmp_path / "run")), str(tmp_path / "out")
+    for arguments, expected in (
+        (("map", "sim:home", "--frames", "0:3", "--prior", run, "--out", out), f"--prior {run}: needs {MISSING}"),
+        (("diff", run, run), f"diff: needs {MISSING}"),
+    ):
+        done = _run(*arguments)
+        assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+        assert expected in done.stderr.splitlines()[-1]
