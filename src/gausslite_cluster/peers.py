@@ -107,8 +107,8 @@ class Peers:
             voxels=part.voxels.to_row(),
         )
         with peer_errors(server):
-            # the end of the connection ends the wait
-            stored = await self.stub(server).StorePart(request)
+            # a part of a message that is sent again meanwhile is stored once
+            stored = await self.stub(server).StorePart(request, timeout=CALL_S)
         return StoredCount(stored.accepted_voxels, stored.stale_voxels)
 
     async def close(self) -> None:

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from gausslite.domain.errors import UnavailableError
-from gausslite_places.frame_fit import FrameFit, SurfaceSamples, fit_frame
+from gausslite.fusion.frames import FrameFit
+from gausslite_places.frame_fit import SurfaceSamples, fit_frame
 from gausslite_places.unknown_frames import FrameSearch, find_frame
 
 _COMMAND = (sys.executable, "-m", "gausslite_places.fit_process")

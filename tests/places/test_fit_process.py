@@ -15,11 +15,11 @@ from sample_gaussians import textured_corner
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite_places.fit_process import FitProcess
+from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.frame_fit import SurfaceSamples, fit_frame
 from gausslite_places.unknown_frames import find_frame
 
@@ -67,12 +67,9 @@ def test_a_killed_process_starts_again_and_every_fit_has_the_bits_of_the_functio
     assert fit.pid is None
 
 
-@pytest.mark.parametrize("alignment", [None, AlignmentSettings()])
-def test_an_engine_starts_the_process_with_its_first_comparison_and_without_alignment_none(
-    alignment: AlignmentSettings | None,
-) -> None:
+def test_an_engine_starts_the_process_with_its_first_comparison() -> None:
     fit, grid = FitProcess(), VoxelGrid(0.1)
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=grid, alignment=alignment), fit=fit)
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=grid), aligner=MapAligner(grid, fit, fit.find))
     try:
         for seed, name in enumerate(("ant", "bee")):
             assert fit.pid is None
@@ -80,7 +77,7 @@ def test_an_engine_starts_the_process_with_its_first_comparison_and_without_alig
             voxels = group_by_voxel(textured_corner(seed), grid)
             engine.contribute(session, RoiSubset(name, "", 1, 1, voxels), grid)
             engine.align_due()
-        assert (fit.pid is None) == (alignment is None)
+        assert fit.pid is not None
     finally:
         fit.close()
 
