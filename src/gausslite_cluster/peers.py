@@ -126,7 +126,7 @@ class PartSender:
     """Owns the queue of received messages. Use it on the event loop; one thread decodes.
 
     A message is decoded to the codes of its Gaussians, once, by the server that received it. If some parts are stored
-    and another one is refused, the stored ones stay, as with the slices of UpdateCommitter.
+    and another one is refused, the stored ones stay, as with the slices of store_slices.
     """
 
     def __init__(self, host: RegionHost, regions: RegionServicer, peers: Peers, grid: VoxelGrid) -> None:

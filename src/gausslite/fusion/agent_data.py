@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.domain.voxels import RoiSubset
+from gausslite.domain.voxels import RoiSubset, VoxelBatch
 from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameAlignments
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import fuse
-from gausslite.fusion.vote_input import VoteInput
 
 _log = logging.getLogger(__name__)
 # no agent can join under such a name, because ids of agents hold no colon
@@ -46,26 +45,24 @@ class AgentData:
     change it. It wins a voxel until the agent's own Σkappa is higher. It is deleted when it wins no voxel.
     """
 
-    def __init__(
-        self, store: FusionStore, votes: VoteInput, alignments: FrameAlignments, parts: Sequence[AgentPart]
-    ) -> None:
-        self._store, self._votes, self._alignments = store, votes, alignments
-        self._parts = alignments, *parts
+    def __init__(self, store: FusionStore, alignments: FrameAlignments, parts: Sequence[AgentPart]) -> None:
+        self._store, self._alignments, self._parts = store, alignments, (alignments, *parts)
 
     def remove(self, name: str) -> Int64[ndarray, " v"]:
         """Delete all data of an agent, or an earlier map; returns the voxels that it had. Raises StorageError."""
         # the store last: a part waits for the end of what it writes
         for part in self._parts:
             part.remove_agent(name)
-        return np.union1d(self._store.remove_agent(name), self._votes.remove_agent(name))
+        return self._store.remove_agent(name)
 
-    def keep_as_earlier(self, agent_id: str) -> Int64[ndarray, " v"]:
+    def keep_as_earlier(self, agent_id: str, own: VoxelBatch) -> Int64[ndarray, " v"]:
         """Merge the agent's map into its earlier map; returns the voxels of that. Raises StorageError.
 
-        Where both have a voxel, the one with the higher Σkappa is kept. After a crash before the agent's data are
-        deleted, both names have the same Gaussians, and the next call merges them again.
+        own: the agent's map in the fused frame. Where both have a voxel, the one with the higher Σkappa is kept. After
+        a crash before the agent's data are deleted, both names have the same Gaussians, and the next call merges them
+        again.
         """
-        name, own = earlier_map_of(agent_id), self._votes.batch(agent_id)
+        name = earlier_map_of(agent_id)
         if int(own.counts.sum()) == 0:
             return np.zeros(0, np.int64)
         seq = self._store.totals(name).highest_update_seq + 1

@@ -107,13 +107,14 @@ class FusionEngine:
         self._objects, self._merged_objects = TeamObjects(store), MergedObjects()
         self._checks = UpdateChecks(store, quotas, MissionClock(store))
         self._alignments = FrameAlignments(store)
-        self._votes = VoteInput(store, self._alignments, self.grid)
+        frames = {name: alignment for name, (_, alignment) in self._alignments.frames().items()}
         first = time.time_ns() // 1000 if first_revision is None else first_revision
         # a refinement is of the whole map
         refined = None if store.is_shared else load_refinement(store)
-        self.maps = FusedMapLayers(self._votes, self._lock, self.grid, first, settings.max_removed_voxels, refined)
+        votes = VoteInput(store, frames, self.grid)
+        self.maps = FusedMapLayers(votes, self.grid, first, settings.max_removed_voxels, refined)
         parts = self._members.sessions, self._checks, self.traffic, self._keyframes, self._objects
-        self._agents = AgentData(store, self._votes, self._alignments, parts)
+        self._agents = AgentData(store, self._alignments, parts)
         self._unrecorded: dict[str, Int64[ndarray, " k"]] = {}
         self._aligner = aligner
         if aligner is not None:
@@ -449,16 +450,14 @@ class FusionEngine:
             if len(accepted):
                 before = self._unrecorded.get(agent_id, accepted)
                 self._unrecorded[agent_id] = np.union1d(before, accepted)
-        changed: dict[str, Int64[ndarray, " _"]] = {}
         failed: dict[str, GaussLiteError] = {}
-        for agent_id, keys in self._unrecorded.items():
+        for agent_id in self._unrecorded:
             try:
                 self._alignments.contribute(agent_id, self.compares_frames)
-                changed[agent_id] = self._votes.move(agent_id, keys)
             except GaussLiteError as error:
                 failed[agent_id] = error
-        self.maps.record_all(changed)
-        for agent_id in changed:
+        failed |= self.maps.update({name: keys for name, keys in self._unrecorded.items() if name not in failed})
+        for agent_id in [name for name in self._unrecorded if name not in failed]:
             self._observe(agent_id, self._unrecorded.pop(agent_id))
             self._drop_outgrown(agent_id)
         return failed
@@ -495,10 +494,9 @@ class FusionEngine:
         with self._lock:
             # a frame that changes meanwhile is moved to afterwards
             self._alignments.unmoved.discard(agent_id)
+            self.maps.set_frame(agent_id, self._alignments.get(agent_id))
         try:
-            for keys in self._votes.slices(agent_id):
-                with self._lock:
-                    self.maps.record(agent_id, self._votes.move(agent_id, keys))
+            self.maps.move(agent_id)
         except GaussLiteError:
             with self._lock:
                 self._alignments.unmoved.add(agent_id)
@@ -506,10 +504,10 @@ class FusionEngine:
 
     def _begin_new_map(self, agent_id: str) -> None:
         """Keep the agent's map as its earlier map, then delete all its data. Raises StorageError."""
-        kept = self._agents.keep_as_earlier(agent_id)
+        kept = self._agents.keep_as_earlier(agent_id, self.maps.read(agent_id))
         if len(kept):
             self._observe(earlier_map_of(agent_id), kept)
-            self.maps.record(earlier_map_of(agent_id), kept)
+            self.maps.update({earlier_map_of(agent_id): kept})
         self._remove(agent_id)
 
     def _drop_outgrown(self, agent_id: str) -> None:
@@ -528,8 +526,8 @@ class FusionEngine:
         self._remove(earlier_map_of(agent_id))
 
     def _remove(self, name: str) -> None:
-        changed = self._agents.remove(name)
+        removed = self._agents.remove(name)
         self._unrecorded.pop(name, None)
         if self._aligner is not None:
             self._aligner.forget(name)
-        self.maps.record(name, changed)
+        self.maps.remove_agent(name, removed)

@@ -162,39 +162,6 @@ _SELECT_ROWS = f"{SELECT_UPDATES} WHERE number IN (SELECT value FROM json_each(?
 _CHECKPOINT = "PRAGMA wal_checkpoint(PASSIVE)"
 
 
-class _Checkpoints:
-    """Copies the log into the file every few seconds, in a thread: a commit that did so would wait for the disk."""
-
-    def __init__(self, path: Path, write_lock: RLock) -> None:
-        """write_lock: held by each commit."""
-        self._path, self._write_lock = path, write_lock
-        self._is_closed, self.has_commits = Event(), False
-        self._thread = Thread(target=self._run, name="checkpoints", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Wait until the thread has ended."""
-        self._is_closed.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        with contextlib.closing(connect(self._path)) as db:
-            db.execute("PRAGMA synchronous = FULL")
-            while not self._is_closed.wait(_CHECKPOINT_PERIOD_S):
-                if self.has_commits:
-                    self.has_commits = False
-                    # what fails here fails in the next commit too, which says so
-                    with contextlib.suppress(sqlite3.Error):
-                        self._copy(db)
-
-    def _copy(self, db: sqlite3.Connection) -> None:
-        """Copy the log in rounds, the last one without commits: it begins anew only when all of it is in the file."""
-        for _ in range(_FREE_ROUNDS):
-            db.execute(_CHECKPOINT)
-        with self._write_lock:
-            db.execute(_CHECKPOINT)
-
-
 class SqliteStore(FusionStore):
     """A FusionStore in a file: write-ahead log, synchronous=FULL, one transaction per call, one server at a time.
 
@@ -218,16 +185,35 @@ class SqliteStore(FusionStore):
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
             self.incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
-            self._checkpoints = None if path == IN_MEMORY else _Checkpoints(path, self._write_lock)
             self._opened = opened.pop_all()
+        self._is_closed, self._has_commits = Event(), False
+        self._checkpoints = Thread(target=self._copy_log, name="checkpoints", daemon=True)
+        if path != IN_MEMORY:
+            self._checkpoints.start()
 
     def close(self) -> None:
         """Write the log into the file and close it."""
-        if self._checkpoints is not None:
-            # before the lock, for which its thread may wait
-            self._checkpoints.close()
+        self._is_closed.set()
+        if self._checkpoints.is_alive():
+            # before the lock, for which it may wait
+            self._checkpoints.join()
         with self._write_lock, self._read_lock:
             self._opened.close()
+
+    def _copy_log(self) -> None:
+        """Copy the log into the file every few seconds, in a thread: a commit that did so would wait for the disk."""
+        with contextlib.closing(connect(self._path)) as db:
+            db.execute("PRAGMA synchronous = FULL")
+            while not self._is_closed.wait(_CHECKPOINT_PERIOD_S):
+                if self._has_commits:
+                    self._has_commits = False
+                    # what fails here fails in the next commit too, which says so
+                    with contextlib.suppress(sqlite3.Error):
+                        for _ in range(_FREE_ROUNDS):
+                            db.execute(_CHECKPOINT)
+                        # without commits: the log begins anew only when all of it is in the file
+                        with self._write_lock:
+                            db.execute(_CHECKPOINT)
 
     def _load(self) -> None:
         """Check every row of updates and fill the index."""
@@ -268,5 +254,4 @@ class SqliteStore(FusionStore):
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
                 raise
-            if self._checkpoints is not None:
-                self._checkpoints.has_commits = True
+            self._has_commits = True

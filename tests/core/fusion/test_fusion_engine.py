@@ -188,3 +188,5 @@ def test_stored_voxels_that_could_not_be_voted_on_are_in_the_map_after_the_next_
     # the robot sends it again, and it is in the store already
     assert len(engine.contribute(sessions["ant"].session_id, make_subset("ant", 2, [(5, 5)]), GRID).stale) == 1
     assert engine.maps.size() == (3, 3)
+    again = FusionEngine(store, FusionSettings(grid=GRID))
+    assert np.array_equal(engine.maps.voted_map().keys, again.maps.voted_map().keys)
