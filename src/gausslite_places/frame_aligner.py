@@ -13,8 +13,8 @@ from numpy import ndarray
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.agent_data import earlier_map_of
 from gausslite.fusion.alignment import FrameDecisions, TeamView
+from gausslite.fusion.earlier_map import earlier_map_of
 from gausslite.fusion.frames import FrameAlignment, FrameFit
 from gausslite_places.fit_process import FitProcess
 from gausslite_places.frame_fit import MIN_SAMPLES, Fit, SurfaceSamples, fit_frame

@@ -23,8 +23,8 @@ from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
-from gausslite.fusion.agent_data import AgentData, earlier_map_of
 from gausslite.fusion.alignment import FrameAligner, FrameDecisions, TeamView
+from gausslite.fusion.earlier_map import earlier_map_of, keep_as_earlier
 from gausslite.fusion.frames import FrameAlignment, FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers, load_refinement, save_refinement
 from gausslite.fusion.keyframe_pool import (
@@ -113,8 +113,6 @@ class FusionEngine:
         refined = None if store.is_shared else load_refinement(store)
         votes = VoteInput(store, frames, self.grid)
         self.maps = FusedMapLayers(votes, self.grid, first, settings.max_removed_voxels, refined)
-        parts = self._members.sessions, self._checks, self.traffic, self._keyframes, self._objects
-        self._agents = AgentData(store, self._alignments, parts)
         self._unrecorded: dict[str, Int64[ndarray, " k"]] = {}
         self._aligner = aligner
         if aligner is not None:
@@ -156,7 +154,7 @@ class FusionEngine:
             raise MismatchError(f"mission: expected {quote_name(own)} as agreed here, got {quote_name(mission_id)}")
 
     def join(self, agent_id: str, requested: MissionConfig, fresh_map: bool = False, token: str = "") -> JoinResult:
-        """Open a session and end the agent's earlier one; fresh_map: the agent begins a new map, see AgentData.
+        """Open a session and end the agent's earlier one; fresh_map: the agent begins a new map, see earlier_map.py.
 
         Empty names in `requested` accept the server's. token: the robot's secret, see SessionRegistry. Raises
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
@@ -318,7 +316,7 @@ class FusionEngine:
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.
 
-        ban: refuse later joins under this name, also after a restart. The name of an earlier map (AgentData) deletes
+        ban: refuse later joins under this name, also after a restart. The name of an earlier map deletes
         only that. Raises InvalidInputError for an unknown agent that is not banned, StorageError.
         """
         with self._committing, self._lock:
@@ -504,7 +502,7 @@ class FusionEngine:
 
     def _begin_new_map(self, agent_id: str) -> None:
         """Keep the agent's map as its earlier map, then delete all its data. Raises StorageError."""
-        kept = self._agents.keep_as_earlier(agent_id, self.maps.read(agent_id))
+        kept = keep_as_earlier(self._store, self._alignments, agent_id, self.maps.read(agent_id))
         if len(kept):
             self._observe(earlier_map_of(agent_id), kept)
             self.maps.update({earlier_map_of(agent_id): kept})
@@ -526,8 +524,15 @@ class FusionEngine:
         self._remove(earlier_map_of(agent_id))
 
     def _remove(self, name: str) -> None:
-        removed = self._agents.remove(name)
+        """Delete all data of an agent, or an earlier map. Raises StorageError."""
+        self._alignments.remove_agent(name)
+        self._members.sessions.remove_agent(name)
+        self._checks.remove_agent(name)
+        self.traffic.remove_agent(name)
+        self._keyframes.remove_agent(name)
+        self._objects.remove_agent(name)
         self._unrecorded.pop(name, None)
         if self._aligner is not None:
             self._aligner.forget(name)
-        self.maps.remove_agent(name, removed)
+        # the store last: the parts wait for the end of what they write
+        self.maps.remove_agent(name, self._store.remove_agent(name))

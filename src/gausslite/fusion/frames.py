@@ -67,13 +67,9 @@ class FrameFit:
     is_better: bool
     is_apart: bool
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the fit as plain values, from which `from_json` makes one with the same bits."""
-        return {**asdict(self), "motion": self.motion.tolist()}
-
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> FrameFit:
-        """Return the fit of plain values. Raises KeyError, TypeError, ValueError."""
+        """Return the fit of the plain values that `asdict` and JSON make. Raises KeyError, TypeError, ValueError."""
         misfits = {name: Misfit(**values[name]) for name in ("before", "after")}
         return cls(**{**values, **misfits, "motion": np.array(values["motion"], np.float64).reshape(4, 4)})
 

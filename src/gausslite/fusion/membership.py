@@ -12,7 +12,7 @@ from threading import Lock
 
 from gausslite.domain import errors
 from gausslite.domain.checks import quote_name, require_identifier
-from gausslite.fusion.agent_data import is_earlier_map
+from gausslite.fusion.earlier_map import is_earlier_map
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, SessionRecord, reconcile

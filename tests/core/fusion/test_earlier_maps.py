@@ -8,7 +8,7 @@ import pytest
 from fusion_running import GRID, keys, make_subset
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.fusion.agent_data import earlier_map_of
+from gausslite.fusion.earlier_map import earlier_map_of
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.sqlite_store import SqliteStore
