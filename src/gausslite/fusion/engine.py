@@ -272,9 +272,8 @@ class FusionEngine:
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> None:
         """Set the motion to the fused map's frame that the agent declares, None if unknown. Raises StorageError."""
-        reason = (
-            "" if self.compares_frames else "this server compares no frames (frame-alignment = trust, or no plug-in)"
-        )
+        trusts = "this server compares no frames (frame-alignment = trust, or no plug-in)"
+        reason = "" if self.compares_frames else trusts
         with self._lock:
             is_new = self._alignments.declare(agent_id, T_fused_agent, reason)
         if is_new:
@@ -502,10 +501,12 @@ class FusionEngine:
 
     def _begin_new_map(self, agent_id: str) -> None:
         """Keep the agent's map as its earlier map, then delete all its data. Raises StorageError."""
+        name = earlier_map_of(agent_id)
         kept = keep_as_earlier(self._store, self._alignments, agent_id, self.maps.read(agent_id))
         if len(kept):
-            self._observe(earlier_map_of(agent_id), kept)
-            self.maps.update({earlier_map_of(agent_id): kept})
+            self._alignments.contribute(name, self.compares_frames)
+            self.maps.update({name: kept})
+            self._observe(name, kept)
         self._remove(agent_id)
 
     def _drop_outgrown(self, agent_id: str) -> None:
