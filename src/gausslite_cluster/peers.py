@@ -107,8 +107,8 @@ class Peers:
             voxels=part.voxels.to_row(),
         )
         with peer_errors(server):
-            # the end of the connection ends the wait
-            stored = await self.stub(server).StorePart(request)
+            # a part of a message that is sent again meanwhile is stored once
+            stored = await self.stub(server).StorePart(request, timeout=CALL_S)
         return StoredCount(stored.accepted_voxels, stored.stale_voxels)
 
     async def close(self) -> None:
@@ -126,7 +126,7 @@ class PartSender:
     """Owns the queue of received messages. Use it on the event loop; one thread decodes.
 
     A message is decoded to the codes of its Gaussians, once, by the server that received it. If some parts are stored
-    and another one is refused, the stored ones stay, as with the slices of UpdateCommitter.
+    and another one is refused, the stored ones stay, as with the slices of store_slices.
     """
 
     def __init__(self, host: RegionHost, regions: RegionServicer, peers: Peers, grid: VoxelGrid) -> None:

@@ -21,6 +21,7 @@ from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, merge_batches
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.store_values import SessionRecord
+from gausslite.fusion.traffic import Acknowledgements
 from gausslite.render.choose import choose_rasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
@@ -328,6 +329,11 @@ class Share:
     servicer: SharedServicer
 
     @property
+    def acknowledgements(self) -> Acknowledgements:
+        """Of the messages that agents have sent to this server."""
+        return self.sender.acknowledgements
+
+    @property
     def services(self) -> list[Service]:
         """The service for agents and watchers, and the one for the other servers."""
         return [self.servicer.service(), self.regions.service()]
@@ -350,10 +356,9 @@ class Share:
 
 
 @asynccontextmanager
-async def open_share(settings: ServerSettings, peer_address: str) -> AsyncIterator[Share]:
+async def open_share(settings: ServerSettings, url: str, peer_address: str) -> AsyncIterator[Share]:
     """Take part in a mission while the context is open. Raises InvalidInputError, StorageError."""
-    assert isinstance(settings.store, str)
-    slots = await asyncio.to_thread(SharedSlots, settings.store, peer_address)
+    slots = await asyncio.to_thread(SharedSlots, url, peer_address)
     _log.info("server %s: shares its mission; frames of agents are used as they are (trust)", peer_address)
 
     def create_servicer(engine: FusionEngine) -> FusionServicer:
@@ -363,7 +368,7 @@ async def open_share(settings: ServerSettings, peer_address: str) -> AsyncIterat
 
     # names are fixed, and frames are trusted
     agreed = settings.fusion.mission_config.with_default_names()
-    fusion = replace(settings.fusion, mission_id=agreed.mission_id, world_frame=agreed.world_frame, alignment=None)
+    fusion = replace(settings.fusion, mission_id=agreed.mission_id, world_frame=agreed.world_frame)
     host, peers = RegionHost(slots, fusion, create_servicer), Peers(settings.tls)
     regions = RegionServicer(host)
     sender = PartSender(host, regions, peers, fusion.grid)

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from threading import Lock, Timer
@@ -21,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from gausslite.domain.errors import UnavailableError
-from gausslite_places.frame_fit import FrameFit, SurfaceSamples, fit_frame
+from gausslite.fusion.frames import FrameFit
+from gausslite_places.frame_fit import SurfaceSamples, fit_frame
 from gausslite_places.unknown_frames import FrameSearch, find_frame
 
 _COMMAND = (sys.executable, "-m", "gausslite_places.fit_process")
@@ -125,7 +127,7 @@ def _serve(connection: Connection) -> None:
         while True:
             question = connection.recv_bytes()
             source, target = (_samples(connection.recv_bytes()) for _ in range(2))
-            connection.send_bytes(json.dumps(_answer(question, source, target)).encode())
+            connection.send_bytes(json.dumps(_answer(question, source, target), default=np.ndarray.tolist).encode())
 
 
 def _answer(question: bytes, source: SurfaceSamples, target: SurfaceSamples) -> dict[str, object]:
@@ -134,7 +136,7 @@ def _answer(question: bytes, source: SurfaceSamples, target: SurfaceSamples) -> 
     except Exception as error:
         # the next comparison may succeed
         return {"error": f"{type(error).__name__}: {error}"}
-    return {"fit": found.fit and found.fit.as_json(), "reason": found.reason}
+    return {"fit": found.fit and asdict(found.fit), "reason": found.reason}
 
 
 def _samples(data: bytes) -> SurfaceSamples:

@@ -7,8 +7,7 @@ and by colour, because the optimum of a registration alone is 15 to 30 mm off ev
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -16,6 +15,7 @@ from numpy import ndarray
 
 from gausslite.domain.pose import rotation_angle_deg, transform_points
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, gather_rows
+from gausslite.fusion.frames import FrameFit, Misfit
 from gausslite_places.surface_registration import Surface
 
 MIN_SAMPLES = 60
@@ -37,43 +37,6 @@ _SIGMAS = 4.0
 """Of 650 pairs of maps in the same frame, none has a motion with such gains of both residuals."""
 _APART = 0.65
 """Mean distance as a share of its saturation; the largest of 650 pairs of maps in the same frame is 0.55."""
-
-
-@dataclass(frozen=True, slots=True)
-class Misfit:
-    """Mean point-to-plane distance and luminance difference of samples of one map to another, both saturated."""
-
-    distance_m: float
-    colour: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameFit:
-    """A motion of the source map, and the misfit before and after it on the held-out half of the overlap.
-
-    shift_m, rotation_deg: the motion of the overlap's centre and its angle. compared: number of held-out samples.
-    is_better: distance and colour improve by more than four times their uncertainty. is_apart: before the motion, the
-    surfaces are farther apart than those of maps in the same frame.
-    """
-
-    motion: Float64[ndarray, "4 4"]
-    before: Misfit
-    after: Misfit
-    shift_m: float
-    rotation_deg: float
-    compared: int
-    is_better: bool
-    is_apart: bool
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fit as plain values, from which `from_json` makes one with the same bits."""
-        return {**asdict(self), "motion": self.motion.tolist()}
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> FrameFit:
-        """Return the fit of plain values. Raises KeyError, TypeError, ValueError."""
-        misfits = {name: Misfit(**values[name]) for name in ("before", "after")}
-        return cls(**{**values, **misfits, "motion": np.array(values["motion"], np.float64).reshape(4, 4)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

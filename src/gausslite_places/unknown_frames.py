@@ -8,27 +8,22 @@ fit.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from threading import RLock
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from gausslite.domain.camera import back_project
-from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
+from gausslite.domain.errors import CodecError, InvalidInputError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.pose import orthonormal, rotation_angle_deg, transform_of, transform_points
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.frames import FrameAlignment, FrameAlignments
-from gausslite.fusion.keyframe_pool import KeyframePool
-from gausslite.fusion.store import FusionStore
-from gausslite_places.frame_aligner import FrameAligner, log_change
+from gausslite.fusion.alignment import TeamView
+from gausslite.fusion.frames import FrameAlignment, FrameFit
 from gausslite_places.frame_fit import (
     LUMINANCE,
-    FrameFit,
     SurfaceSamples,
     TargetSurface,
     blocks_of,
@@ -36,9 +31,9 @@ from gausslite_places.frame_fit import (
     in_shared_cubes,
     occupied_blocks,
 )
+from gausslite_places.map_samples import thinned_samples
 from gausslite_places.surface_registration import Surface, can_match_without_guess, matched_motion
 
-_log = logging.getLogger(__name__)
 _MIN_SAMPLES = 300
 _SPACINGS_M = (0.1, 0.15, 0.2)
 """Of the samples whose features are matched: no single one finds the motions of all homes."""
@@ -263,89 +258,78 @@ def _one_of_each_cube(samples: SurfaceSamples) -> SurfaceSamples:
 
 
 class UnknownFrames:
-    """Searches the frames of unlocalised agents as their maps and the team's grow. Call `run` from one thread."""
+    """Searches the frames of unlocalised agents as their maps and the team's grow. Call `search` from one thread."""
 
-    def __init__(
-        self,
-        store: FusionStore,
-        alignments: FrameAlignments,
-        aligner: FrameAligner,
-        keyframes: KeyframePool,
-        lock: RLock,
-        find: Find,
-    ) -> None:
-        self._store, self._alignments, self._aligner = store, alignments, aligner
-        self._keyframes, self._lock, self._find = keyframes, lock, find
+    def __init__(self, find: Find) -> None:
+        self._find = find
         # the team at the latest search, the agent's size and the team's
         self._searched: dict[str, tuple[tuple[str, ...], tuple[int, int]]] = {}
         self._failed: dict[str, int] = {}
+        # of each agent, by the ids of its keyframes
         self._samples_of_keyframe: dict[str, dict[int, SurfaceSamples]] = {}
 
-    def run(self) -> None:
-        """Search the frames of the agents with enough new data; the aligner moves the maps. Raises StorageError."""
-        with self._lock:
-            names = [name for name in self._alignments.names() if self._size(name)]
-            for known in (self._searched, self._failed, self._samples_of_keyframe):
-                for name in known.keys() - set(names):
-                    del known[name]
-            waiting = [name for name in names if not self._alignments.get(name).is_localised]
-            team = [name for name in names if self._alignments.get(name).is_used]
-            if waiting and not team:
-                # nobody knows a frame: the first agent's is as good as any
-                first = waiting.pop(0)
-                self._put(first, self._alignments.get(first).in_state({}, is_quarantined=False, is_first=True))
-                team = [first]
-        for name in waiting:
-            self._search(name, team)
+    def search(self, team: TeamView, frames: Mapping[str, FrameAlignment]) -> dict[str, FrameAlignment]:
+        """Search the frames of the agents with enough new data; returns their new alignments.
 
-    def _search(self, agent_id: str, team: Sequence[str]) -> None:
-        with self._lock:
-            before = {name: self._alignments.get(name) for name in (agent_id, *team)}
-            sizes = self._size(agent_id), sum(self._size(name) for name in team)
-            last_team, last_sizes = self._searched.get(agent_id, ((), sizes))
-            has_grown = any(now >= _GROWTH * then for now, then in zip(sizes, last_sizes, strict=True))
-            if last_team == tuple(team) and not has_grown:
-                return
-            self._searched[agent_id] = tuple(team), sizes
+        frames: of all agents, by rank.
+        """
+        names = [name for name in frames if _size(team, name)]
+        for known in (self._searched, self._failed, self._samples_of_keyframe):
+            for name in known.keys() - set(names):
+                del known[name]
+        waiting = [name for name in names if not frames[name].is_localised]
+        localised = {name: frames[name] for name in names if frames[name].is_used}
+        found: dict[str, FrameAlignment] = {}
+        if waiting and not localised:
+            # nobody knows a frame: the first agent's is as good as any
+            first = waiting.pop(0)
+            found[first] = localised[first] = frames[first].in_state({}, is_quarantined=False, is_first=True)
+        for name in waiting:
+            if self._is_due(team, name, tuple(localised)):
+                found[name] = self._search(team, name, frames[name], localised)
+        return found
+
+    def _is_due(self, team: TeamView, agent_id: str, localised: tuple[str, ...]) -> bool:
+        sizes = _size(team, agent_id), sum(_size(team, name) for name in localised)
+        last, last_sizes = self._searched.get(agent_id, ((), sizes))
+        has_grown = any(now >= _GROWTH * then for now, then in zip(sizes, last_sizes, strict=True))
+        is_due = last != localised or has_grown
+        if is_due:
+            self._searched[agent_id] = localised, sizes
+        return is_due
+
+    def _search(
+        self, team: TeamView, agent_id: str, unknown: FrameAlignment, localised: Mapping[str, FrameAlignment]
+    ) -> FrameAlignment:
         try:
-            found = self._find(self._samples(agent_id), SurfaceSamples.concatenate([*map(self._samples, team)]))
+            source = self._samples(team, agent_id, unknown)
+            target = SurfaceSamples.concatenate([self._samples(team, *own) for own in localised.items()])
+            found = self._find(source, target)
             self._failed.pop(agent_id, None)
-        except (UnavailableError, CodecError, InvalidInputError) as error:
+        except (UnavailableError, CodecError, InvalidInputError, StorageError) as error:
             # one agent's data must not end the comparisons of the others, nor be searched for ever
             found = FrameSearch(None, f"the search failed: {error}")
             self._failed[agent_id] = self._failed.get(agent_id, 0) + 1
             if self._failed[agent_id] < _ATTEMPTS:
                 del self._searched[agent_id]
-        with self._lock:
-            if any(self._alignments.get(name) is not alignment for name, alignment in before.items()):
-                return
-            unknown = before[agent_id]
-            after = unknown.unlocalised(found.reason) if found.fit is None else unknown.localised(found.fit)
-            self._put(agent_id, after)
+        return unknown.unlocalised(found.reason) if found.fit is None else unknown.localised(found.fit)
 
-    def _put(self, agent_id: str, after: FrameAlignment) -> None:
-        before = self._alignments.get(agent_id)
-        if after.is_localised:
-            self._aligner.put_frame(agent_id, after)
-        elif after.message != before.message:
-            self._alignments.put(agent_id, after)
-        log_change(agent_id, before, after)
-
-    def _samples(self, agent_id: str) -> SurfaceSamples:
+    def _samples(self, team: TeamView, agent_id: str, alignment: FrameAlignment) -> SurfaceSamples:
         """Return samples of the agent's voxels and keyframes, in the fused frame if the agent is localised."""
-        with self._lock:
-            T = self._alignments.get(agent_id).T_fused_agent
-            indices = np.array(self._keyframes.indices(agent_id), np.int64)
-            chosen = indices[:: max(1, -(-len(indices) // _MAX_KEYFRAMES))].tolist()
-            encoded = [self._keyframes.find(agent_id, index) for index in chosen]
+        ids = team.keyframe_ids(agent_id)
+        chosen = list(ids)[:: max(1, -(-len(ids) // _MAX_KEYFRAMES))]
+        # one that was received again is read again
         before = self._samples_of_keyframe.get(agent_id, {})
-        self._samples_of_keyframe[agent_id] = samples = {
-            hash(data): before.get(hash(data)) or keyframe_samples(self._keyframes.decode([(agent_id, data)])[0].frame)
-            for data in encoded
-        }
-        seen = _one_of_each_cube(SurfaceSamples.concatenate([*samples.values()])).moved(T)
-        return SurfaceSamples.concatenate([self._aligner.samples(agent_id), seen])
+        samples = {ids[index]: before[ids[index]] for index in chosen if ids[index] in before}
+        for index in chosen:
+            frame = None if ids[index] in samples else team.keyframe(agent_id, index)
+            if frame is not None:
+                samples[ids[index]] = keyframe_samples(frame)
+        self._samples_of_keyframe[agent_id] = samples
+        seen = _one_of_each_cube(SurfaceSamples.concatenate([*samples.values()])).moved(alignment.T_fused_agent)
+        return SurfaceSamples.concatenate([thinned_samples(team, agent_id, alignment), seen])
 
-    def _size(self, agent_id: str) -> int:
-        """Return a measure of what the server has of an agent's surfaces."""
-        return self._store.totals(agent_id).voxels + _KEYFRAME_VOXELS * self._keyframes.count(agent_id)
+
+def _size(team: TeamView, agent_id: str) -> int:
+    """Return a measure of what the server has of an agent's surfaces."""
+    return team.totals(agent_id).voxels + _KEYFRAME_VOXELS * len(team.keyframe_ids(agent_id))

@@ -17,10 +17,9 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
-_SHARING = ("peers", "region_", "shared_")
 NEED_AN_EXTRA = {
     "torch": ("gausslite.render.reference", "gausslite.render.cuda", "gausslite_bench.raster.gsplat_baseline"),
-    "psycopg": ("gausslite.fusion.postgres_", *(f"gausslite_fusion_server.{name}" for name in _SHARING)),
+    "psycopg": tuple(f"gausslite_cluster.{name}" for name in ("peers", "postgres_", "region_", "shared_")),
     "rclpy": ("gausslite_ros.node",),
     "rospy": ("gausslite_ros.node_ros1",),
     "viser": ("gausslite_view", "gausslite_bench.view_rates"),

@@ -46,7 +46,7 @@ from gausslite.domain.voxels import (
     group_by_voxel,
     select_keys,
 )
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.vote import fuse
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.fusion_service_pb2_grpc import FusionServiceStub
@@ -88,7 +88,7 @@ def scattered(agent_id: str, seq: int, seed: int, count: int = 60) -> RoiSubset:
 
 def latest_of(subsets: list[RoiSubset]) -> VoxelBatch:
     """One agent's latest update of each voxel, as a store has it after these messages."""
-    store = MemoryStore()
+    store = SqliteStore()
     for subset in subsets:
         stored = decode_stored(encode_subset(subset, GRID))[0]
         store.put_all([replace(stored, voxels=stored.voxels.with_computed_sums())])

@@ -16,23 +16,32 @@ from gausslite.domain.errors import UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, transform_points
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
-from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import (
-    AlignmentSettings,
-    AlignmentState,
-    FrameAlignment,
+from gausslite.domain.voxels import (
+    RoiSubset,
+    VoxelBatch,
+    VoxelGrid,
+    group_by_voxel,
+    merge_batches,
+    select_voxels,
+    tombstones,
 )
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameFit
 from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig
-from gausslite_places.frame_fit import Fit, FrameFit, SurfaceSamples, fit_frame
+from gausslite_places.frame_aligner import MapAligner
+from gausslite_places.frame_fit import Fit, SurfaceSamples, fit_frame
 
 GRID = VoxelGrid(0.10)
 ANYTHING = MissionConfig("", "", 0.10)
-SETTINGS = FusionSettings(grid=GRID, alignment=AlignmentSettings())
+SETTINGS = FusionSettings(grid=GRID)
+
+
+def aligning(store: FusionStore | None = None, fit: Fit = fit_frame) -> FusionEngine:
+    return FusionEngine(store or SqliteStore(), SETTINGS, aligner=MapAligner(GRID, fit))
 
 
 def wrong_frame(shift_m: tuple[float, float, float], angle_deg: float = 0.0) -> np.ndarray:
@@ -47,7 +56,7 @@ def send(engine: FusionEngine, agent_id: str, gaussians: Gaussians, seq: int = 1
 
 def team(T_agent_fused: np.ndarray, store: FusionStore | None = None, fit: Fit = fit_frame) -> FusionEngine:
     """An engine with ant, in the fused frame, and bee, whose frame is wrong and whose kappa wins."""
-    engine = FusionEngine(store or MemoryStore(), SETTINGS, fit=fit)
+    engine = aligning(store, fit)
     send(engine, "ant", corner(0))
     send(engine, "bee", move_gaussians(corner(1, kappa=9), T_agent_fused))
     return engine
@@ -110,7 +119,7 @@ def test_too_little_shared_surface_gives_no_fit() -> None:
 def test_a_frame_within_the_noise_changes_no_bit() -> None:
     engine = team(np.eye(4))
     before = engine.maps.voted_map()
-    assert not engine.align_due()
+    assert not engine.align_due().is_changed
     assert (state_of(engine, "ant"), state_of(engine, "bee")) == (AlignmentState.REFERENCE, AlignmentState.ALIGNED)
     assert engine.maps.voted_map().gaussians.means_m.tobytes() == before.gaussians.means_m.tobytes()
 
@@ -120,8 +129,8 @@ def test_five_centimetres_and_two_degrees_are_corrected_also_after_a_restart(tmp
     engine = team(wrong_frame((0.03, -0.03, 0.025), 2.0), store)
     wrong = surface_error_m(engine.maps.voted_map("bee").gaussians.means_m)
     revision = engine.revision
-    assert engine.align_due()
-    assert not engine.align_due()
+    assert engine.align_due().is_changed
+    assert not engine.align_due().is_changed
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
     corrected = surface_error_m(engine.maps.voted_map("bee").gaussians.means_m)
     assert wrong > 0.015
@@ -131,7 +140,7 @@ def test_five_centimetres_and_two_degrees_are_corrected_also_after_a_restart(tmp
     assert len(engine.maps.changes(revision).won.batch) > 0
     store.close()
     store = SqliteStore(tmp_path / "store.sqlite")
-    assert surface_error_m(FusionEngine(store, SETTINGS).maps.voted_map("bee").gaussians.means_m) == corrected
+    assert surface_error_m(aligning(store).maps.voted_map("bee").gaussians.means_m) == corrected
     store.close()
 
 
@@ -160,7 +169,7 @@ def box_on_table(seed: int) -> np.ndarray:
     ids=["a box on the table", "another part of the table", "box and another part"],
 )
 def test_correct_frames_of_regions_that_hardly_overlap_stay_as_they_are(points: np.ndarray) -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     send(engine, "ant", plain_gaussians(table_part(0, 0.0, 0.5), kappa=5))
     for seq in range(1, 5):
         send(engine, "bee", plain_gaussians(points[: seq * len(points) // 4], kappa=9), seq)
@@ -182,15 +191,15 @@ def send_twice(engine: FusionEngine, agent_id: str, gaussians: Gaussians) -> Non
 
 
 def test_a_gross_misfit_is_quarantined_if_newer_data_repeat_it_and_returns_when_it_is_mended() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     send(engine, "ant", corner(0))
     first, second = halves(move_gaussians(corner(1, kappa=9), WRONG))
     send(engine, "bee", first)
-    assert not engine.align_due()
+    assert not engine.align_due().is_changed
     assert state_of(engine, "bee") is AlignmentState.UNKNOWN
     assert "contradicts ant" in alignment_of(engine, "bee").message
     send(engine, "bee", second, 2)
-    assert engine.align_due()
+    assert engine.align_due().is_changed
     [bee] = [status for status in engine.status().agents if status.agent_id == "bee"]
     assert bee.alignment.state is AlignmentState.QUARANTINED
     assert "contradicts ant: 0." in bee.alignment.message
@@ -209,7 +218,7 @@ def test_a_gross_misfit_is_quarantined_if_newer_data_repeat_it_and_returns_when_
 
 
 def test_a_lone_agent_that_two_others_contradict_is_quarantined_even_if_it_came_first() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     send(engine, "ant", move_gaussians(corner(0, kappa=9), WRONG))
     for seed, name in enumerate(("bee", "cat"), start=1):
         send(engine, name, corner(seed))
@@ -226,18 +235,18 @@ def test_who_contradicts_an_evicted_agent_is_released_also_after_a_restart(tmp_p
     for restarts in (False, True):
         path.unlink(missing_ok=True)
         store = SqliteStore(path)
-        engine = FusionEngine(store, SETTINGS)
+        engine = aligning(store)
         send(engine, "ant", move_gaussians(corner(0), WRONG))
         send_twice(engine, "bee", corner(1))
         assert state_of(engine, "bee") is AlignmentState.QUARANTINED
         if restarts:
             store.close()
             store = SqliteStore(path)
-            engine = FusionEngine(store, SETTINGS)
+            engine = aligning(store)
             engine.align_due()
             assert state_of(engine, "bee") is AlignmentState.QUARANTINED
         engine.evict("ant", ban=True)
-        assert engine.align_due()
+        assert engine.align_due().is_changed
         assert state_of(engine, "bee") is AlignmentState.REFERENCE
         won = {status.agent_id: status.won_voxels for status in engine.status().agents}
         assert won["bee"] > 0
@@ -245,7 +254,7 @@ def test_who_contradicts_an_evicted_agent_is_released_also_after_a_restart(tmp_p
 
 
 def test_one_early_voxel_harms_nobody() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     rng = np.random.default_rng(0)
     send(engine, "eve", plain_gaussians(rng.uniform(0.0, 0.1, (400, 3)), kappa=9))
     send_twice(engine, "ant", corner(0))
@@ -255,7 +264,7 @@ def test_one_early_voxel_harms_nobody() -> None:
     assert engine.maps.won_voxels("ant") + engine.maps.won_voxels("bee") > 100
 
 
-class CountingStore(MemoryStore):
+class CountingStore(SqliteStore):
     """Records how many voxels each read asks for; -1 for all."""
 
     def __init__(self) -> None:
@@ -275,7 +284,7 @@ def test_comparing_and_correcting_read_slices_and_never_a_whole_map() -> None:
     store = CountingStore()
     engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0), store)
     store.reads.clear()
-    assert engine.align_due()
+    assert engine.align_due().is_changed
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
     assert len(store.reads) > 10
     assert 0 <= min(store.reads) <= max(store.reads) <= 128
@@ -284,7 +293,7 @@ def test_comparing_and_correcting_read_slices_and_never_a_whole_map() -> None:
 def test_a_message_of_an_agent_in_another_frame_reads_its_own_voxels() -> None:
     for shift_m in ((5.0, 0.02, 0.0), (0.0, 0.0, 0.0)):
         store = CountingStore()
-        engine = FusionEngine(store, SETTINGS)
+        engine = aligning(store)
         engine.join("bee", ANYTHING)
         engine.declare_frame("bee", wrong_frame(shift_m, 40.0))
         send(engine, "bee", corner(1))
@@ -295,8 +304,8 @@ def test_a_message_of_an_agent_in_another_frame_reads_its_own_voxels() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_moved_voxels_are_those_of_a_new_engine_whatever_the_order_of_messages(seed: int) -> None:
-    rng, store = np.random.default_rng(seed), MemoryStore()
-    engine = FusionEngine(store, SETTINGS)
+    rng, store = np.random.default_rng(seed), SqliteStore()
+    engine = aligning(store)
     send(engine, "ant", corner(0))
     engine.join("bee", ANYTHING)
     for seq in range(1, 9):
@@ -307,7 +316,7 @@ def test_moved_voxels_are_those_of_a_new_engine_whatever_the_order_of_messages(s
         gone = tombstones(np.setdiff1d(store.batch("bee").keys, batch.keys)[: int(rng.integers(0, 4))])
         session = engine.join("bee", ANYTHING).session.session_id
         engine.contribute(session, RoiSubset("bee", "", seq, seq, merge_batches(batch, gone)), GRID)
-    again = FusionEngine(store, SETTINGS)
+    again = aligning(store)
     for read in (lambda e: e.maps.voted_map(), lambda e: e.maps.union_map(), lambda e: e.maps.changes().won.batch):
         ours, theirs = read(engine), read(again)
         assert np.array_equal(ours.keys, theirs.keys)
@@ -331,20 +340,21 @@ def test_messages_are_stored_during_a_comparison_and_its_result_is_dropped_with_
 
 
 def test_an_agent_that_cannot_be_compared_stays_due_and_the_others_are_compared() -> None:
-    failures = [UnavailableError("killed")]
+    calls = []
 
     def fail_once(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
-        if failures:
-            raise failures.pop()
+        calls.append(source)
+        if len(calls) == 1:
+            raise UnavailableError("killed")
         return fit_frame(source, target)
 
     engine = team(wrong_frame((0.1, 0.0, 0.1), 3.0), fit=fail_once)
     with pytest.raises(UnavailableError, match="agent 'ant': killed"):
         engine.align_due()
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
-    assert engine.is_alignment_due
-    engine.align_due()
-    assert not engine.is_alignment_due
+    compared = len(calls)
+    assert not engine.align_due().is_due
+    assert len(calls) > compared
 
 
 def test_agents_take_turns_and_a_single_earlier_agent_is_compared_once() -> None:
@@ -369,7 +379,7 @@ def test_agents_take_turns_and_a_single_earlier_agent_is_compared_once() -> None
 
 
 def test_later_updates_of_a_drifting_agent_get_their_own_correction() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     send(engine, "ant", corner(0))
     scene = corner(1, kappa=9)
     order = np.argsort(scene.means_m[:, 0], kind="stable")
@@ -385,7 +395,7 @@ def test_later_updates_of_a_drifting_agent_get_their_own_correction() -> None:
 
 def test_a_declared_frame_is_used_and_can_be_refined() -> None:
     T_agent_fused = wrong_frame((5.0, 0.0, 0.0), 40.0)
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     send(engine, "ant", corner(0))
     engine.join("bee", ANYTHING)
     engine.declare_frame("bee", wrong_frame((0.05, 0.03, 0.0)) @ inverse(T_agent_fused))
@@ -396,7 +406,7 @@ def test_a_declared_frame_is_used_and_can_be_refined() -> None:
 
 
 def test_a_keyframe_that_a_declared_frame_moves_out_of_range_is_left_out() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     engine.join("bee", ANYTHING)
     engine.declare_frame("bee", wrong_frame((9000.0, 0.0, 0.0)))
     near, far = (
@@ -416,3 +426,24 @@ def test_moved_gaussians_keep_their_shape() -> None:
     w, x, y, z = moved.quats_wxyz.T.astype(np.float64)
     axis = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
     assert axis == pytest.approx(np.tile(T[:3, 0], (10, 1)), abs=1e-5)
+
+
+@pytest.mark.parametrize(("shift_m", "is_kept"), [(0.0, True), (0.05, True), (0.22, False)])
+def test_an_earlier_map_in_another_frame_is_corrected_or_deleted(shift_m: float, is_kept: bool) -> None:
+    engine = aligning()
+
+    def reboot() -> str:
+        return engine.join("ant", ANYTHING, fresh_map=True).session.session_id
+
+    session = reboot()
+    engine.contribute(session, RoiSubset("ant", "", 1, 1, group_by_voxel(corner(0), GRID)), GRID)
+    session, whole = reboot(), group_by_voxel(move_gaussians(corner(1), wrong_frame((shift_m,) * 3)), GRID)
+    for seq in (1, 2):
+        part = select_voxels(whole, np.arange(len(whole)) % 2 == seq % 2)
+        engine.contribute(session, RoiSubset("ant", "", seq, seq, part), GRID)
+        engine.align_due()
+    status = {each.agent_id: each for each in engine.status().agents}
+    assert ("ant:earlier" in status) == is_kept
+    assert status["ant"].alignment.state is not AlignmentState.QUARANTINED
+    if not is_kept:
+        assert status["ant"].won_voxels == status["ant"].voxels > 0

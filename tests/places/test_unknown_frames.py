@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,23 +22,28 @@ from gausslite.domain.pose import inverse, rotation_angle_deg, transform_of, tra
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import AlignmentSettings, AlignmentState, FrameAlignment
+from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameFit, Misfit
 from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig
-from gausslite_places.frame_fit import FrameFit, Misfit, SurfaceSamples
-from gausslite_places.unknown_frames import FrameSearch, find_frame, keyframe_samples
+from gausslite_places.frame_aligner import MapAligner
+from gausslite_places.frame_fit import Fit, SurfaceSamples, fit_frame
+from gausslite_places.unknown_frames import Find, FrameSearch, find_frame, keyframe_samples
 
 pytest.importorskip("kiss_matcher")
 
 GRID = VoxelGrid(0.10)
 ANYTHING = MissionConfig("", "", 0.10)
-SETTINGS = FusionSettings(grid=GRID, alignment=AlignmentSettings())
+SETTINGS = FusionSettings(grid=GRID)
 T_BEE_ROOM = transform_of(np.array([7.0, -5.0, 1.0, 0.0, 0.0, 2.6]))
 """Where the room is for the agent bee: 8.7 m and 149 degrees away."""
 CENTRE_M = np.array([[2.0, 1.5, 1.2]])
+
+
+def aligning(store: FusionStore | None = None, fit: Fit = fit_frame, find: Find = find_frame) -> FusionEngine:
+    return FusionEngine(store or SqliteStore(), SETTINGS, aligner=MapAligner(GRID, fit, find))
 
 
 @cache
@@ -82,7 +90,7 @@ def report(x_m: float) -> ObjectReport:
 
 def test_an_agent_in_an_unknown_frame_stays_apart_until_the_server_has_found_it(tmp_path: Path) -> None:
     store: FusionStore = SqliteStore(tmp_path / "store.sqlite")
-    engine = FusionEngine(store, SETTINGS)
+    engine = aligning(store)
     send(engine, "ant", scan(0))
     few = move_gaussians(scan(1, kappa=9), T_BEE_ROOM).take(np.arange(150))
     send(engine, "bee", few, unknown=True)
@@ -99,7 +107,7 @@ def test_an_agent_in_an_unknown_frame_stays_apart_until_the_server_has_found_it(
 
     send(engine, "bee", move_gaussians(scan(1, kappa=9), T_BEE_ROOM), seq=2)
     revision = engine.revision
-    assert engine.align_due()
+    assert engine.align_due().is_changed
     found = alignment_of(engine, "bee")
     assert found.state is AlignmentState.CORRECTED
     assert "frame unknown: found by the server" in found.message
@@ -117,7 +125,7 @@ def test_an_agent_in_an_unknown_frame_stays_apart_until_the_server_has_found_it(
     voxels = won(engine, "bee")
     store.close()
     store = SqliteStore(tmp_path / "store.sqlite")
-    again = FusionEngine(store, SETTINGS)
+    again = aligning(store)
     # it joins again without knowing its frame
     again.join("bee", ANYTHING)
     again.declare_frame("bee", None)
@@ -166,7 +174,7 @@ def test_a_room_that_the_team_has_twice_is_found_with_the_rooms_beside_it() -> N
 
 
 def test_without_a_known_frame_the_first_agent_defines_it_until_one_that_knows_its_own_joins() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    engine = aligning()
     T_ant_room = transform_of(np.array([1.0, 2.0, 0.0, 0.0, 0.0, -1.0]))
     send(engine, "ant", move_gaussians(scan(0), T_ant_room), unknown=True)
     send(engine, "bee", move_gaussians(scan(1, kappa=9), T_BEE_ROOM), unknown=True)
@@ -185,14 +193,17 @@ def test_without_a_known_frame_the_first_agent_defines_it_until_one_that_knows_i
 
 
 def test_a_found_frame_that_newer_data_contradict_is_taken_back() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)
+    wrong = transform_of(np.array([0.6, 0.4, 0.0, 0.0, 0.0, 0.2])) @ inverse(T_BEE_ROOM)
+    fit = FrameFit(wrong, Misfit(0.1, 0.25), Misfit(0.0, 0.0), 9.0, 149.0, 500, True, False)
+    store = SqliteStore()
+    engine = aligning(store, fit=lambda *_: None, find=lambda *_: FrameSearch(fit))
     send(engine, "ant", scan(0))
     bee = move_gaussians(scan(1, kappa=9), T_BEE_ROOM)
     halves = [bee.take(np.arange(start, len(bee), 2)) for start in (0, 1)]
     send(engine, "bee", halves[0], unknown=True)
-    wrong = transform_of(np.array([0.6, 0.4, 0.0, 0.0, 0.0, 0.2])) @ inverse(T_BEE_ROOM)
-    fit = FrameFit(wrong, Misfit(0.1, 0.25), Misfit(0.0, 0.0), 9.0, 149.0, 500, True, False)
-    engine._aligner.put_frame("bee", alignment_of(engine, "bee").localised(fit))
+    engine.align_due()
+    assert np.array_equal(alignment_of(engine, "bee").T_fused_agent, wrong)
+    engine = aligning(store)
     send(engine, "bee", halves[1], seq=2)
     assert won(engine, "bee") > 0
     engine.align_due()
@@ -205,7 +216,7 @@ def test_a_found_frame_that_newer_data_contradict_is_taken_back() -> None:
 
 
 def test_an_agent_that_knows_its_frame_now_is_used_as_sent() -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     send(engine, "ant", scan(0), unknown=True)
     engine.align_due()
     assert "frame-alignment = trust" in alignment_of(engine, "ant").message
@@ -221,7 +232,7 @@ def test_a_search_that_fails_is_made_twice_and_then_with_more_data_or_after_the_
         sizes.append(len(source))
         raise UnavailableError("the process of the comparisons ended 2 times, with code -9")
 
-    engine = FusionEngine(MemoryStore(), SETTINGS, find=find)
+    engine = aligning(find=find)
     send(engine, "ant", scan(0))
     send(engine, "bee", scan(1).take(np.arange(400)), unknown=True)
     for _ in range(5):
@@ -241,7 +252,7 @@ def test_a_search_that_fails_is_made_twice_and_then_with_more_data_or_after_the_
 
 
 def test_a_keyframe_that_no_decoder_reads_ends_no_comparison_of_others() -> None:
-    engine = FusionEngine(MemoryStore(), SETTINGS)  # without a decoder
+    engine = aligning()  # without a decoder
     send(engine, "ant", scan(0))
     send(engine, "bee", scan(1), unknown=True)
     session = engine.join("bee", MissionConfig("", "", SETTINGS.grid.size_m)).session
@@ -258,3 +269,28 @@ def test_an_image_that_no_room_gives_has_not_more_samples_than_a_view() -> None:
     depth_m = (2.7 + 2.2 * np.sin(rows / 60) * np.sin(columns / 60)).astype(np.float32)
     waves = Frame(0, 0, np.zeros((*depth_m.shape, 3), np.uint8), depth_m, camera, np.eye(4))
     assert 10_000 <= len(keyframe_samples(waves)) <= 20_000
+
+
+def test_a_slow_disk_delays_nobody_while_keyframes_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    store, begun, released = SqliteStore(), Event(), Event()
+    engine = aligning(store, find=lambda *_: FrameSearch(None))
+    send(engine, "ant", scan(0))
+    send(engine, "bee", scan(1), unknown=True)
+    session = engine.join("bee", ANYTHING).session
+    engine.add_keyframe(session.session_id, EncodedKeyframe("bee", 0, 1, 1, b"an image"))
+    read = store.keyframe
+
+    def read_slowly(*arguments: Any) -> bytes:
+        begun.set()
+        assert released.wait(60)
+        return read(*arguments)
+
+    monkeypatch.setattr(store, "keyframe", read_slowly)
+    with ThreadPoolExecutor(2) as threads:
+        run = threads.submit(engine.align_due)
+        assert begun.wait(60)
+        try:
+            assert threads.submit(engine.alignment, "ant").result(30).is_used
+        finally:
+            released.set()
+        run.result(60)

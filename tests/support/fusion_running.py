@@ -21,10 +21,11 @@ from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
+from gausslite.fusion.alignment import FrameAligner
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -80,12 +81,14 @@ def fusion_server(
     refine: RefineSettings | None = None,
     tls: Tls | None = None,
     address: str = "127.0.0.1:0",
+    aligner: FrameAligner | None = None,
 ) -> Iterator[RunningServer]:
     """Start a fusion server on a free port or `address` with the reference rasterizer; the caller owns the store.
 
     With tls the client uses the server's certificate; the stub and the channel do not work then.
     """
-    engine = FusionEngine(store or MemoryStore(), settings or FusionSettings(grid=GRID), decode_keyframe=decode_frame)
+    settings = settings or FusionSettings(grid=GRID)
+    engine = FusionEngine(store or SqliteStore(), settings, decode_keyframe=decode_frame, aligner=aligner)
     settings_of_refinement = refine or RefineSettings(iterations=3, report_every=1)
     servicer = FusionServicer(engine, RefinementWorker(settings_of_refinement, ReferenceRasterizer))
     loops = []
@@ -107,12 +110,12 @@ def fusion_server(
 
 @contextmanager
 def server_process(
-    *arguments: str, log: Path = Path(os.devnull), ready_s: float = 30
+    *arguments: str, log: Path = Path(os.devnull), ready_s: float = 30, command: Sequence[str] = COMMAND
 ) -> Iterator[tuple[subprocess.Popen[bytes], FusionClient]]:
     """Start a server in another process and wait until it is ready; it is killed at the end."""
     with tempfile.TemporaryDirectory() as folder, log.open("wb") as stderr:
         address = f"unix:{folder}/fusion.sock"
-        process = subprocess.Popen([*COMMAND, "--listen", address, *arguments], stderr=stderr)
+        process = subprocess.Popen([*command, "--listen", address, *arguments], stderr=stderr)
         try:
             options = [("grpc.initial_reconnect_backoff_ms", 100), ("grpc.max_reconnect_backoff_ms", 200)]
             with grpc.insecure_channel(address, options) as channel:

@@ -40,8 +40,8 @@ def sharing_server(
     shares: list[Share] = []
 
     async def run() -> None:
-        settings = ServerSettings(store=url, fusion=FusionSettings(grid=GRID), tls=tls)
-        async with open_share(settings, address) as share:
+        settings = ServerSettings(fusion=FusionSettings(grid=GRID), tls=tls)
+        async with open_share(settings, url, address) as share:
             running = await start_server(address, share.services, tls)
             task = asyncio.create_task(share.run())
             shares.append(share)

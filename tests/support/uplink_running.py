@@ -16,7 +16,7 @@ from gausslite.domain.errors import (
     GaussLiteError,
 )
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient
@@ -41,7 +41,7 @@ def uplink(
         link.close()
 
 
-def stored_kappas(store: MemoryStore) -> dict[int, list[int]]:
+def stored_kappas(store: SqliteStore) -> dict[int, list[int]]:
     """Return the kappas that the server stores of the robot, by voxel, ascending: the codec reorders them."""
     table = store.batch("robot")
     return {

@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import gc
 import json
+import logging
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -14,11 +15,11 @@ from functools import partial
 
 from gausslite.domain.errors import GaussLiteError
 from gausslite.fusion import store_maintenance
+from gausslite.fusion.alignment import FrameAligner
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
-from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import StoreReport
-from gausslite.process import Sibling, import_extra, print_message, sibling
+from gausslite.plugins import Group, find
+from gausslite.process import Sibling, print_message, sibling
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.run_service import LogFormat, log_to_stderr, run_service
@@ -28,15 +29,16 @@ from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import FusionServicer
 from gausslite_fusion_server.settings import (
     MAINTENANCE_COMMANDS,
-    POSTGRES_SCHEME,
     PROGRAM,
+    FrameUse,
     MaintenanceSettings,
     ServerSettings,
     parse_arguments,
     parse_maintenance,
 )
-from gausslite_places.fit_process import FitProcess
+from gausslite_fusion_server.stores import database_of, open_store
 
+_log = logging.getLogger(__name__)
 _SWITCH_INTERVAL_S = 0.001
 _COLLECTION_THRESHOLDS = (2_000, 10, 100)
 
@@ -94,16 +96,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return run_service(PROGRAM, serve)
 
 
-def _open_store(settings: ServerSettings) -> FusionStore:
-    """Return the store. Raises InvalidInputError, StorageError."""
-    if settings.store is None:
-        return MemoryStore()
-    if isinstance(settings.store, str):
-        import_extra("psycopg", "postgres", f"--store {POSTGRES_SCHEME}...")
-        from gausslite_cluster.postgres_store import PostgresStore
-
-        return PostgresStore(settings.store)
-    return SqliteStore(settings.store, settings.store_max_bytes)
+def _open_aligner(settings: ServerSettings) -> FrameAligner | None:
+    """Return what compares agents' frames; None if they are used as declared."""
+    if settings.frame_alignment is FrameUse.TRUST:
+        return None
+    create = find(Group.ALIGNERS)
+    if create is None:
+        _log.warning("agents' frames are used as declared: no plug-in of %s is installed", Group.ALIGNERS)
+        return None
+    aligner: FrameAligner = create(settings.fusion.grid)
+    return aligner
 
 
 async def _serve(settings: ServerSettings) -> None:
@@ -114,16 +116,17 @@ async def _serve(settings: ServerSettings) -> None:
     if settings.peer_address is not None:
         await _serve_share(settings, settings.peer_address)
         return
-    store = _open_store(settings)
-    with contextlib.closing(store), contextlib.closing(FitProcess()) as fit:
-        engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, fit=fit, find=fit.find)
+    with contextlib.closing(open_store(settings)) as store:
+        aligner = _open_aligner(settings)
+        engine = FusionEngine(store, settings.fusion, decode_keyframe=decode_frame, aligner=aligner)
         refinement = RefinementWorker(settings.refine, partial(choose_rasterizer, settings.rasterizer))
         servicer = FusionServicer(engine, refinement)
         try:
             await _serve_mission(settings, engine, servicer)
         finally:
-            # else the servicer waits for a comparison
-            fit.close()
+            if aligner is not None:
+                # else the servicer waits for a comparison
+                aligner.close()
             servicer.close()
 
 
@@ -152,11 +155,9 @@ async def _serve_mission(settings: ServerSettings, engine: FusionEngine, service
 
 async def _serve_share(settings: ServerSettings, peer_address: str) -> None:
     """Serve a part of a mission, together with the other servers of the database."""
-    import_extra("psycopg", "postgres", f"--store {POSTGRES_SCHEME}...")
-    from gausslite_cluster.shared_servicer import open_share
-
-    async with open_share(settings, peer_address) as share:
-        metrics = metrics_server(settings.metrics, share.engine, share.sender.acknowledgements, share.counts)
+    assert isinstance(settings.store, str)
+    async with database_of(settings.store).open_share(settings, settings.store, peer_address) as share:
+        metrics = metrics_server(settings.metrics, share.engine, share.acknowledgements, share.counts)
         with metrics, _page(settings):
             await serve_until_stopped(
                 settings.listen, share.services, share.run, settings.tls, settings.limits, settings.health

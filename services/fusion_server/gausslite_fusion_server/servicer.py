@@ -15,7 +15,7 @@ from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport
-from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.engine import AlignmentRun, FusionEngine
 from gausslite.fusion.refinement import MapRenderer
 from gausslite.fusion.store_values import MissionConfig, SessionRecord
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -149,7 +149,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def publish_changes(self) -> None:
         """Wake the watchers, and look which frames are due. Use it on the event loop."""
         self._map_changes.notify()
-        if self.engine.settings.alignment is not None:
+        if self.engine.compares_frames:
             self._align_in_background()
 
     def _commit_soon(self) -> None:
@@ -359,17 +359,17 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         while self._align_again and self._gate.is_open:
             await asyncio.sleep(pause_s)
             # messages that arrive meanwhile set it again
-            self._align_again, start_s, is_changed = False, loop.time(), True
+            self._align_again, start_s = False, loop.time()
             try:
-                is_changed = await loop.run_in_executor(self._aligner, self.engine.align_due, 1)
+                run = await loop.run_in_executor(self._aligner, self.engine.align_due, 1)
                 pause_s = max(_ALIGN_DELAY_S, _ALIGN_PAUSE * (loop.time() - start_s))
             except Exception as error:
-                # an agent may have been compared before
                 _log.error("frames are not compared, again in %.0f s: %s", _ALIGN_RETRY_S, error)
-                pause_s = _ALIGN_RETRY_S
+                # an agent may have been compared before
+                run, pause_s = AlignmentRun(is_changed=True, is_due=True), _ALIGN_RETRY_S
             self._align_pause_s = pause_s
-            self._align_again |= self.engine.is_alignment_due
-            if is_changed:
+            self._align_again |= run.is_due
+            if run.is_changed:
                 self._map_changes.notify()
 
     async def _session(self, session_id: str, caller: Caller) -> SessionRecord:

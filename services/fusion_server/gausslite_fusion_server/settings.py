@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,6 @@ from gausslite.config.plain_values import without_password
 from gausslite.config.program import Program, parse_options
 from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError
-from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.process import print_message
@@ -26,7 +26,8 @@ from gausslite.wire.security import CallLimits, Tls, TlsFiles
 PROGRAM = "gausslite-fusion-server"
 MEMORY = "memory"
 STORE_SUFFIX = ".sqlite"
-POSTGRES_SCHEME = "postgresql://"
+_DATABASE = "postgresql://USER@HOST/DATABASE"
+"""An example: the plug-in of a store has the name of the scheme."""
 _MAX_STORE_MB = 1 << 24
 _MAINTENANCE = (
     ("backup", ("store", "target"), "copy a store to a new file and verify the copy; a server may be using it"),
@@ -36,12 +37,17 @@ _MAINTENANCE = (
 MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 
 
+class FrameUse(StrEnum):
+    """What the server does with the frames that agents declare."""
+
+    CORRECT = "correct"
+    TRUST = "trust"
+
+
 def _read_store(text: str) -> Path | str | None:
     if text == MEMORY:
         return None
-    if "://" in text and not text.startswith(POSTGRES_SCHEME):
-        raise InvalidInputError(f"expected {POSTGRES_SCHEME}USER@HOST/DATABASE, got {without_password(text)}")
-    return text if text.startswith(POSTGRES_SCHEME) else read_path(text)
+    return text if "://" in text else read_path(text)
 
 
 def _read_health(text: str) -> str:
@@ -51,13 +57,13 @@ def _read_health(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ServerSettings:
-    """Address, storage (a file, the URL of a PostgreSQL database, or memory) and limits of the server; the mission."""
+    """Address, storage (a file, the URL of a database, or memory) and limits of the server; the mission."""
 
     listen: str = option(FUSION_ADDRESS, "HOST:PORT or unix:PATH", metavar="ADDRESS")
     store: Path | str | None = option(
         None,
         "storage of the voxel updates (default: memory)",
-        metavar="memory|PATH.sqlite|postgresql://USER@HOST/DATABASE",
+        metavar=f"{MEMORY}|PATH{STORE_SUFFIX}|{_DATABASE}",
         plain_type=str,
         convert=_read_store,
         to_plain=str,
@@ -79,6 +85,9 @@ class ServerSettings:
         convert=partial(require_callable, "peer-address"),
     )
     fusion: FusionSettings = field(default_factory=FusionSettings)
+    frame_alignment: FrameUse = option(
+        FrameUse.CORRECT, "correct the misfit of agents' frames and quarantine gross ones, or trust them"
+    )
     refine: RefineSettings = field(default_factory=RefineSettings)
     rasterizer: str = option("auto", "backend of the refinement", choices=BACKENDS)
     tls: Tls | None = None
@@ -105,7 +114,6 @@ class ServerSettings:
 OPTIONS = Program.of(
     *(ServerSettings, TlsFiles),
     flags="listen store mission world-frame voxel-size view metrics log-format tls-cert tls-key tls-ca",
-    defaults={"frame-alignment": AlignmentSettings()},
 )
 
 
@@ -131,7 +139,7 @@ def _require_store(options: argparse.Namespace) -> None:
     """Raise InvalidInputError for a store of another kind than the other options need, or for a misspelt one."""
     store = options.store
     if options.peer_address is not None and not isinstance(store, str):
-        raise InvalidInputError(f"peer-address: expected a database as --store, {POSTGRES_SCHEME}USER@HOST/DATABASE")
+        raise InvalidInputError(f"peer-address: expected a database as --store, {_DATABASE}")
     if store is None:
         return
     if isinstance(store, str):
@@ -144,7 +152,7 @@ def _require_store(options: argparse.Namespace) -> None:
     elif store.suffix != STORE_SUFFIX and not store.exists():
         raise InvalidInputError(
             f"--store {without_password(str(store))}: expected {MEMORY} or the name of a file that ends in "
-            f"{STORE_SUFFIX}, or {POSTGRES_SCHEME}USER@HOST/DATABASE"
+            f"{STORE_SUFFIX}, or {_DATABASE}"
         )
 
 

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Collection, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from threading import RLock
+from threading import Lock, RLock
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.checks import quote_name
-from gausslite.domain.errors import MismatchError, SessionUnknownError
+from gausslite.domain.errors import GaussLiteError, MismatchError, SessionUnknownError, StorageError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, TeamObject
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
-from gausslite.fusion.agent_data import AgentData
+from gausslite.fusion.alignment import FrameAligner, FrameDecisions, TeamView
+from gausslite.fusion.earlier_map import earlier_map_of, keep_as_earlier
 from gausslite.fusion.frames import FrameAlignment, FrameAlignments
 from gausslite.fusion.fused_map import FusedMapLayers, load_refinement, save_refinement
 from gausslite.fusion.keyframe_pool import (
@@ -43,14 +46,14 @@ from gausslite.fusion.updates import (
     MissionClock,
     PendingUpdate,
     UpdateChecks,
-    UpdateCommitter,
+    UpdateIngest,
     require_own,
     require_within_quotas,
+    store_slices,
 )
 from gausslite.fusion.vote_input import VoteInput
-from gausslite_places.frame_aligner import FrameAligner
-from gausslite_places.frame_fit import Fit, fit_frame
-from gausslite_places.unknown_frames import Find, UnknownFrames, find_frame
+
+_log = logging.getLogger(__name__)
 
 
 class JoinResult(NamedTuple):
@@ -65,13 +68,21 @@ class JoinResult(NamedTuple):
     keyframes: tuple[int, ...]
 
 
+class AlignmentRun(NamedTuple):
+    """What a look at the agents' frames has done: whether the fused map changed, and whether more agents are due."""
+
+    is_changed: bool
+    is_due: bool
+
+
 class FusionEngine:
     """Owns the store, the sessions, the keyframes and the refined map of one mission. Thread-safe.
 
     Updates, sessions, keyframes, objects and the refined map persist with the store. first_revision must exceed the
     revisions from before a restart; by default it is the time in microseconds.
-    decode_keyframe reads keyframes as they were received; a refinement and the search for an unknown frame need it. fit
-    and find compare two agents' maps. traffic: continues the counters of an earlier engine.
+    decode_keyframe reads keyframes as they were received; a refinement and the search for an unknown frame need it.
+    aligner: decides the agents' frames; without one they are used as declared. traffic: continues the counters of an
+    earlier engine.
     Raises MismatchError if the store belongs to another mission configuration, CodecError for damaged records,
     StorageError.
     """
@@ -82,30 +93,36 @@ class FusionEngine:
         settings: FusionSettings,
         first_revision: int | None = None,
         decode_keyframe: FrameDecoder = no_decoder,
-        fit: Fit = fit_frame,
-        find: Find = find_frame,
+        aligner: FrameAligner | None = None,
         traffic: TrafficLog | None = None,
     ) -> None:
         self.settings, self.grid, quotas = settings, settings.grid, settings.quotas
         self.storage, self.acknowledgements = StorageProbe(store), Acknowledgements()
         self.traffic = traffic or TrafficLog()
-        self._lock, self._store = RLock(), store
+        # held through a commit; who deletes an agent's data takes it before the other one
+        self._committing, self._lock = Lock(), RLock()
+        self._store, self._ingest = store, UpdateIngest(self.grid)
         self._members = Membership(store, settings)
         self._keyframes = KeyframePool(store, quotas, decode_keyframe)
         self._objects, self._merged_objects = TeamObjects(store), MergedObjects()
         self._checks = UpdateChecks(store, quotas, MissionClock(store))
         self._alignments = FrameAlignments(store)
-        self._votes = VoteInput(store, self._alignments, self.grid)
-        self._aligner = FrameAligner(store, self._alignments, self._lock, self.grid, settings.alignment, fit)
-        self._unknown_frames = UnknownFrames(store, self._alignments, self._aligner, self._keyframes, self._lock, find)
+        frames = {name: alignment for name, (_, alignment) in self._alignments.frames().items()}
         first = time.time_ns() // 1000 if first_revision is None else first_revision
         # a refinement is of the whole map
         refined = None if store.is_shared else load_refinement(store)
-        self.maps = FusedMapLayers(self._votes, self._lock, self.grid, first, settings.max_removed_voxels, refined)
-        parts = self._members.sessions, self._checks, self.traffic, self._keyframes, self._objects
-        delete_in_parts = [part.remove_agent for part in parts]
-        self._agents = AgentData(store, self._votes, self.maps, self._alignments, self._aligner, delete_in_parts)
-        self._committer = UpdateCommitter(store, self._lock, self.grid, self._check_update, self._record_updates)
+        votes = VoteInput(store, frames, self.grid)
+        self.maps = FusedMapLayers(votes, self.grid, first, settings.max_removed_voxels, refined)
+        self._unrecorded: dict[str, Int64[ndarray, " k"]] = {}
+        self._aligner = aligner
+        if aligner is not None:
+            for agent_id in store.agents():
+                aligner.observe(agent_id, store.keys(agent_id))
+
+    @property
+    def compares_frames(self) -> bool:
+        """Whether agents' frames are compared, instead of used as declared."""
+        return self._aligner is not None
 
     @property
     def mission_config(self) -> MissionConfig:
@@ -137,17 +154,17 @@ class FusionEngine:
             raise MismatchError(f"mission: expected {quote_name(own)} as agreed here, got {quote_name(mission_id)}")
 
     def join(self, agent_id: str, requested: MissionConfig, fresh_map: bool = False, token: str = "") -> JoinResult:
-        """Open a session and end the agent's earlier one; fresh_map: the agent begins a new map, see AgentData.
+        """Open a session and end the agent's earlier one; fresh_map: the agent begins a new map, see earlier_map.py.
 
         Empty names in `requested` accept the server's. token: the robot's secret, see SessionRegistry. Raises
         InvalidInputError, MismatchError, NameInUseError, NotPermittedError (banned), QuotaError, StorageError.
         """
-        with self._committer.committing, self._lock:
+        with self._committing, self._lock:
             for ended in self._members.admit(agent_id, requested, token):
-                self._agents.remove(ended)
+                self._remove_all(ended)
             session = self._members.open_session(agent_id, token)
             if fresh_map:
-                self._agents.begin_new_map(agent_id)
+                self._begin_new_map(agent_id)
                 self._members.sessions.save(session, token)
             self._checks.record_join(agent_id)
             return JoinResult(
@@ -156,18 +173,18 @@ class FusionEngine:
 
     def begin_elsewhere(self, agent_id: str, fresh_map: bool) -> int:
         """Note that the agent has joined at another server; return its highest update_seq here. Raises StorageError."""
-        with self._committer.committing, self._lock:
+        with self._committing, self._lock:
             self._members.sessions.forget_elsewhere(agent_id)
             if fresh_map:
-                self._agents.begin_new_map(agent_id)
+                self._begin_new_map(agent_id)
             return self.highest_update_seq(agent_id)
 
     def remove_elsewhere(self, agent_id: str) -> int:
         """Delete the agent's voxels here, after another server has ended its session; returns their number."""
-        with self._committer.committing, self._lock:
+        with self._committing, self._lock:
             voxels = self._store.totals(agent_id).voxels
             self._members.sessions.forget_elsewhere(agent_id)
-            self._agents.remove(agent_id)
+            self._remove_all(agent_id)
             # one that came here while the session ended
             self._store.remove_record(agent_id, OBJECTS)
             return voxels
@@ -195,7 +212,7 @@ class FusionEngine:
         """Store an agent's voxel updates; they are durable on return, if the store is.
 
         Raises SessionUnknownError, MismatchError (another grid), NotPermittedError (another agent's name),
-        InvalidInputError, QuotaError, StorageError, UnavailableError; see UpdateCommitter for what is stored then.
+        InvalidInputError, QuotaError, StorageError, UnavailableError; see store_slices for what is stored then.
         """
         session = self.session(session_id)
         require_own(session.agent_id, subset.agent_id, grid, self.grid)
@@ -212,30 +229,41 @@ class FusionEngine:
         An encoded message is decoded when it is its agent's turn; a decoded one may be the part that is this server's.
         Raises UnavailableError.
         """
-        put = self._committer.add(PendingUpdate(session.session_id, session.agent_id, message))
+        put = self._ingest.add(PendingUpdate(session.session_id, session.agent_id, message))
         self.acknowledgements.add(session.agent_id, put)
         return put
 
     def commit_updates(self) -> None:
-        """Commit the queued updates. Call it after each `enqueue_update`."""
-        self._committer.commit()
+        """Commit the queued updates, group by group, until none waits. Call it after each `enqueue_update`."""
+        while group := self._ingest.take():
+            try:
+                with self._committing:
+                    self._commit([update for update in group if not update.future.done()])
+            except Exception as error:
+                # reaches the senders through their futures
+                for update in group:
+                    update.fail(error)
+            finally:
+                self._ingest.put_back(group)
 
-    def align_due(self, at_most: int | None = None) -> bool:
-        """Compare the frames of the agents with enough new updates; returns whether the fused map changed.
+    def align_due(self, at_most: int | None = None) -> AlignmentRun:
+        """Compare the frames of the agents with enough new updates, and move maps whose frame changes.
 
         It takes up to seconds, without the lock but for slices. at_most: number of agents. Call it from one thread at a
         time. Raises StorageError, UnavailableError if an agent could not be compared.
         """
+        if self._aligner is None:
+            return AlignmentRun(False, False)
         before = self.revision
-        if self.settings.alignment is not None:
-            self._unknown_frames.run()
-        self._aligner.run(self._apply_frame, self._drop_contradicted, at_most)
-        return self.revision != before
-
-    @property
-    def is_alignment_due(self) -> bool:
-        """Return whether `align_due` would compare an agent."""
-        return self._aligner.is_due
+        self._move_maps()
+        with self._lock:
+            team = TeamView(self._alignments.frames(), self._store, self._keyframes)
+        found = self._aligner.poll(team, at_most)
+        self._apply(found, team)
+        self._move_maps()
+        if found.failure:
+            raise UnavailableError(found.failure)
+        return AlignmentRun(self.revision != before, found.is_due)
 
     def alignment(self, agent_id: str) -> FrameAlignment:
         """Return how the agent's frame fits the fused map."""
@@ -244,10 +272,12 @@ class FusionEngine:
 
     def declare_frame(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> None:
         """Set the motion to the fused map's frame that the agent declares, None if unknown. Raises StorageError."""
+        trusts = "this server compares no frames (frame-alignment = trust, or no plug-in)"
+        reason = "" if self.compares_frames else trusts
         with self._lock:
-            is_new = self._aligner.declare(agent_id, T_fused_agent)
+            is_new = self._alignments.declare(agent_id, T_fused_agent, reason)
         if is_new:
-            self._apply_frame(agent_id)
+            self._move_map(agent_id)
 
     def add_keyframe(self, session_id: str, keyframe: EncodedKeyframe, selected: Collection[int] = ()) -> None:
         """Store a keyframe for the refinement; the agent's others that are not `selected` are deleted.
@@ -285,14 +315,14 @@ class FusionEngine:
     def evict(self, agent_id: str, ban: bool = False) -> int:
         """End the agent's session and delete all its data; returns the number of its voxels. For operators.
 
-        ban: refuse later joins under this name, also after a restart. The name of an earlier map (AgentData) deletes
+        ban: refuse later joins under this name, also after a restart. The name of an earlier map deletes
         only that. Raises InvalidInputError for an unknown agent that is not banned, StorageError.
         """
-        with self._committer.committing, self._lock:
+        with self._committing, self._lock:
             voxels = self._store.totals(agent_id).voxels
             self._members.require_evictable(agent_id, ban)
             self._members.sessions.end_agent(agent_id)
-            self._agents.remove(agent_id)
+            self._remove_all(agent_id)
             if ban:
                 self._members.bans.add(agent_id)
             return voxels
@@ -304,12 +334,12 @@ class FusionEngine:
 
     def leave(self, session_id: str, forget: bool = False) -> int:
         """End a session and return the fused revision; with `forget` all updates of the agent are deleted."""
-        with self._committer.committing, self._lock:
+        with self._committing, self._lock:
             agent_id = self._members.sessions.get(session_id).agent_id
             # first, so that nothing follows what is deleted
             self._members.sessions.end_agent(agent_id)
             if forget:
-                self._agents.remove(agent_id)
+                self._remove_all(agent_id)
             return self.maps.revision()
 
     def refinement_input(self) -> tuple[Gaussians, list[AgentKeyframe], int]:
@@ -329,7 +359,7 @@ class FusionEngine:
         """Store the result of a refinement of the vote at this revision. Raises RevisionGoneError, StorageError."""
         shown = self.maps.show_refined(gaussians, revision)
         # no update may be in the store without being in the change log
-        with self._committer.committing:
+        with self._committing:
             changed = self.maps.changed_since(revision)
         save_refinement(self._store, shown.without(changed))
 
@@ -380,32 +410,130 @@ class FusionEngine:
         with self._lock:
             self._store.close()
 
-    def _apply_frame(self, agent_id: str) -> None:
-        """Move the agent's map to its frame and state as they are now, in slices between which messages are served."""
-        for keys in self._votes.slices(agent_id):
-            with self._lock:
-                self.maps.record(agent_id, self._votes.move(agent_id, keys))
+    def _commit(self, group: Sequence[PendingUpdate]) -> None:
+        """Check, store and record the next slice of each message; the disk is written without the lock."""
+        with self._lock:
+            permitted = [update for update in group if self._is_permitted(update)]
+        stored = store_slices(self._store, permitted)
+        with self._lock:
+            failed = self._record([(update.agent_id, outcome.accepted) for update, outcome in stored])
+        for update, outcome in stored:
+            if update.agent_id in failed:
+                update.fail(failed[update.agent_id])
+            elif update.add_outcome(outcome):
+                update.future.set_result(update.outcome())
 
-    def _drop_contradicted(self, agent_id: str) -> bool:
-        with self._committer.committing, self._lock:
-            return self._agents.drop_contradicted(agent_id)
+    def _is_permitted(self, update: PendingUpdate) -> bool:
+        """Return whether a message may be stored; otherwise refuse it. Only its first part is checked."""
+        try:
+            session = self._members.sessions.get(update.session_id)
+            if not update.outcomes:
+                require_own(session.agent_id, update.agent_id, self.grid, self.grid)
+                self._checks.require_plausible(update.subset)
+                require_storable(update.subset)
+                require_within_quotas(update.subset, self._store, self.settings.quotas)
+        except GaussLiteError as error:
+            update.fail(error)
+            return False
+        return True
 
-    def _check_update(self, update: PendingUpdate) -> None:
-        """Raise GaussLiteError for a message that may not be stored; only its first part is checked."""
-        session = self._members.sessions.get(update.session_id)
-        if not update.outcomes:
-            require_own(session.agent_id, update.agent_id, self.grid, self.grid)
-            self._checks.require_plausible(update.subset)
-            require_storable(update.subset)
-            require_within_quotas(update.subset, self._store, self.settings.quotas)
+    def _record(self, stored: Sequence[tuple[str, Int64[ndarray, " _"]]]) -> dict[str, GaussLiteError]:
+        """Update the fused map after a commit of these voxels of different agents; returns the errors of agents.
 
-    def _record_updates(self, stored: Sequence[tuple[str, Int64[ndarray, " _"]]]) -> None:
-        """Update the fused map after a commit of these accepted voxels of different agents."""
-        changed = {}
+        What fails is recorded with a later commit: the store has the voxels, and would find them stale when they are
+        sent again.
+        """
         for agent_id, accepted in stored:
-            self._aligner.record(agent_id, accepted)
             if len(accepted):
-                changed[agent_id] = self._votes.move(agent_id, accepted)
-        self.maps.record_all(changed)
-        for agent_id in changed:
-            self._agents.drop_outgrown(agent_id)
+                before = self._unrecorded.get(agent_id, accepted)
+                self._unrecorded[agent_id] = np.union1d(before, accepted)
+        failed: dict[str, GaussLiteError] = {}
+        for agent_id in self._unrecorded:
+            try:
+                self._alignments.contribute(agent_id, self.compares_frames)
+            except GaussLiteError as error:
+                failed[agent_id] = error
+        failed |= self.maps.update({name: keys for name, keys in self._unrecorded.items() if name not in failed})
+        for agent_id in [name for name in self._unrecorded if name not in failed]:
+            self._observe(agent_id, self._unrecorded.pop(agent_id))
+            self._drop_outgrown(agent_id)
+        return failed
+
+    def _observe(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
+        if self._aligner is not None:
+            self._aligner.observe(agent_id, keys)
+
+    def _apply(self, found: FrameDecisions, team: TeamView) -> None:
+        """Take over what an aligner has decided, but for frames that have changed meanwhile."""
+        for name in found.deleted:
+            with self._committing, self._lock:
+                if self._alignments.has_frame(name, team.frames[name][0]):
+                    _log.warning("%s: its agent's new map does not fit it, so it is deleted", name)
+                    self._remove(name)
+        for name, alignment in found.alignments.items():
+            frame_id, before = team.frames[name]
+            with self._lock:
+                # where an agent is in the team's map was found with the team's frames
+                is_found = alignment.is_localised and not before.is_localised
+                if not is_found or all(self._alignments.has_frame(own, id_) for own, (id_, _) in team.frames.items()):
+                    self._alignments.decide(name, frame_id, alignment)
+
+    def _move_maps(self) -> None:
+        while True:
+            with self._lock:
+                agent_id = min(self._alignments.unmoved, default=None)
+            if agent_id is None:
+                return
+            self._move_map(agent_id)
+
+    def _move_map(self, agent_id: str) -> None:
+        """Move the agent's map to its frame and state as they are now, in slices between which messages are served."""
+        with self._lock:
+            # a frame that changes meanwhile is moved to afterwards
+            self._alignments.unmoved.discard(agent_id)
+            self.maps.set_frame(agent_id, self._alignments.get(agent_id))
+        try:
+            self.maps.move(agent_id)
+        except GaussLiteError:
+            with self._lock:
+                self._alignments.unmoved.add(agent_id)
+            raise
+
+    def _begin_new_map(self, agent_id: str) -> None:
+        """Keep the agent's map as its earlier map, then delete all its data. Raises StorageError."""
+        name = earlier_map_of(agent_id)
+        kept = keep_as_earlier(self._store, self._alignments, agent_id, self.maps.read(agent_id))
+        if len(kept):
+            self._alignments.contribute(name, self.compares_frames)
+            self.maps.update({name: kept})
+            self._observe(name, kept)
+        self._remove(agent_id)
+
+    def _drop_outgrown(self, agent_id: str) -> None:
+        """Delete the agent's earlier map if it wins no voxel."""
+        name = earlier_map_of(agent_id)
+        if self._store.totals(name).voxels and not self.maps.won_voxels(name):
+            try:
+                self._remove(name)
+            except StorageError as error:
+                # the updates are stored; the next one tries again
+                _log.warning("the earlier map of agent %s is not deleted: %s", agent_id, error)
+
+    def _remove_all(self, agent_id: str) -> None:
+        """Delete all data of the agent, with its earlier map. Raises StorageError."""
+        self._remove(agent_id)
+        self._remove(earlier_map_of(agent_id))
+
+    def _remove(self, name: str) -> None:
+        """Delete all data of an agent, or an earlier map. Raises StorageError."""
+        self._alignments.remove_agent(name)
+        self._members.sessions.remove_agent(name)
+        self._checks.remove_agent(name)
+        self.traffic.remove_agent(name)
+        self._keyframes.remove_agent(name)
+        self._objects.remove_agent(name)
+        self._unrecorded.pop(name, None)
+        if self._aligner is not None:
+            self._aligner.forget(name)
+        # the store last: the parts wait for the end of what they write
+        self.maps.remove_agent(name, self._store.remove_agent(name))

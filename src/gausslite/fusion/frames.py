@@ -8,23 +8,24 @@ An agent that does not know its frame is unlocalised until the server has found 
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, GaussLiteError
 from gausslite.domain.pose import inverse, require_rigid, rotation_angle_deg
 from gausslite.fusion.store import FusionStore
-from gausslite_places.frame_fit import FrameFit
 
+_log = logging.getLogger(__name__)
 RECORD = "alignment"
 _MAX_SEGMENTS = 200
-_WITNESSES = 2
-"""A lone contradiction quarantines only if a second part of the agent's data repeats it."""
 
 
 class AlignmentState(StrEnum):
@@ -41,30 +42,36 @@ class AlignmentState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class AlignmentSettings:
-    """When a misfit is corrected, and when two maps contradict each other.
+class Misfit:
+    """Mean point-to-plane distance and luminance difference of samples of one map to another, both saturated."""
 
-    min_shift_m, min_rotation_deg: smaller motions are errors of the registration, which occur between maps in the same
-    frame. max_shift_m, max_rotation_deg: a larger motion that fits better is a contradiction. refit_share: a
-    comparison is due when so many voxels have changed since the last one, as a share of the agent's voxels.
+    distance_m: float
+    colour: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameFit:
+    """A motion of the source map, and the misfit before and after it on the held-out half of the overlap.
+
+    shift_m, rotation_deg: the motion of the overlap's centre and its angle. compared: number of held-out samples.
+    is_better: distance and colour improve by more than four times their uncertainty. is_apart: before the motion, the
+    surfaces are farther apart than those of maps in the same frame.
     """
 
-    min_shift_m: float = 0.03
-    min_rotation_deg: float = 1.5
-    max_shift_m: float = 0.25
-    max_rotation_deg: float = 8.0
-    refit_share: float = 0.25
+    motion: Float64[ndarray, "4 4"]
+    before: Misfit
+    after: Misfit
+    shift_m: float
+    rotation_deg: float
+    compared: int
+    is_better: bool
+    is_apart: bool
 
-    def contradicts(self, fit: FrameFit) -> bool:
-        """Return whether no allowed correction explains the misfit."""
-        if fit.is_better:
-            return fit.shift_m > self.max_shift_m or fit.rotation_deg > self.max_rotation_deg
-        return fit.is_apart
-
-    def corrects(self, fit: FrameFit) -> bool:
-        """Return whether the motion is applied."""
-        is_large = fit.shift_m >= self.min_shift_m or fit.rotation_deg >= self.min_rotation_deg
-        return fit.is_better and is_large and not self.contradicts(fit)
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> FrameFit:
+        """Return the fit of the plain values that `asdict` and JSON make. Raises KeyError, TypeError, ValueError."""
+        misfits = {name: Misfit(**values[name]) for name in ("before", "after")}
+        return cls(**{**values, **misfits, "motion": np.array(values["motion"], np.float64).reshape(4, 4)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +111,15 @@ class FrameAlignment:
     def is_localised(self) -> bool:
         """Return whether the agent's frame is known, to itself or to the server."""
         return self.state is not AlignmentState.UNLOCALISED
+
+    def is_placed_as(self, other: FrameAlignment) -> bool:
+        """Return whether the vote reads the agent's updates in the same way with the other alignment."""
+        own, theirs = ((0, self.declared), *self.segments), ((0, other.declared), *other.segments)
+        return (
+            self.is_used == other.is_used
+            and len(own) == len(theirs)
+            and all(a == b and np.array_equal(T, U) for (a, T), (b, U) in zip(own, theirs, strict=True))
+        )
 
     @property
     def rank(self) -> tuple[bool, int]:
@@ -168,46 +184,21 @@ class FrameAlignment:
         )
 
 
-@dataclass(slots=True)
-class Comparison:
-    """The latest fit of two agents' maps, and in how many parts of each agent's data in a row it is a contradiction."""
-
-    fit: FrameFit
-    contradicting: dict[str, int] = field(default_factory=dict)
-
-
-def find_quarantined(
-    orders: Mapping[str, int], comparisons: Mapping[frozenset[str], Comparison]
-) -> dict[str, tuple[str, ...]]:
-    """Return the agents to quarantine, with the accepted agents that each of them contradicts.
-
-    Agents that fit most others are accepted first, then those that contributed first. An agent that contradicts two
-    accepted ones is quarantined. So is one that contradicts a single one, fits none, and repeats it with newer data.
-    """
-    fits: dict[str, set[str]] = {name: set() for name in orders}
-    for pair, comparison in comparisons.items():
-        if pair <= orders.keys() and not comparison.contradicting:
-            for name in pair:
-                fits[name] |= pair - {name}
-    accepted: list[str] = []
-    quarantined: dict[str, tuple[str, ...]] = {}
-    for name in sorted(orders, key=lambda name: (-len(fits[name]), orders[name])):
-        found = [(other, comparisons.get(frozenset((name, other)))) for other in accepted]
-        against = [(other, c) for other, c in found if c is not None and c.contradicting]
-        is_repeated = any(c.contradicting.get(name, 0) >= _WITNESSES for _, c in against)
-        if len(against) >= _WITNESSES or (is_repeated and not fits[name].intersection(accepted)):
-            quarantined[name] = tuple(other for other, _ in against)
-        else:
-            accepted.append(name)
-    return quarantined
-
-
 class FrameAlignments:
-    """The alignments of all agents; they persist with the store. Not thread-safe; FusionEngine holds a lock."""
+    """The alignments of all agents; they persist with the store. Not thread-safe; FusionEngine holds a lock.
+
+    An agent's frame has an id, which changes when another frame is declared, and with the agent's data. What is decided
+    from copies of the data holds the id of the frame that it is for.
+    """
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
         self._by_agent = {agent_id: _decode(data) for agent_id, data in store.records(RECORD).items()}
+        self._contributors = set(store.agents())
+        self._frame_ids = {agent_id: number for number, agent_id in enumerate(self._by_agent, start=1)}
+        self._next_id = 1 + len(self._frame_ids)
+        self.unmoved: set[str] = set()
+        """Agents whose alignment is another one than that by which the vote has moved their maps."""
 
     def get(self, agent_id: str) -> FrameAlignment:
         """Return the agent's alignment."""
@@ -217,18 +208,74 @@ class FrameAlignments:
     def __contains__(self, agent_id: str) -> bool:
         return agent_id in self._by_agent
 
-    def names(self) -> tuple[str, ...]:
-        """Return the agents that have an alignment, by their rank."""
-        return tuple(sorted(self._by_agent, key=lambda name: self._by_agent[name].rank))
+    def frames(self) -> dict[str, tuple[int, FrameAlignment]]:
+        """Return the id of each agent's frame, and its alignment, by rank."""
+        names = sorted(self._by_agent, key=lambda name: self._by_agent[name].rank)
+        return {name: (self._frame_ids[name], self._by_agent[name]) for name in names}
 
-    def put(self, agent_id: str, alignment: FrameAlignment) -> None:
-        """Replace the agent's alignment. Raises StorageError."""
-        self._store.save_record(agent_id, RECORD, json.dumps(asdict(alignment), default=np.ndarray.tolist).encode())
-        self._by_agent[agent_id] = alignment
+    def add(self, agent_id: str, alignment: FrameAlignment) -> None:
+        """Set the alignment of an agent in another frame than before. Raises StorageError."""
+        self._save(agent_id, alignment)
+        self._frame_ids[agent_id] = self._next_id
+        self._next_id += 1
+
+    def contribute(self, agent_id: str, is_compared: bool) -> None:
+        """Note an update of the agent: its first one fixes its rank. Raises StorageError.
+
+        is_compared: the server compares frames. Before the first update of the first agent that knows its frame, what
+        was found without it is unknown again.
+        """
+        if is_compared:
+            self._end_provisional_frames(agent_id)
+        if agent_id not in self._by_agent:
+            is_first = not any(alignment.is_used for alignment in self._by_agent.values())
+            self.add(agent_id, self.get(agent_id).in_state({}, is_quarantined=False, is_first=is_first))
+        self._contributors.add(agent_id)
+
+    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None, reason: str = "") -> bool:
+        """Set the motion that the agent declares, None if it does not know its frame. Raises StorageError.
+
+        reason: why the server does not find an unknown frame. Returns whether the motion changed; what was found of an
+        unknown frame stays.
+        """
+        current = self.get(agent_id)
+        if T_fused_agent is None:
+            if current.is_unknown:
+                return False
+            declared = current.unlocalised(reason)
+        elif current.is_unknown or not np.array_equal(current.declared, T_fused_agent):
+            declared = FrameAlignment(current.order, declared=T_fused_agent)
+        else:
+            return False
+        self.add(agent_id, declared)
+        return True
+
+    def decide(self, agent_id: str, frame_id: int, alignment: FrameAlignment) -> None:
+        """Replace the alignment that was decided for this frame, unless the agent has another one by now.
+
+        Raises StorageError.
+        """
+        if not self.has_frame(agent_id, frame_id):
+            return
+        before = self._by_agent[agent_id]
+        self._save(agent_id, alignment)
+        if alignment.state is not before.state or alignment.message != before.message:
+            level = logging.WARNING if alignment.against else logging.INFO
+            reason = f": {alignment.message}" if alignment.message else ""
+            _log.log(level, "agent %s is %s%s", quote_name(agent_id), alignment.state, reason)
+        if not alignment.is_placed_as(before):
+            self.unmoved.add(agent_id)
+
+    def has_frame(self, agent_id: str, frame_id: int) -> bool:
+        """Return whether the agent is still in this frame."""
+        return self._frame_ids.get(agent_id) == frame_id
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete the alignment of the agent; the store deletes its record with its updates."""
         self._by_agent.pop(agent_id, None)
+        self._frame_ids.pop(agent_id, None)
+        self._contributors.discard(agent_id)
+        self.unmoved.discard(agent_id)
 
     def transforms(self) -> dict[str, Float64[ndarray, "4 4"]]:
         """Return the latest T_fused_agent of the agents whose frame differs from the fused map's."""
@@ -245,6 +292,20 @@ class FrameAlignments:
     def unlocalised(self) -> set[str]:
         """The agents whose frame nobody knows."""
         return {name for name, alignment in self._by_agent.items() if not alignment.is_localised}
+
+    def _end_provisional_frames(self, agent_id: str) -> None:
+        names = self._contributors & self._by_agent.keys()
+        is_first = agent_id not in self._contributors and all(self._by_agent[name].is_unknown for name in names)
+        if not is_first or self.get(agent_id).is_unknown:
+            return
+        for name, own in list(self._by_agent.items()):
+            if own.is_unknown and own.is_localised:
+                self.add(name, own.unlocalised(f"agent {agent_id} knows its frame, which is the team's now"))
+                self.unmoved.add(name)
+
+    def _save(self, agent_id: str, alignment: FrameAlignment) -> None:
+        self._store.save_record(agent_id, RECORD, json.dumps(asdict(alignment), default=np.ndarray.tolist).encode())
+        self._by_agent[agent_id] = alignment
 
 
 def _decode(data: bytes) -> FrameAlignment:

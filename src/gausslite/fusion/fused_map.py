@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import reduce
-from threading import RLock
+from threading import Lock
 
 import numpy as np
 from jaxtyping import Int64, UInt64
@@ -31,6 +31,7 @@ from gausslite.domain.voxels import (
     tiles_of,
 )
 from gausslite.fusion.change_log import ChangeLog, VoxelLog
+from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import VoteResult, rank_voxels, union_maps
 from gausslite.fusion.vote_input import VoteInput
@@ -149,19 +150,20 @@ class FusedMapChanges:
 
 
 class FusedMapLayers:
-    """Owns the change logs and the refined map; reads the updates from `votes`. Thread-safe, with the engine's lock."""
+    """Owns what the vote reads, the change logs and the refined map. Thread-safe."""
 
     def __init__(
         self,
         votes: VoteInput,
-        lock: RLock,
         grid: VoxelGrid,
         first_revision: int,
         max_removed_voxels: int,
         stored: StoredRefinement | None = None,
     ) -> None:
         """stored: the latest refinement from before a restart."""
-        self._votes, self._lock, self._grid = votes, lock, grid
+        # below the engine's; held for a message, or a tile or a slice of a map
+        self._lock = Lock()
+        self._votes, self._grid = votes, grid
         self._change_log = ChangeLog(first_revision, max_removed_voxels)
         self._refined: RefinedMap | None = None
         vote = rank_voxels(votes.scores())
@@ -191,22 +193,54 @@ class FusedMapLayers:
         """Return whether a refinement has been stored."""
         return self._refined is not None
 
-    def record(self, agent_id: str, keys: Int64[ndarray, " k"]) -> None:
-        """Record that what the vote reads of this agent changed in these voxels."""
-        self.record_all({agent_id: keys})
+    def update(self, stored: Mapping[str, Int64[ndarray, " _"]]) -> dict[str, GaussLiteError]:
+        """Vote on these voxels of each agent, which the store has or has no longer, as one revision.
 
-    def record_all(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
+        Returns the errors of the agents whose voxels could not be read; these are left out.
+        """
+        changed: dict[str, Int64[ndarray, " _"]] = {}
+        failed: dict[str, GaussLiteError] = {}
+        with self._lock:
+            for agent_id, keys in stored.items():
+                try:
+                    changed[agent_id] = self._votes.move(agent_id, keys)
+                except GaussLiteError as error:
+                    failed[agent_id], changed[agent_id] = error, self._votes.leave_out(agent_id, keys)
+            self._record(changed)
+        return failed
+
+    def set_frame(self, agent_id: str, alignment: FrameAlignment) -> None:
+        """Read the agent's updates in this frame from now on; `move` follows."""
+        with self._lock:
+            self._votes.set_frame(agent_id, alignment)
+
+    def move(self, agent_id: str) -> None:
+        """Move the agent's map to its frame, in slices between which others have their turn. Raises StorageError."""
+        for keys in self._votes.slices(agent_id):
+            for error in self.update({agent_id: keys}).values():
+                raise error
+
+    def read(self, agent_id: str) -> VoxelBatch:
+        """Return the agent's updates as the vote reads them. Raises StorageError."""
+        with self._lock:
+            return self._votes.batch(agent_id)
+
+    def remove_agent(self, agent_id: str, removed: Int64[ndarray, " v"]) -> None:
+        """Vote without an agent; removed: the voxels that the store had of it."""
+        with self._lock:
+            self._record({agent_id: np.union1d(removed, self._votes.remove_agent(agent_id))})
+
+    def _record(self, changed_keys: Mapping[str, Int64[ndarray, " _"]]) -> None:
         """Record that what the vote reads changed in these voxels of each agent, with one vote on all of them."""
         if not changed_keys:
             return
-        with self._lock:
-            vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
-            fused_changes = self._change_log.record(changed_keys, vote)
-            if self._refined is not None:
-                present = set(vote.keys.tolist())
-                changed = [key for key in fused_changes.tolist() if key in present]
-                removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_log]
-                self._refined_log.record(changed, removed)
+        vote = rank_voxels(self._votes.scores(np.concatenate(list(changed_keys.values()))))
+        fused_changes = self._change_log.record(changed_keys, vote)
+        if self._refined is not None:
+            present = set(vote.keys.tolist())
+            changed = [key for key in fused_changes.tolist() if key in present]
+            removed = [key for key in fused_changes.tolist() if key not in present and key in self._refined_log]
+            self._refined_log.record(changed, removed)
 
     def changes(self, since_revision: int = 0, layer: MapLayer = MapLayer.VOTE) -> FusedMapChanges:
         """Return the changes of a layer since a revision; the whole map for 0. Raises RevisionGoneError."""

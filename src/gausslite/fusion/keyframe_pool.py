@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from threading import Lock
 from typing import NamedTuple
@@ -49,6 +50,7 @@ class EncodedKeyframe:
 class _Stored(NamedTuple):
     capture_time_ns: int
     size_bytes: int
+    keyframe_id: int
 
 
 class KeyframePool:
@@ -65,7 +67,8 @@ class KeyframePool:
         # held by changes; they replace an agent's keyframes as a whole
         self._changing = Lock()
         store.remove_unfinished_keyframes()
-        self._stored = _in_order(store.keyframe_sizes(), store.records(ORDER_RECORD))
+        self._ids = itertools.count()
+        self._stored = _in_order(store.keyframe_sizes(), store.records(ORDER_RECORD), self._ids)
 
     def __len__(self) -> int:
         return sum(map(len, list(self._stored.values())))
@@ -86,7 +89,7 @@ class KeyframePool:
             before = stored.get(keyframe.index)
             if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
                 del stored[keyframe.index]
-            stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data))
+            stored[keyframe.index] = _Stored(keyframe.capture_time_ns, len(keyframe.data), next(self._ids))
             wanted = {*(selected or stored), keyframe.index}
             kept = self._newest_within_limits({index: own for index, own in stored.items() if index in wanted})
             if len(kept) < len(stored):
@@ -102,6 +105,10 @@ class KeyframePool:
     def indices(self, agent_id: str) -> tuple[int, ...]:
         """Return the frame indices of this agent's keyframes, the newest last."""
         return tuple(self._stored.get(agent_id, ()))
+
+    def ids(self, agent_id: str) -> dict[int, int]:
+        """Return the id of the agent's keyframe of each index, the newest last; one received again has another id."""
+        return {index: own.keyframe_id for index, own in self._stored.get(agent_id, {}).items()}
 
     def find(self, agent_id: str, index: int | None = None) -> bytes:
         """Return the agent's encoded keyframe, the newest one without an index; empty if it has none.
@@ -151,7 +158,7 @@ class KeyframePool:
 
 
 def _in_order(
-    sizes_bytes: Mapping[str, Mapping[int, int]], orders: Mapping[str, bytes]
+    sizes_bytes: Mapping[str, Mapping[int, int]], orders: Mapping[str, bytes], ids: Iterator[int]
 ) -> dict[str, dict[int, _Stored]]:
     """Return the keyframes in the order in which they were received; those without a place are the last."""
     stored = {}
@@ -161,7 +168,7 @@ def _in_order(
         except (TypeError, ValueError, RecursionError) as error:
             raise CodecError(f"stored order of keyframes: expected its JSON, got other bytes ({error})") from error
         ordered = [*(index for index in times_ns if index in sizes), *sorted(sizes.keys() - times_ns.keys())]
-        stored[agent_id] = {index: _Stored(times_ns.get(index, -1), sizes[index]) for index in ordered}
+        stored[agent_id] = {index: _Stored(times_ns.get(index, -1), sizes[index], next(ids)) for index in ordered}
     return stored
 
 

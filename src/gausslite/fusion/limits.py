@@ -10,16 +10,12 @@ from gausslite.domain.checks import require_identifier, require_name
 from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.store_values import MissionConfig
 
 DEFAULT_LEASE_S = 60.0
 """Longer than a robot needs to notice a lost server and to reconnect, see wire/channel.py."""
 MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
-
-
-_CORRECT, _TRUST = "correct", "trust"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +55,7 @@ class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
     max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
-    alignment: how agents' frames are estimated; None uses them as declared. lease_s: time after an agent's last call
-    during which no other robot can take its name.
+    lease_s: time after an agent's last call during which no other robot can take its name.
     """
 
     grid: VoxelGrid = option(VoxelGrid(), "edge of the voxels", **VOXEL_SIZE)
@@ -68,15 +63,6 @@ class FusionSettings:
     world_frame: str = option("", "frame of all maps (default: the first agent's)", metavar="NAME")
     quotas: Quotas = field(default_factory=Quotas)
     max_removed_voxels: int = MAX_REMOVED_VOXELS
-    alignment: AlignmentSettings | None = option(
-        None,
-        "correct the misfit of agents' frames and quarantine gross ones, or trust them (default: correct)",
-        key="frame-alignment",
-        choices=(_CORRECT, _TRUST),
-        plain_type=str,
-        convert=lambda text: AlignmentSettings() if text == _CORRECT else None,
-        to_plain=lambda _: _CORRECT,
-    )
     lease_s: float = DEFAULT_LEASE_S
 
     def __post_init__(self) -> None:

@@ -8,10 +8,11 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Collection
+from threading import Lock
 
 from gausslite.domain import errors
 from gausslite.domain.checks import quote_name, require_identifier
-from gausslite.fusion.agent_data import is_earlier_map
+from gausslite.fusion.earlier_map import is_earlier_map
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig, SessionRecord, reconcile
@@ -61,7 +62,7 @@ _NAME_TAKEN = "another robot uses this name; give each its own agent id"
 
 
 class SessionRegistry:
-    """Opens, finds and ends sessions; they persist with the store. Not thread-safe; FusionEngine holds a lock.
+    """Opens, finds and ends sessions; they persist with the store. FusionEngine holds a lock, but not for `known`.
 
     A lease lasts `lease_s` after the session's last use; clock_s: the time in seconds. Only a join with the token of
     the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256. Sessions that
@@ -70,6 +71,8 @@ class SessionRegistry:
 
     def __init__(self, store: FusionStore, lease_s: float, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._store, self._lease_s, self._clock_s = store, lease_s, clock_s
+        # held for a moment, never during a call of the store: each message asks for its session
+        self._lock = Lock()
         self._elsewhere: dict[str, SessionRecord] = {}
         self._sessions = {session.session_id: session for session in store.sessions()}
         # in the order of the agents' first sessions; after a restart, each robot has a whole lease to come back
@@ -81,7 +84,8 @@ class SessionRegistry:
     @property
     def agents(self) -> frozenset[str]:
         """The agents that have a session."""
-        return frozenset(session.agent_id for session in self._sessions.values())
+        with self._lock:
+            return frozenset(session.agent_id for session in self._sessions.values())
 
     @property
     def live_agents(self) -> frozenset[str]:
@@ -103,11 +107,12 @@ class SessionRegistry:
         is_holder = self._is_holder(agent_id, token)
         session = SessionRecord(secrets.token_hex(16), agent_id)
         self.save(session, token)
-        for replaced in self._sessions_of(agent_id):
-            del self._sessions[replaced]
-            self._replaced.append((replaced, is_holder))
-        self._sessions[session.session_id] = session
-        self._renew(agent_id)
+        with self._lock:
+            for replaced in self._sessions_of(agent_id):
+                del self._sessions[replaced]
+                self._replaced.append((replaced, is_holder))
+            self._sessions[session.session_id] = session
+            self._lease_ends_s[agent_id] = self._clock_s() + self._lease_s
         return session
 
     def save(self, session: SessionRecord, token: str) -> None:
@@ -117,11 +122,13 @@ class SessionRegistry:
         self._token_hashes[session.agent_id] = _hash(token)
 
     def known(self, session_id: str) -> SessionRecord | None:
-        """Return the session if it is known without the store, and renew its lease; in any thread, without lock."""
-        session = self._sessions.get(session_id)
-        if session is None:
-            return self._elsewhere.get(session_id)
-        self._renew(session.agent_id)
+        """Return the session if it is known without the store, and renew its lease; in any thread, at once."""
+        lease_end_s = self._clock_s() + self._lease_s
+        with self._lock:
+            session = self._sessions.get(session_id)
+            if session is None:
+                return self._elsewhere.get(session_id)
+            self._lease_ends_s[session.agent_id] = lease_end_s
         return session
 
     def get(self, session_id: str) -> SessionRecord:
@@ -143,26 +150,30 @@ class SessionRegistry:
         elsewhere = self._store.find_session(session_id)
         if elsewhere is None:
             raise errors.SessionUnknownError(f"session {quote_name(session_id)}: unknown to this server; join again")
-        self._elsewhere[session_id] = elsewhere
+        with self._lock:
+            self._elsewhere[session_id] = elsewhere
         return elsewhere
 
     def forget_elsewhere(self, agent_id: str) -> None:
         """Ask the store again for the session of an agent that another server has opened."""
-        for session_id in [key for key, session in self._elsewhere.items() if session.agent_id == agent_id]:
-            del self._elsewhere[session_id]
+        with self._lock:
+            for session_id in [key for key, session in self._elsewhere.items() if session.agent_id == agent_id]:
+                del self._elsewhere[session_id]
 
     def end_agent(self, agent_id: str) -> None:
         """End the session and the lease of an agent, if it has one. Raises StorageError."""
         for session_id in self._sessions_of(agent_id):
             self._store.end_session(session_id)
-            del self._sessions[session_id]
-        self._lease_ends_s.pop(agent_id, None)
+            with self._lock:
+                del self._sessions[session_id]
+        with self._lock:
+            self._lease_ends_s.pop(agent_id, None)
 
     def end_unused(self, kept: Collection[str]) -> list[str]:
         """End the sessions whose lease has ended, except those of `kept`; return their agents. Raises StorageError."""
-        ended = [
-            agent_id for agent_id in self._lease_ends_s if agent_id not in kept and self._remaining_s(agent_id) <= 0
-        ]
+        now_s = self._clock_s()
+        with self._lock:
+            ended = [name for name, end_s in self._lease_ends_s.items() if name not in kept and end_s <= now_s]
         for agent_id in ended:
             self.end_agent(agent_id)
         return ended
@@ -173,9 +184,6 @@ class SessionRegistry:
 
     def _sessions_of(self, agent_id: str) -> list[str]:
         return [key for key, session in self._sessions.items() if session.agent_id == agent_id]
-
-    def _renew(self, agent_id: str) -> None:
-        self._lease_ends_s[agent_id] = self._clock_s() + self._lease_s
 
     def _remaining_s(self, agent_id: str) -> float:
         return self._lease_ends_s.get(agent_id, -float("inf")) - self._clock_s()

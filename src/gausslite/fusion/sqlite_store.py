@@ -1,4 +1,4 @@
-"""The store of voxel updates in one SQLite file: acknowledged updates survive a power failure."""
+"""The store of voxel updates in SQLite: in a file, where acknowledged updates survive a power failure, or in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from gausslite.domain.errors import StorageError
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.store_rows import LogChange, require_intact
 
-_IN_MEMORY = Path(":memory:")
+IN_MEMORY = Path(":memory:")
+"""The name of a database that ends with its connection."""
 SCHEMA_VERSION = 9
 PAGE_BYTES = 4096
 RESTORE_ADVICE = (
@@ -86,7 +87,7 @@ def open_existing(path: Path) -> sqlite3.Connection:
 
 def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
     """Lock a store and connect to it for writing; a missing file is created. Raises StorageError."""
-    if path == _IN_MEMORY:
+    if path == IN_MEMORY:
         db = opened.enter_context(contextlib.closing(connect(path)))
         _create_tables(db)
         return db
@@ -161,72 +162,58 @@ _SELECT_ROWS = f"{SELECT_UPDATES} WHERE number IN (SELECT value FROM json_each(?
 _CHECKPOINT = "PRAGMA wal_checkpoint(PASSIVE)"
 
 
-class _Checkpoints:
-    """Copies the log into the file every few seconds, in a thread: a commit that did so would wait for the disk."""
-
-    def __init__(self, path: Path, write_lock: RLock) -> None:
-        """write_lock: held by each commit."""
-        self._path, self._write_lock = path, write_lock
-        self._is_closed, self.has_commits = Event(), False
-        self._thread = Thread(target=self._run, name="checkpoints", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Wait until the thread has ended."""
-        self._is_closed.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        with contextlib.closing(connect(self._path)) as db:
-            db.execute("PRAGMA synchronous = FULL")
-            while not self._is_closed.wait(_CHECKPOINT_PERIOD_S):
-                if self.has_commits:
-                    self.has_commits = False
-                    # what fails here fails in the next commit too, which says so
-                    with contextlib.suppress(sqlite3.Error):
-                        self._copy(db)
-
-    def _copy(self, db: sqlite3.Connection) -> None:
-        """Copy the log in rounds, the last one without commits: it begins anew only when all of it is in the file."""
-        for _ in range(_FREE_ROUNDS):
-            db.execute(_CHECKPOINT)
-        with self._write_lock:
-            db.execute(_CHECKPOINT)
-
-
 class SqliteStore(FusionStore):
     """A FusionStore in a file: write-ahead log, synchronous=FULL, one transaction per call, one server at a time.
 
-    The totals of all updates are in memory (ScoreIndex). Reads use a second connection and so do not wait for a commit.
-    max_bytes limits the file size; a put beyond it raises StorageError and changes nothing. The constructor reads and
-    checks every row. It raises StorageError if the file cannot be opened, is in use by another server, is damaged, or
-    has another schema.
+    Without a path it is in memory and ends with its process. The totals of all updates are in memory (ScoreIndex).
+    Reads of a file use a second connection and so do not wait for a commit. max_bytes limits the file size; a put
+    beyond it raises StorageError and changes nothing. The constructor reads and checks every row. It raises
+    StorageError if the file cannot be opened, is in use by another server, is damaged, or has another schema.
     """
 
-    def __init__(self, path: Path, max_bytes: int | None = None) -> None:
+    def __init__(self, path: Path = IN_MEMORY, max_bytes: int | None = None) -> None:
         super().__init__()
-        self._path, self._read_lock = path, RLock()
+        self._path = path
         with ExitStack() as opened:
             self._writer = self._reader = _open(path, opened)
-            if path == _IN_MEMORY:
-                # both use one connection
-                self._read_lock = self._write_lock
-            else:
+            # one connection for both in memory
+            self._read_lock = self._write_lock
+            if path != IN_MEMORY:
+                self._read_lock = RLock()
                 self._reader = opened.enter_context(contextlib.closing(connect(path)))
             if max_bytes is not None:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
             self._load()
             self.incarnation_id = str(self._read("SELECT value FROM properties WHERE name = 'incarnation_id'")[0][0])
-            self._checkpoints = None if path == _IN_MEMORY else _Checkpoints(path, self._write_lock)
             self._opened = opened.pop_all()
+        self._is_closed, self._has_commits = Event(), False
+        self._checkpoints = Thread(target=self._copy_log, name="checkpoints", daemon=True)
+        if path != IN_MEMORY:
+            self._checkpoints.start()
 
     def close(self) -> None:
         """Write the log into the file and close it."""
-        if self._checkpoints is not None:
-            # before the lock, for which its thread may wait
-            self._checkpoints.close()
+        self._is_closed.set()
+        if self._checkpoints.is_alive():
+            # before the lock, for which it may wait
+            self._checkpoints.join()
         with self._write_lock, self._read_lock:
             self._opened.close()
+
+    def _copy_log(self) -> None:
+        """Copy the log into the file every few seconds, in a thread: a commit that did so would wait for the disk."""
+        with contextlib.closing(connect(self._path)) as db:
+            db.execute("PRAGMA synchronous = FULL")
+            while not self._is_closed.wait(_CHECKPOINT_PERIOD_S):
+                if self._has_commits:
+                    self._has_commits = False
+                    # what fails here fails in the next commit too, which says so
+                    with contextlib.suppress(sqlite3.Error):
+                        for _ in range(_FREE_ROUNDS):
+                            db.execute(_CHECKPOINT)
+                        # without commits: the log begins anew only when all of it is in the file
+                        with self._write_lock:
+                            db.execute(_CHECKPOINT)
 
     def _load(self) -> None:
         """Check every row of updates and fill the index."""
@@ -267,12 +254,4 @@ class SqliteStore(FusionStore):
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
                 raise
-            if self._checkpoints is not None:
-                self._checkpoints.has_commits = True
-
-
-class MemoryStore(SqliteStore):
-    """A FusionStore without a file, which ends with its process."""
-
-    def __init__(self) -> None:
-        super().__init__(_IN_MEMORY)
+            self._has_commits = True

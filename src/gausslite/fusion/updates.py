@@ -11,12 +11,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from threading import Lock, RLock
+from threading import Lock
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
-from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import declared_bytes, decode_stored
@@ -191,6 +189,11 @@ class PendingUpdate:
             return subset
         return replace(subset, voxels=subset.voxels.slice(start, start + SLICE_VOXELS))
 
+    def fail(self, error: BaseException) -> None:
+        """Refuse the message, unless it has its answer."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
     def add_outcome(self, outcome: PutOutcome) -> bool:
         """Note that the next slice is stored; returns whether it was the last one."""
         self.outcomes.append(outcome)
@@ -300,55 +303,41 @@ class UpdateQueue:
 
 _GROUP_BYTES = 1 << 19
 """Of about 20 messages of a robot; a message that comes during a commit waits for its end."""
-Check = Callable[[PendingUpdate], None]
-"""Raises GaussLiteError to refuse a message."""
-Record = Callable[[Sequence[tuple[str, Int64[ndarray, " _"]]]], None]
-"""Notes the voxels of each agent that a commit has stored."""
 
 
-class UpdateCommitter:
-    """Owns the queue. Messages are checked and recorded under the engine's lock, decoded and committed without it.
+class UpdateIngest:
+    """The queue of received messages, which are decoded when it is their agents' turn. Thread-safe."""
 
-    A message with more than SLICE_VOXELS voxels is stored in several transactions. If one of them fails, the stored
-    part stays; it is a part of the agent's newest data, and sending the message again completes it. Thread-safe.
-    """
-
-    def __init__(self, store: FusionStore, lock: RLock, grid: VoxelGrid, check: Check, record: Record) -> None:
-        self._store, self._lock, self._grid, self._check, self._record = store, lock, grid, check, record
+    def __init__(self, grid: VoxelGrid) -> None:
+        self._grid = grid
         self._queue = UpdateQueue()
         self._next_log_s = 0.0
-        self.committing = Lock()
-        """Held through a commit; who deletes an agent's data takes it before the engine's lock."""
 
     def add(self, update: PendingUpdate) -> Future[PutOutcome]:
         """Queue a message; the future has its outcome after a commit. Raises UnavailableError."""
         self._queue.add(update)
         return update.future
 
-    def commit(self) -> None:
-        """Commit the queued messages, group by group, until none waits."""
-        while self._queue.has_waiting:
-            group = self._queue.take(_GROUP_BYTES)
-            try:
-                self._decode_all(group)
-                with self.committing:
-                    self._commit([update for update in group if not update.future.done()])
-            except Exception as error:
-                # reaches the senders through their futures
-                for update in group:
-                    _fail(update, error)
-            finally:
-                for update in group:
-                    self._queue.put_back(update, update.future.done())
+    def take(self) -> list[PendingUpdate]:
+        """Return the next group, decoded, or none; its messages stay in the queue until `put_back`.
 
-    def _decode_all(self, group: list[PendingUpdate]) -> None:
+        The future of a message that cannot be decoded has the error.
+        """
+        group = self._queue.take(_GROUP_BYTES)
         for update in group:
             self._log_if_late(update)
             try:
                 if isinstance(update.message, bytes):
                     update.message = decode_own(update.message, update.agent_id, self._grid)
-            except errors.GaussLiteError as error:
-                _fail(update, error)
+            except Exception as error:
+                # a group has messages of several agents
+                update.fail(error)
+        return group
+
+    def put_back(self, group: Sequence[PendingUpdate]) -> None:
+        """Let the agents of a group wait for their next slices, or for their next messages."""
+        for update in group:
+            self._queue.put_back(update, update.future.done())
 
     def _log_if_late(self, update: PendingUpdate) -> None:
         now_s = time.monotonic()
@@ -358,39 +347,23 @@ class UpdateCommitter:
                 "messages are late: one of agent %s has waited %.1f s", update.agent_id, now_s - update.queued_s
             )
 
-    def _commit(self, group: list[PendingUpdate]) -> None:
-        checked: list[tuple[PendingUpdate, StoredSubset]] = []
-        with self._lock:
-            for update in group:
-                try:
-                    self._check(update)
-                    checked.append((update, update.next_slice()))
-                except errors.GaussLiteError as error:
-                    _fail(update, error)
-        if not checked:
-            return
-        outcomes = self._put(checked)
-        with self._lock:
-            results = zip(checked, outcomes, strict=True)
-            self._record([(part.agent_id, put.accepted) for (_, part), put in results if put is not None])
-        for (update, _), outcome in zip(checked, outcomes, strict=True):
-            if outcome is not None and update.add_outcome(outcome):
-                update.future.set_result(update.outcome())
 
-    def _put(self, checked: list[tuple[PendingUpdate, StoredSubset]]) -> list[PutOutcome | None]:
-        """Store the messages; if the group fails, each alone, so that one too large for the disk fails alone."""
-        try:
-            return list(self._store.put_all([part for _, part in checked]))
-        except errors.GaussLiteError as error:
-            if len(checked) > 1:
-                return [outcome for own in checked for outcome in self._put([own])]
-            _fail(checked[0][0], error)
-            return [None]
+def store_slices(store: FusionStore, group: Sequence[PendingUpdate]) -> list[tuple[PendingUpdate, PutOutcome]]:
+    """Store the next slice of each message; returns those that were stored. The futures of the others have the error.
 
-
-def _fail(update: PendingUpdate, error: BaseException) -> None:
-    if not update.future.done():
-        update.future.set_exception(error)
+    If the group fails, each is stored alone, so that one too large for the disk fails alone. A message with more than
+    SLICE_VOXELS voxels is stored in several transactions. If one of them fails, the stored part stays; it is a part of
+    the agent's newest data, and sending the message again completes it.
+    """
+    if not group:
+        return []
+    try:
+        return list(zip(group, store.put_all([update.next_slice() for update in group]), strict=True))
+    except errors.GaussLiteError as error:
+        if len(group) > 1:
+            return [stored for update in group for stored in store_slices(store, [update])]
+        group[0].fail(error)
+        return []
 
 
 def require_within_quotas(subset: StoredSubset, store: FusionStore, quotas: Quotas) -> None:

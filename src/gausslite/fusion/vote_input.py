@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, select_keys, select_voxels
-from gausslite.fusion.frames import FrameAlignments
+from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import SCORES, VoxelScoreTable
 
@@ -56,16 +56,27 @@ class VoteInput:
     """Reads the updates from the store, and moves those of agents in other frames.
 
     The index has the totals of the moved voxels; their Gaussians are moved when they are read. So a message, or a slice
-    of a map whose frame changes, costs its own voxels. Not thread-safe; FusionEngine holds a lock.
+    of a map whose frame changes, costs its own voxels. Not thread-safe; FusedMapLayers holds a lock.
     """
 
-    def __init__(self, store: FusionStore, alignments: FrameAlignments, grid: VoxelGrid) -> None:
-        self._store, self._alignments, self._grid = store, alignments, grid
+    def __init__(self, store: FusionStore, frames: Mapping[str, FrameAlignment], grid: VoxelGrid) -> None:
+        """frames: of the agents, as far as they have one."""
+        self._store, self._grid = store, grid
+        # of the agents whose updates are not used as sent
+        self._frames: dict[str, FrameAlignment] = {}
         self._moved: dict[str, _MovedVoxels] = {}
-        for agent_id in store.agents():
-            if not self._is_as_sent(agent_id):
-                for keys in self.slices(agent_id):
-                    self.move(agent_id, keys)
+        for agent_id, alignment in frames.items():
+            self.set_frame(agent_id, alignment)
+        for agent_id in self._frames:
+            for keys in self.slices(agent_id):
+                self.move(agent_id, keys)
+
+    def set_frame(self, agent_id: str, alignment: FrameAlignment) -> None:
+        """Move the agent's updates by this alignment from now on; `move` those that are stored."""
+        if alignment.is_identity and alignment.is_used:
+            self._frames.pop(agent_id, None)
+        else:
+            self._frames[agent_id] = alignment
 
     def agents(self) -> tuple[str, ...]:
         """Return the ids of the agents with updates, sorted."""
@@ -112,19 +123,23 @@ class VoteInput:
         return {name: self.batch(name, keys) if name in self._moved else batch for name, batch in batches.items()}
 
     def move(self, agent_id: str, sources: Int64[ndarray, " a"]) -> Int64[ndarray, " k"]:
-        """Move these voxels of the agent by its alignment as it is now; returns the fused voxels that may change."""
-        if self._is_as_sent(agent_id) and agent_id not in self._moved:
+        """Move these voxels of the agent by its alignment; returns the fused voxels that may change.
+
+        Raises StorageError; then `leave_out` these voxels, which would count as sent.
+        """
+        alignment = self._frames.get(agent_id)
+        if alignment is None and agent_id not in self._moved:
             return sources
         moved = self._moved.setdefault(agent_id, _MovedVoxels())
         changed: set[int] = set()
-        if self._is_as_sent(agent_id):
+        if alignment is None:
             for source in sources.tolist():
                 changed |= {source} | moved.replace(source, None)
             if not moved.cells_of:
                 del self._moved[agent_id]
             return _array(changed)
         cells_of: dict[int, _Cells] = {source: {} for source in sources.tolist()}
-        if self._alignments.get(agent_id).is_used:
+        if alignment.is_used:
             batch = self._store.batch(agent_id, sources)
             gaussians = self._gaussians_in_frame(agent_id, batch)
             rows = np.flatnonzero(self._in_range(gaussians))
@@ -134,14 +149,16 @@ class VoteInput:
             changed |= moved.replace(source, cells)
         return _array(changed)
 
+    def leave_out(self, agent_id: str, sources: Int64[ndarray, " a"]) -> Int64[ndarray, " k"]:
+        """Use nothing of these voxels until they are moved; returns the fused voxels that may change."""
+        moved = self._moved.setdefault(agent_id, _MovedVoxels())
+        return _array(set().union(*(moved.replace(source, {}) for source in sources.tolist())))
+
     def remove_agent(self, agent_id: str) -> Int64[ndarray, " k"]:
-        """Delete the agent's moved voxels; returns them."""
+        """Delete the agent's frame and its moved voxels; returns these."""
+        self._frames.pop(agent_id, None)
         moved = self._moved.pop(agent_id, None)
         return _array(() if moved is None else moved.sources_of)
-
-    def _is_as_sent(self, agent_id: str) -> bool:
-        alignment = self._alignments.get(agent_id)
-        return alignment.is_identity and alignment.is_used
 
     def _move(self, agent_id: str, sources: Int64[ndarray, " s"]) -> VoxelBatch:
         gaussians = self._gaussians_in_frame(agent_id, self._store.batch(agent_id, sources))
@@ -149,7 +166,7 @@ class VoteInput:
 
     def _gaussians_in_frame(self, agent_id: str, batch: VoxelBatch) -> Gaussians:
         """Return the Gaussians in the fused frame, in their order."""
-        alignment = self._alignments.get(agent_id)
+        alignment = self._frames.get(agent_id, FrameAlignment(0))
         segments = alignment.segment_of(self._store.stored(agent_id, batch.keys)["update_seqs"])
         used = np.unique(segments)
         if len(used) == 1:

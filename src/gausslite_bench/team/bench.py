@@ -11,11 +11,10 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_voxels
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import AlignmentSettings
 from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings, refine
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome
@@ -25,6 +24,7 @@ from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.scenes import TeamPlan, TeamScene
 from gausslite_evaluation.compare import MapScores, score_team
 from gausslite_evaluation.views import MapViewer
+from gausslite_places.frame_aligner import MapAligner
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"
 ALONE, TRUSTED = " alone", ", frames trusted"
@@ -146,8 +146,8 @@ def fuse_messages(
 ) -> FusionEngine:
     """Return a fusion engine that has received each agent's messages, agent by agent."""
     quotas = Quotas(voxels_per_agent=10_000_000, gaussians_per_agent=100_000_000)
-    settings = FusionSettings(grid, quotas=quotas, alignment=AlignmentSettings() if align else None)
-    engine = FusionEngine(MemoryStore(), settings)
+    aligner = MapAligner(grid) if align else None
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid, quotas=quotas), aligner=aligner)
     for agent_id, subsets in messages.items():
         session_id = engine.join(agent_id, MissionConfig("", "", grid.size_m)).session.session_id
         for subset in subsets:

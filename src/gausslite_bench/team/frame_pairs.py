@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from gausslite.domain.pose import transform_of, transform_points
-from gausslite.fusion.frames import AlignmentSettings
-from gausslite_places.frame_fit import FrameFit, SurfaceSamples, fit_frame
+from gausslite.fusion.frames import FrameFit
+from gausslite_places.frame_fit import SurfaceSamples, fit_frame
+from gausslite_places.frame_rules import MAX_ROTATION_DEG, MAX_SHIFT_M, contradicts, corrects
 
 PARTS = {"whole": (np.inf, np.inf), "1 to 2 m": (1.0, 2.0), "0.4 to 1 m": (0.4, 1.0), "0.15 to 0.4 m": (0.15, 0.4)}
 """Half the edges of the boxes that are cut out of a map."""
@@ -21,7 +22,6 @@ _PLANE_M, _PLANE_REACH_M = 0.03, (0.5, 1.5)
 _NEAREST = 12
 _LARGEST_M, _LARGEST_DEG = 1.0, 30.0
 _MIN_SAMPLES = 60
-_GROSS = AlignmentSettings()
 CORRECT, MODERATE, GROSS = "none", "moderate", "gross"
 ABSTAINED, FITS, CORRECTED, CONTRADICTED = "not compared", "fits", "corrected", "contradicted"
 
@@ -86,7 +86,7 @@ def _judge(
     size: tuple[float, float],
 ) -> FramePair:
     fit = fit_frame(source.moved(T_wrong), target)
-    is_gross = size[0] > _GROSS.max_shift_m or size[1] > _GROSS.max_rotation_deg
+    is_gross = size[0] > MAX_SHIFT_M or size[1] > MAX_ROTATION_DEG
     error = CORRECT if size == (0, 0) else GROSS if is_gross else MODERATE
     motion = np.eye(4) if fit is None else fit.motion
     wrong = transform_points(motion @ T_wrong, source.points_m) - source.points_m
@@ -96,9 +96,9 @@ def _judge(
 def _outcome(fit: FrameFit | None) -> str:
     if fit is None:
         return ABSTAINED
-    if _GROSS.contradicts(fit):
+    if contradicts(fit):
         return CONTRADICTED
-    return CORRECTED if _GROSS.corrects(fit) else FITS
+    return CORRECTED if corrects(fit) else FITS
 
 
 def _in_box(

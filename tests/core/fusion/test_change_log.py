@@ -14,7 +14,7 @@ from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batc
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.vote import FusedMap, fuse, rank_voxels
 
@@ -39,7 +39,7 @@ def make_batch(counts: dict[int, int]) -> VoxelBatch:
 @settings(max_examples=60)
 @given(STEPS)
 def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     engine = FusionEngine(store, FusionSettings(grid=GRID), first_revision=1)
     sessions = {
         name: engine.join(name, MissionConfig("", "", 0.10)).session.session_id for name in ("ant", "bee", "cat")
@@ -73,13 +73,13 @@ def assert_status_is_counted_from_the_map(engine: FusionEngine, fused: FusedMap)
         assert agent.won_voxels == int(fused.won_by(agent.agent_id).sum())
 
 
-def record(change_log: ChangeLog, store: MemoryStore, subset: RoiSubset) -> list[int]:
+def record(change_log: ChangeLog, store: SqliteStore, subset: RoiSubset) -> list[int]:
     accepted = store.put(subset).accepted
     return change_log.record({subset.agent_id: accepted}, rank_voxels(store.scores(accepted))).tolist()
 
 
 def test_only_a_change_of_the_fused_map_is_recorded() -> None:
-    change_log, store = ChangeLog(first_revision=100), MemoryStore()
+    change_log, store = ChangeLog(first_revision=100), SqliteStore()
     assert record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 3, 2: 1}))) == [1, 2]
     assert change_log.voxels.revisions.revision == 101
     assert record(change_log, store, RoiSubset("bee", "", 1, 1, make_batch({1: 2}))) == []
@@ -92,14 +92,14 @@ def test_only_a_change_of_the_fused_map_is_recorded() -> None:
 
 @pytest.mark.parametrize("revision", [0, 99, 103, 10**18])
 def test_a_revision_from_before_a_restart_is_gone(revision: int) -> None:
-    change_log, store = ChangeLog(first_revision=100), MemoryStore()
+    change_log, store = ChangeLog(first_revision=100), SqliteStore()
     record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 3})))
     with pytest.raises(RevisionGoneError, match="expected 100 to 101"):
         change_log.voxels.revisions.changed_since(revision)
 
 
 def test_the_number_of_recorded_removals_is_limited() -> None:
-    change_log, store = ChangeLog(first_revision=1, max_removed=2), MemoryStore()
+    change_log, store = ChangeLog(first_revision=1, max_removed=2), SqliteStore()
     record(change_log, store, RoiSubset("ant", "", 1, 1, make_batch({1: 1, 2: 1, 3: 1})))
     for revision, key in enumerate((1, 2, 3), start=2):
         record(change_log, store, RoiSubset("ant", "", revision, revision, make_batch({key: 0})))

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from fusion_running import GRID, keys, make_subset
-from sample_gaussians import plain_gaussians
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.voxels import RoiSubset, group_by_voxel, select_voxels
-from gausslite.fusion.agent_data import earlier_map_of
+from gausslite.fusion.earlier_map import earlier_map_of
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import AlignmentSettings, AlignmentState
 from gausslite.fusion.limits import FusionSettings, Quotas
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig
 
@@ -24,7 +20,7 @@ EARLIER = "ant:earlier"
 
 
 def engine_on(store: FusionStore | None = None, **settings: object) -> FusionEngine:
-    return FusionEngine(store or MemoryStore(), FusionSettings(grid=GRID, **settings))
+    return FusionEngine(store or SqliteStore(), FusionSettings(grid=GRID, **settings))
 
 
 def reboot(engine: FusionEngine, agent_id: str = "ant") -> str:
@@ -118,32 +114,6 @@ def test_operators_delete_an_earlier_map_alone_or_with_its_agent() -> None:
     send(engine, reboot(engine), 1, {0: [5]})
     engine.leave(reboot(engine), forget=True)
     assert fused_kappas(engine) == {}
-
-
-def corner_subset(seed: int, shift_m: float = 0.0) -> RoiSubset:
-    """Samples of a textured corner of a room: a floor and two walls of 2 m."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(0, 2, (3000, 3))
-    points[np.arange(3000), rng.integers(0, 3, 3000)] = 0.0
-    texture = 0.5 + 0.4 * np.sin(6 * points[:, 0] + 4 * points[:, 1] + 5 * points[:, 2])
-    gaussians = plain_gaussians(points + shift_m, rgb=np.repeat(texture[:, None], 3, 1), kappa=5)
-    return RoiSubset("ant", "", 1, 1, group_by_voxel(gaussians, GRID))
-
-
-@pytest.mark.parametrize(("shift_m", "is_kept"), [(0.0, True), (0.05, True), (0.22, False)])
-def test_an_earlier_map_in_another_frame_is_corrected_or_deleted(shift_m: float, is_kept: bool) -> None:
-    engine = engine_on(alignment=AlignmentSettings())
-    engine.contribute(reboot(engine), corner_subset(0), GRID)
-    session, whole = reboot(engine), corner_subset(1, shift_m)
-    for seq in (1, 2):
-        part = select_voxels(whole.batch, np.arange(len(whole.batch)) % 2 == seq % 2)
-        engine.contribute(session, RoiSubset("ant", "", seq, seq, part), GRID)
-        engine.align_due()
-    status = {each.agent_id: each for each in engine.status().agents}
-    assert (EARLIER in status) == is_kept
-    assert status["ant"].alignment.state is not AlignmentState.QUARANTINED
-    if not is_kept:
-        assert status["ant"].won_voxels == status["ant"].voxels > 0
 
 
 def test_the_name_of_an_earlier_map_is_derived_from_its_agent() -> None:

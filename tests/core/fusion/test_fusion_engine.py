@@ -10,13 +10,22 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
-from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, QuotaError, SessionUnknownError
+from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.domain.errors import (
+    GaussLiteError,
+    InvalidInputError,
+    MismatchError,
+    QuotaError,
+    SessionUnknownError,
+    StorageError,
+)
 from gausslite.domain.objects import ObjectReport
+from gausslite.domain.pose import transform_of
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
+from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings, Quotas
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig, reconcile
 from gausslite.fusion.traffic import TrafficCounters
 
@@ -42,7 +51,7 @@ def make_subset(
 
 
 def test_status_counts_each_agents_contribution() -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID, mission_id="rescue"), first_revision=10)
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID, mission_id="rescue"), first_revision=10)
     ant, bee = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
     engine.contribute(ant, make_subset("ant", 3, [(0, 5), (1, 1), (1, 1)], removed=(4,)), GRID)
     engine.contribute(bee, make_subset("bee", 8, [(1, 9), (2, 0)]), GRID)
@@ -62,7 +71,7 @@ def test_status_counts_each_agents_contribution() -> None:
 
 
 def test_a_mission_without_updates_has_an_empty_map() -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     assert len(engine.maps.voted_map()) == len(engine.maps.union_map()) == 0
     assert engine.status().agents == ()
     assert len(engine.maps.changes().won.batch) == 0
@@ -70,7 +79,7 @@ def test_a_mission_without_updates_has_an_empty_map() -> None:
 
 
 def test_the_first_agent_that_names_the_mission_fixes_it() -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     engine.join("ant", ANYTHING)
     assert engine.mission_config == MissionConfig("mission", "world", 0.10)
     with pytest.raises(MismatchError, match="'world' as agreed here, got 'odom'"):
@@ -79,7 +88,7 @@ def test_the_first_agent_that_names_the_mission_fixes_it() -> None:
 
 
 def test_a_store_of_another_mission_is_refused() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     FusionEngine(store, FusionSettings(grid=GRID)).join("ant", MissionConfig("m", "w", 0.10))
     for settings in (FusionSettings(grid=VoxelGrid(0.2)), FusionSettings(grid=GRID, mission_id="other")):
         with pytest.raises(MismatchError, match=r"got (0\.2 m|'other')"):
@@ -88,7 +97,7 @@ def test_a_store_of_another_mission_is_refused() -> None:
 
 def test_quotas_apply_per_agent_and_a_resend_does_not_count() -> None:
     engine = FusionEngine(
-        MemoryStore(), FusionSettings(grid=GRID, quotas=Quotas(voxels_per_agent=2, gaussians_per_agent=2))
+        SqliteStore(), FusionSettings(grid=GRID, quotas=Quotas(voxels_per_agent=2, gaussians_per_agent=2))
     )
     ant = engine.join("ant", ANYTHING).session.session_id
     engine.contribute(ant, make_subset("ant", 1, [(0, 1), (1, 1)]), GRID)
@@ -105,7 +114,7 @@ def test_quotas_apply_per_agent_and_a_resend_does_not_count() -> None:
 
 
 def test_every_error_message_is_one_short_line() -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     ant = engine.join("ant", MissionConfig("m", "w", 0.10)).session.session_id
     attempts = [
         lambda: engine.join(LONG, ANYTHING),
@@ -128,7 +137,7 @@ def test_every_error_message_is_one_short_line() -> None:
 
 
 def test_a_slow_disk_delays_no_question_about_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
-    store, begun, released = MemoryStore(), Event(), Event()
+    store, begun, released = SqliteStore(), Event(), Event()
     engine = FusionEngine(store, FusionSettings(grid=GRID, mission_id="rescue"))
     session = engine.join("ant", ANYTHING).session
     save = store.save_record
@@ -149,3 +158,35 @@ def test_a_slow_disk_delays_no_question_about_a_session(monkeypatch: pytest.Monk
         finally:
             released.set()
         reported.result(60)
+
+
+class FailingStore(SqliteStore):
+    """Refuses to read voxels while `is_failing`."""
+
+    is_failing = False
+
+    def batch(self, agent_id: str, keys: np.ndarray | None = None) -> VoxelBatch:
+        if self.is_failing:
+            raise StorageError("damaged")
+        return super().batch(agent_id, keys)
+
+
+def test_stored_voxels_that_could_not_be_voted_on_are_in_the_map_after_the_next_commit() -> None:
+    store = FailingStore()
+    engine = FusionEngine(store, FusionSettings(grid=GRID))
+    sessions = {name: engine.join(name, ANYTHING).session for name in ("ant", "bee")}
+    # the vote reads the voxels of an agent in another frame
+    engine.declare_frame("ant", transform_of(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    engine.contribute(sessions["ant"].session_id, make_subset("ant", 1, [(0, 5)]), GRID)
+    store.is_failing = True
+    message = {name: StoredSubset.exact(make_subset(name, 2, [(5, 5)])) for name in sessions}
+    futures = {name: engine.enqueue_update(sessions[name], message[name]) for name in sessions}
+    engine.commit_updates()
+    assert isinstance(futures["ant"].exception(), StorageError)
+    assert len(futures["bee"].result().accepted) == 1
+    store.is_failing = False
+    # the robot sends it again, and it is in the store already
+    assert len(engine.contribute(sessions["ant"].session_id, make_subset("ant", 2, [(5, 5)]), GRID).stale) == 1
+    assert engine.maps.size() == (3, 3)
+    again = FusionEngine(store, FusionSettings(grid=GRID))
+    assert np.array_equal(engine.maps.voted_map().keys, again.maps.voted_map().keys)

@@ -22,7 +22,7 @@ from gausslite.domain.voxels import (
     select_voxels,
     tombstones,
 )
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.vote import FusedMap, fuse, fuse_maps, rank_voxels, union_maps
 
@@ -84,7 +84,7 @@ def subsets_from(history: dict[str, list[Spec]]) -> list[RoiSubset]:
 
 
 def stored(messages: list[RoiSubset], store: FusionStore | None = None) -> FusionStore:
-    store = store or MemoryStore()
+    store = store or SqliteStore()
     for message in messages:
         store.put(message)
     return store
@@ -212,7 +212,7 @@ def test_every_store_gives_the_same_map(history: dict[str, list[Spec]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         on_disk = SqliteStore(Path(folder) / "store.sqlite")
         try:
-            outcomes = [(on_disk.put(s), memory.put(s)) for memory in [MemoryStore()] for s in subsets]
+            outcomes = [(on_disk.put(s), memory.put(s)) for memory in [SqliteStore()] for s in subsets]
             for ours, theirs in outcomes:
                 assert ours.accepted.tolist() == theirs.accepted.tolist()
                 assert ours.stale.tolist() == theirs.stale.tolist()

@@ -26,7 +26,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, select_keys
 from gausslite.fusion.keyframe_pool import KeyframePool
 from gausslite.fusion.limits import Quotas
-from gausslite.fusion.sqlite_store import SCHEMA_VERSION, MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import AgentTotals, MissionConfig, SessionRecord
 
@@ -60,7 +60,7 @@ def opener(kind: str, request: pytest.FixtureRequest) -> OpenStore:
     """Return a function that opens the test's store of this kind, again after it was closed."""
     match kind:
         case "memory":
-            return MemoryStore
+            return SqliteStore
         case "sqlite":
             path = request.getfixturevalue("tmp_path") / "store.sqlite"
             return lambda: SqliteStore(path)

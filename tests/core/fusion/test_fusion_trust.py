@@ -31,7 +31,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframe_pool import EncodedKeyframe
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.membership import SessionRegistry
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.updates import MAX_SEQ_STEP, MissionClock, UpdateChecks
@@ -50,7 +50,7 @@ class Clock:
 
 
 def new_engine(store: FusionStore | None = None, **settings: object) -> FusionEngine:
-    return FusionEngine(store or MemoryStore(), FusionSettings(grid=GRID, **settings))
+    return FusionEngine(store or SqliteStore(), FusionSettings(grid=GRID, **settings))
 
 
 def join(engine: FusionEngine, agent_id: str, token: str = "own") -> str:
@@ -85,7 +85,7 @@ def received(cells: dict[int, list[int]]) -> StoredSubset:
 
 
 def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -> None:
-    store, clock = MemoryStore(), Clock()
+    store, clock = SqliteStore(), Clock()
     quotas = Quotas(kappa_at_join=100, kappa_per_second=10)
     checks = UpdateChecks(store, quotas, clock)
     checks.record_join("ant")
@@ -100,7 +100,7 @@ def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -
 
 
 def test_a_wrong_wall_clock_neither_sets_the_mission_back_nor_far_ahead() -> None:
-    store, wall, monotonic = MemoryStore(), Clock(), Clock()
+    store, wall, monotonic = SqliteStore(), Clock(), Clock()
     # of a computer without a battery for its clock, before it finds a time server
     wall.now_s, monotonic.now_s = 0.0, 7.0
     clock = MissionClock(store, wall, monotonic)
@@ -165,7 +165,7 @@ def test_an_evicted_agent_leaves_no_data_and_a_banned_one_stays_out_after_a_rest
 def test_what_is_being_written_when_its_agent_is_evicted_is_deleted_too(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, begun, ended = MemoryStore(), Event(), Event()
+    store, begun, ended = SqliteStore(), Event(), Event()
     engine = new_engine(store)
     session, end_session = join(engine, "ant"), store.end_session
     name = "save_keyframe" if kind == "keyframe" else "save_record"
@@ -197,7 +197,7 @@ def test_what_is_being_written_when_its_agent_is_evicted_is_deleted_too(
 
 
 def test_the_name_of_a_live_robot_is_taken_over_only_with_its_token_or_after_its_lease() -> None:
-    store, clock = MemoryStore(), Clock()
+    store, clock = SqliteStore(), Clock()
     sessions = SessionRegistry(store, 60.0, clock)
     first = sessions.open("ant", "token").session_id
     clock.now_s += 59
@@ -225,8 +225,24 @@ def test_the_name_of_a_live_robot_is_taken_over_only_with_its_token_or_after_its
     assert restarted.open("ant", "token").session_id != third
 
 
+def test_a_session_that_ends_during_a_message_leaves_no_lease() -> None:
+    clock = Clock()
+
+    def end_meanwhile() -> float:
+        if clock.now_s == 1001.0:
+            clock.now_s += 1
+            sessions.end_agent("ant")
+        return clock()
+
+    sessions = SessionRegistry(SqliteStore(), 60.0, end_meanwhile)
+    session = sessions.open("ant", "token")
+    clock.now_s = 1001.0
+    sessions.known(session.session_id)
+    sessions.require_free("ant", "another robot's")
+
+
 def test_names_that_never_contributed_do_not_fill_a_mission() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     engine = new_engine(store, quotas=Quotas(agents=3), lease_s=0.0)
     engine.contribute(join(engine, "good"), make_subset("good", 1, {0: [1]}), GRID)
     for number in range(10):
@@ -274,7 +290,7 @@ def test_new_names_are_logged_and_names_that_come_and_go_fill_no_log(caplog: pyt
 
 @pytest.mark.parametrize("how", ["leave", "evict", "unban"])
 def test_an_agent_that_is_gone_leaves_no_record(how: str) -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     engine = new_engine(store)
     session = join(engine, "ant")
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
@@ -293,7 +309,7 @@ def test_an_agent_that_is_gone_leaves_no_record(how: str) -> None:
     assert join(engine, "ant", token="another")
 
 
-def all_records(store: MemoryStore) -> dict[str, dict[str, bytes]]:
+def all_records(store: SqliteStore) -> dict[str, dict[str, bytes]]:
     names = ("alignment", "ban", "first-joined", "join-token", "objects", "session")
     return {name: store.records(name) for name in names}
 

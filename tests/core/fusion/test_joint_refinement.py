@@ -17,7 +17,7 @@ from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.keyframe_pool import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframePool
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.refinement import RefineProgress, RefineSettings, refine
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mapping.settings import ONLINE_RATES, DensitySettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings
@@ -145,7 +145,7 @@ def encoded(agent_id: str, index: int, data: bytes = b"", time_ns: int | None = 
 
 
 def test_the_pool_keeps_the_newest_of_each_agent_and_replaces_a_resent_one() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     limits = Quotas(keyframes_per_agent=2, keyframe_pixels=18 * 24, keyframe_bytes_per_agent=9)
     pool = KeyframePool(store, limits)
     for index, data in ((3, b"first"), (1, b"1"), (2, b"2"), (3, b"again")):
@@ -191,7 +191,7 @@ def test_the_newest_keyframe_is_of_the_second_mission_whose_indices_begin_again(
 
 
 def test_a_keyframe_stored_without_its_place_is_the_newest_and_a_damaged_order_is_named() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     KeyframePool(store, Quotas()).add(encoded("ant", 5, b"5"))
     # the server was killed before it stored the order
     store.save_keyframe("ant", 2, b"2")
@@ -202,7 +202,7 @@ def test_a_keyframe_stored_without_its_place_is_the_newest_and_a_damaged_order_i
 
 
 def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> None:
-    store, limits = MemoryStore(), Quotas(keyframe_bytes_per_agent=10)
+    store, limits = SqliteStore(), Quotas(keyframe_bytes_per_agent=10)
     for index in (1, 2, 3):
         KeyframePool(store, limits).add(encoded("ant", index, b"1234"))
     assert KeyframePool(store, limits).indices("ant") == (2, 3)
@@ -211,7 +211,7 @@ def test_the_bytes_of_an_agents_keyframes_are_bounded_also_after_a_restart() -> 
 
 
 def test_keyframes_that_are_not_selected_are_deleted() -> None:
-    pool = KeyframePool(MemoryStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24))
+    pool = KeyframePool(SqliteStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24))
     for index in (1, 2, 3):
         pool.add(encoded("ant", index))
     pool.add(encoded("ant", 9), selected=(2, 5))
@@ -219,7 +219,7 @@ def test_keyframes_that_are_not_selected_are_deleted() -> None:
 
 
 def test_a_damaged_keyframe_is_named() -> None:
-    pool = KeyframePool(MemoryStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24), decode_frame)
+    pool = KeyframePool(SqliteStore(), Quotas(keyframes_per_agent=4, keyframe_pixels=18 * 24), decode_frame)
     pool.add(encoded("ant", 1, b"\xff\xff"))
     with pytest.raises(CodecError, match="expected an EncodedFrame"):
         pool.decode(pool.read(pool.names()))

@@ -18,7 +18,7 @@ from gausslite.domain.voxels import VoxelBatch, select_voxels
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig, VoxelScoreTable
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
@@ -150,7 +150,7 @@ def test_a_refinement_reads_and_shows_tiles_and_messages_in_between_are_shown_an
 
 
 def test_a_damaged_refinement_is_refused() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     store.save_record("", "refined-map", b"\x08\0\0\0\0\0\0\0{}      ")
     with pytest.raises(CodecError, match="stored refinement: expected its arrays"):
         FusionEngine(store, FusionSettings(grid=GRID))

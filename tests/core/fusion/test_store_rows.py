@@ -76,7 +76,7 @@ def rows_of(batch: VoxelBatch, seqs: list[int]) -> list[tuple[int, int, int, byt
 def test_each_voxel_has_its_latest_update_after_any_messages(open_store: OpenStore, seed: int) -> None:
     rng = np.random.default_rng(seed)
     store, latest = open_store(), Latest()
-    is_durable = type(store).__name__ != "MemoryStore"
+    is_durable = type(store).__name__ != "SqliteStore"
     for step in range(40):
         group = [random_update(rng, name) for name in rng.permutation(AGENTS)[: rng.integers(1, 4)].tolist()]
         outcomes = store.put_all([stored for stored, _ in group])

@@ -19,7 +19,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, tombstones
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig, PutOutcome
 from gausslite.fusion.updates import SLICE_VOXELS, PendingUpdate, UpdateQueue
 from gausslite.fusion.vote import fuse
@@ -144,18 +144,18 @@ def test_a_message_costs_what_its_header_declares() -> None:
 
 
 def test_a_late_message_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings())
+    engine = FusionEngine(SqliteStore(), FusionSettings())
     session = engine.join("ant", ANY).session
     for seq in (1, 2):
         engine.enqueue_update(session, encoded("ant", seq, {0: 2}))
-    for update in engine._committer._queue._pending["ant"]:
+    for update in engine._ingest._queue._pending["ant"]:
         update.queued_s -= 60.0
     engine.commit_updates()
     [line] = [record.getMessage() for record in caplog.records if "late" in record.getMessage()]
     assert line.startswith("messages are late: one of agent ant has waited 6")
 
 
-class CountingStore(MemoryStore):
+class CountingStore(SqliteStore):
     """Counts the transactions; refuses those of the agent `refused`."""
 
     def __init__(self, refused: str = "") -> None:
@@ -184,7 +184,7 @@ def test_messages_of_many_agents_share_one_commit_and_a_refused_one_fails_alone(
 
 
 def test_concurrent_agents_and_an_eviction_give_the_map_of_the_stored_updates() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     engine = FusionEngine(store, FusionSettings())
 
     def contribute(agent_id: str) -> None:

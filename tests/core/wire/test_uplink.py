@@ -24,13 +24,13 @@ from gausslite.domain.objects import ObjectReport
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.frames import AlignmentState, FrameAlignment
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
 
 
 def test_the_latest_update_of_each_voxel_arrives() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     enqueued = [{1: [5, 6], 2: [7], 3: [1]}, {2: [], 3: [9, 9, 9]}, {4: [2]}]
     with fusion_server(store) as fusion, uplink(fusion.client.address) as link:
         for voxels in enqueued:
@@ -98,7 +98,7 @@ def test_a_quarantine_is_in_the_agents_log_and_in_the_status(
 
 
 def test_handover_is_counted_separately_and_sends_only_changed_voxels() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     with fusion_server(store) as fusion, uplink(fusion.client.address) as link:
         link.enqueue(make_batch({1: [5], 2: [7]}))
         assert link.drain(WAIT_S)
@@ -119,7 +119,7 @@ def test_the_spool_survives_a_restart_of_the_robot(tmp_path: Path) -> None:
     with uplink(nobody, spool=path) as link:
         link.enqueue(make_batch({1: [5], 2: [7]}))
         assert not link.drain(0.0)
-    store = MemoryStore()
+    store = SqliteStore()
     with fusion_server(store) as fusion, uplink(fusion.client.address, spool=path) as link:
         link.enqueue(make_batch({2: [8]}))
         assert link.drain(WAIT_S)

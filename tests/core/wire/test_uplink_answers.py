@@ -24,7 +24,7 @@ from gausslite.domain.errors import (
     UnavailableError,
 )
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.server import Service
@@ -139,7 +139,7 @@ class FlakyServer(ScriptedServer):
 
     def __init__(self, faults: list[str]) -> None:
         super().__init__(self._store_or_fail)
-        self.store = MemoryStore()
+        self.store = SqliteStore()
         self._faults = iter(faults)
 
     async def ContributeSubsets(self, request_iterator: Any, context: Any) -> Any:
@@ -149,7 +149,7 @@ class FlakyServer(ScriptedServer):
                 raise UnavailableError("cut")
             subset, _ = decode_subset(request.subset)
             if fault == "memory lost":
-                self.store = MemoryStore()
+                self.store = SqliteStore()
                 raise SessionUnknownError("restarted")
             put = self.store.put(subset)
             if fault == "ack lost":

@@ -8,7 +8,7 @@ from pathlib import Path
 from fusion_running import GRID, fusion_server, make_batch
 from waiting import wait_until
 
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_maintenance import back_up, restore
 from gausslite.wire.clients import FusionClient
@@ -36,7 +36,7 @@ def send_then_replace(first: FusionStore, second: FusionStore, tmp_path: Path) -
 
 
 def test_after_a_restart_with_an_empty_store(tmp_path: Path) -> None:
-    send_then_replace(MemoryStore(), MemoryStore(), tmp_path)
+    send_then_replace(SqliteStore(), SqliteStore(), tmp_path)
 
 
 def test_after_a_restart_with_a_store_that_has_lost_its_newest_updates(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_after_a_restore_of_an_equal_store_nothing_is_sent_again(tmp_path: Path)
 
 
 def test_an_evicted_agent_sends_everything_again(tmp_path: Path) -> None:
-    store, address = MemoryStore(), f"unix:{tmp_path}/fusion.sock"
+    store, address = SqliteStore(), f"unix:{tmp_path}/fusion.sock"
     with fusion_server(store, address=address) as t:
         uplink = Uplink(FusionClient(address, deadline_s=5.0), "ant", Spool(None, "ant", GRID), GRID, QUICK)
         send_a_map(uplink, range(40))
@@ -124,7 +124,7 @@ def voxels_of(store: FusionStore) -> dict[int, tuple[int, int]]:
 
 
 def test_a_robot_that_reboots_without_its_spool_keeps_its_map(tmp_path: Path) -> None:
-    store, address = MemoryStore(), f"unix:{tmp_path}/fusion.sock"
+    store, address = SqliteStore(), f"unix:{tmp_path}/fusion.sock"
     with fusion_server(store, address=address) as t:
         for cells, gaussians in ((range(40), 80), (range(3, 6), 80)):
             spool = Spool(None, "ant", GRID)

@@ -18,7 +18,7 @@ from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
@@ -105,7 +105,7 @@ class SlowDisk(Spool):
 
 
 def test_publishing_is_part_of_a_frames_time() -> None:
-    with fusion_server(MemoryStore()) as fusion:
+    with fusion_server(SqliteStore()) as fusion:
         spool = SlowDisk(None, "robot", GRID)
         uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID)
         worker = MappingWorker(SETTINGS, GRID, ball_estimator, uplink, clock=lambda: spool.now_s)
@@ -211,7 +211,7 @@ def test_an_invalid_frame_is_rejected_and_the_stream_continues() -> None:
 
 
 def test_after_a_full_spool_all_changes_are_published_again(tmp_path: Path) -> None:
-    store, spool = MemoryStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
+    store, spool = SqliteStore(), Spool(tmp_path / "robot.spool", "robot", GRID)
     with fusion_server(store) as fusion:
         uplink = Uplink(FusionClient(fusion.client.address), "robot", spool, GRID, UplinkSettings(interval_s=0.0))
         with agent(uplink=uplink) as a:

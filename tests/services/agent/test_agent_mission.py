@@ -27,7 +27,7 @@ from gausslite.domain.errors import DatasetError, InvalidInputError, StorageErro
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory
 from gausslite.domain.relevance import BallRegion, Region
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mission.results import locked_folder
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.schedule import read_timeline
@@ -120,7 +120,7 @@ def stream_of(wall: Wall, options: AgentSettings) -> FrameStream:
 
 
 def test_a_mission_leaves_a_map_a_report_and_its_region_on_the_server(tmp_path: Path) -> None:
-    store, options = MemoryStore(), settings(tmp_path)
+    store, options = SqliteStore(), settings(tmp_path)
     with fusion_server(store) as fusion, agent_mission(options, fusion.client.address) as (mission, worker):
         mission.run(stream_of(Wall(), options))
         assert mission.state == MissionState.ENDED

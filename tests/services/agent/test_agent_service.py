@@ -30,7 +30,7 @@ from gausslite.domain.pose import Twist
 from gausslite.domain.relevance import BallRegion, PointedObject
 from gausslite.domain.task import TargetRole, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.perception.detector import RegionDetector
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimator, TaskRelevanceEstimator
 from gausslite.v1 import agent_service_pb2 as pb
@@ -427,7 +427,7 @@ def test_an_upside_down_region_is_refused() -> None:
 
 
 def test_only_the_tasks_region_leaves_the_robot() -> None:
-    store = MemoryStore()
+    store = SqliteStore()
     with fusion_server(store) as fusion:
         client = FusionClient(fusion.client.address)
         uplink = Uplink(client, "robot", Spool(None, "robot", GRID), GRID, UplinkSettings(interval_s=0.0))

@@ -27,7 +27,7 @@ from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.relevance import BallRegion, Region
 from gausslite.domain.state import State
 from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, group_by_voxel
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate
 from gausslite.wire.clients import AgentClient, FusionClient
 from gausslite.wire.spool import Purpose, Spool
@@ -140,12 +140,12 @@ def totals(batch: VoxelBatch) -> dict[int, tuple[int, int]]:
     return {key: (kappa, count) for key, kappa, count in zip(*columns, strict=True) if count}
 
 
-def totals_on(store: MemoryStore) -> dict[int, tuple[int, int]]:
+def totals_on(store: SqliteStore) -> dict[int, tuple[int, int]]:
     return totals(store.batches()["robot"])
 
 
 def test_a_restarted_mission_gives_the_same_map_and_updates(tmp_path: Path) -> None:
-    whole, first, second = MemoryStore(), MemoryStore(), settings(tmp_path / "x.state")
+    whole, first, second = SqliteStore(), SqliteStore(), settings(tmp_path / "x.state")
     with fusion_server(whole) as fusion, agent_run(settings(tmp_path / "whole.state"), fusion) as (mission, worker):
         map_frames(worker, *range(8))
         mission.finish()
@@ -170,7 +170,7 @@ def restored_map(options: AgentSettings) -> Gaussians:
 @pytest.mark.parametrize("keeps_spool", [True, False])
 def test_the_fused_map_follows_the_agent_through_clean_and_unsaved_ends(keeps_spool: bool, tmp_path: Path) -> None:
     """The third run is not saved. With a spool file, the server has only the agent's voxels; without, also others."""
-    store, options = MemoryStore(), settings(tmp_path / "robot.state")
+    store, options = SqliteStore(), settings(tmp_path / "robot.state")
     spool = tmp_path / "robot.spool" if keeps_spool else None
     with fusion_server(store) as fusion:
         with agent_run(options, fusion, spool) as (mission, worker):
@@ -200,7 +200,7 @@ def test_the_fused_map_follows_the_agent_through_clean_and_unsaved_ends(keeps_sp
 
 def test_voxels_sent_after_the_last_save_are_removed_by_the_restored_agent(tmp_path: Path) -> None:
     """The killed process had sent voxels and a whole map beyond the saved one."""
-    store, options, spool = MemoryStore(), settings(tmp_path / "robot.state"), tmp_path / "robot.spool"
+    store, options, spool = SqliteStore(), settings(tmp_path / "robot.state"), tmp_path / "robot.spool"
     with fusion_server(store) as fusion:
         with agent_run(options, fusion, spool) as (mission, worker):
             map_frames(worker, 0, 1)
@@ -228,7 +228,7 @@ def shifted(gaussians: Gaussians, distance_m: float) -> Gaussians:
 
 
 def test_a_server_that_lost_its_data_receives_it_again(tmp_path: Path) -> None:
-    options, store = settings(tmp_path / "robot.state"), MemoryStore()
+    options, store = settings(tmp_path / "robot.state"), SqliteStore()
     with fusion_server() as fusion, agent_run(options, fusion, tmp_path / "robot.spool") as (mission, worker):
         map_frames(worker, 0, 1)
         mission.finish()
@@ -300,7 +300,7 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
 
 def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
-    address, store = f"unix:{tmp_path}/agent.sock", MemoryStore()
+    address, store = f"unix:{tmp_path}/agent.sock", SqliteStore()
     command = [
         sys.executable,
         "-m",

@@ -20,7 +20,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.fusion import traffic
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.traffic import Acknowledgements, StorageProbe
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -120,7 +120,7 @@ def test_a_check_leaves_nothing_in_the_store(tmp_path: Path) -> None:
     store.close()
 
 
-class StandingStore(MemoryStore):
+class StandingStore(SqliteStore):
     """A store whose disk takes no write until it is `running`."""
 
     def __init__(self) -> None:

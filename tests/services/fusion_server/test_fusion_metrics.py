@@ -13,7 +13,7 @@ from fusion_running import GRID, make_subset
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.traffic import TrafficCounters
 
@@ -29,7 +29,7 @@ ANYTHING = MissionConfig("", "", GRID.size_m)
 
 @pytest.fixture
 def engine() -> FusionEngine:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     for agent_id, kappa in (("ant", 1), ("bee", 2)):
         session = engine.join(agent_id, ANYTHING).session.session_id
         engine.contribute(session, make_subset(agent_id, 1, {0: [kappa], 1: [3 - kappa], 2: [kappa]}), GRID)

@@ -85,14 +85,45 @@ def test_frames_are_compared_in_a_process_that_ends_with_the_server(tmp_path: Pa
 
 
 def test_a_database_without_the_extra_is_one_line_with_the_command_that_installs_it() -> None:
-    program = (
-        "import sys; sys.modules['psycopg'] = None; from gausslite_fusion_server.program import run; sys.exit(run())"
-    )
-    command = [sys.executable, "-c", program, "--store", "postgresql://ant@db/team"]
+    command = [*without("psycopg"), "--store", "postgresql://ant@db/team"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     [line] = done.stderr.splitlines()
     assert line.endswith("pip install 'gausslite[postgres]'")
+
+
+def without(*packages: str) -> list[str]:
+    """The command of a server where these packages are not installed."""
+    absent = "".join(f"sys.modules[{name!r}] = None; " for name in packages)
+    return [
+        sys.executable,
+        "-c",
+        f"import sys; {absent}from gausslite_fusion_server.program import run; sys.exit(run())",
+    ]
+
+
+def test_without_its_plug_ins_a_server_stores_and_votes_and_says_once_that_it_compares_no_frames(
+    tmp_path: Path,
+) -> None:
+    log, command = tmp_path / "log", without("gausslite_places", "gausslite_cluster")
+    with server_process("--store", str(tmp_path / "s.sqlite"), log=log, command=command) as (process, client):
+        for name, kappa in (("ant", 1), ("bee", 9)):
+            session = client.join(name, GRID).session_id
+            subset = make_subset(name, 1, {0: [kappa], 3 + kappa: [2]})
+            list(client.contribute([request(session, subset)], 20.0))
+        assert [agent.won_voxels for agent in client.status().agents] == [1, 2]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+    [line] = [line for line in log.read_text().splitlines() if "plug-in" in line]
+    assert "agents' frames are used as declared: no plug-in of gausslite.aligners is installed" in line
+
+
+def test_the_url_of_a_database_whose_package_is_absent_names_the_package() -> None:
+    command = [*without("gausslite_cluster"), "--store", "postgresql://ant@db/team"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    [line] = done.stderr.splitlines()
+    assert "postgresql: needs the package gausslite_cluster" in line
 
 
 class Hasty(FusionClient):

@@ -20,7 +20,7 @@ from gausslite.domain.errors import (
 )
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.fusion.limits import FusionSettings, Quotas
-from gausslite.fusion.sqlite_store import MemoryStore, SqliteStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export, FusionClient
 
@@ -186,7 +186,7 @@ def test_a_full_store_ends_the_stream_and_the_server_keeps_serving(tmp_path: Pat
 
 
 def test_a_restarted_server_keeps_its_sessions_only_with_a_file(tmp_path: Path) -> None:
-    first_life, second_life = MemoryStore(), MemoryStore()
+    first_life, second_life = SqliteStore(), SqliteStore()
     with fusion_server(first_life) as t:
         session = t.client.join("ant", GRID).session_id
         t.contribute_subsets(session, make_subset("ant", 1, {0: [1]}))

@@ -17,16 +17,18 @@ from gausslite.domain.errors import InvalidInputError, PoseError, QuotaError, Un
 from gausslite.domain.pose import transform_of
 from gausslite.domain.voxels import RoiSubset, empty_batch, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.frames import AlignmentSettings
+from gausslite.fusion.frames import FrameFit
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import MapRenderer
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
 from gausslite_fusion_server import servicer
+from gausslite_places.frame_aligner import MapAligner
+from gausslite_places.frame_fit import SurfaceSamples, fit_frame
 
 CELLS = {0: [5, 6], 1: [7], 2: [1, 1]}
 
@@ -126,7 +128,7 @@ def test_a_declared_frame_moves_the_agents_map() -> None:
 
 
 def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the_map_as_it_is() -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID))
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     ant = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
     engine.contribute(ant, make_subset("ant", 1, {0: [5, 6], 20: [7], 40: [1, 1]}), GRID)
     renderer = MapRenderer(engine, ReferenceRasterizer)
@@ -153,21 +155,19 @@ def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the
 def test_frames_that_could_not_be_compared_are_compared_later_without_another_message(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    failures, align_due = [UnavailableError("killed")], FusionEngine.align_due
+    failures = [UnavailableError("killed")]
 
-    def fail_once(engine: FusionEngine, at_most: int | None = None) -> bool:
-        if engine.is_alignment_due and failures:
+    def fail_once(source: SurfaceSamples, target: SurfaceSamples) -> FrameFit | None:
+        if failures:
             raise failures.pop()
-        return align_due(engine, at_most)
+        return fit_frame(source, target)
 
-    monkeypatch.setattr(FusionEngine, "align_due", fail_once)
     monkeypatch.setattr(servicer, "_ALIGN_RETRY_S", 0.0)
-    with fusion_server(settings=FusionSettings(grid=GRID, alignment=AlignmentSettings())) as server:
+    with fusion_server(aligner=MapAligner(GRID, fail_once)) as server:
         for seed, name in enumerate(("ant", "bee")):
             session = server.client.join(name, GRID).session_id
             subset = RoiSubset(name, "", 1, 1, group_by_voxel(textured_corner(seed), GRID))
             server.contribute_subsets(session, subset)
         wait_until(lambda: server.client.status().agents[1].alignment.state == pb.ALIGNMENT_STATE_ALIGNED)
-    assert [record.message for record in caplog.records if record.levelname == "ERROR"] == [
-        "frames are not compared, again in 0 s: killed"
-    ]
+    [line] = [record.message for record in caplog.records if record.levelname == "ERROR"]
+    assert line in [f"frames are not compared, again in 0 s: agent {name!r}: killed" for name in ("ant", "bee")]

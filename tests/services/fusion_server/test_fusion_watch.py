@@ -15,7 +15,7 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
-from gausslite.fusion.sqlite_store import MemoryStore
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
 from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -33,7 +33,7 @@ def watching(settings: FusionSettings, body: Callable[[AsyncIterator[MapBlock], 
     """Run `body` with the blocks of a watcher and a way to contribute while it sleeps."""
 
     async def run() -> None:
-        engine = FusionEngine(MemoryStore(), settings, first_revision=1)
+        engine = FusionEngine(SqliteStore(), settings, first_revision=1)
         servicer = FusionServicer(engine, RefinementWorker(RefineSettings(), ReferenceRasterizer))
         session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
         responses = servicer.WatchFusedMap(pb.WatchFusedMapRequest(), None)
@@ -85,7 +85,7 @@ def test_a_watcher_that_missed_too_much_gets_a_snapshot() -> None:
 
 
 def test_a_change_is_read_once_for_all_watchers(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID), first_revision=1)
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID), first_revision=1)
     session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
     cache, part = EncodedPartCache(), WatchedPart(MapLayer.VOTE)
     readers = [FusedMapReader(engine, part, cache) for _ in range(20)]
@@ -98,7 +98,7 @@ def test_a_change_is_read_once_for_all_watchers(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_watchers_that_follow_closely_share_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = FusionEngine(MemoryStore(), FusionSettings(grid=GRID), first_revision=1)
+    engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID), first_revision=1)
     session = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
     cache, part = EncodedPartCache(), WatchedPart(MapLayer.VOTE)
     early, late = (FusedMapReader(engine, part, cache) for _ in range(2))

@@ -1,0 +1,66 @@
+"""Open the store of a server: memory, a SQLite file, or a database whose plug-in has the name of its URL's scheme."""
+
+from __future__ import annotations
+
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Protocol
+
+from gausslite.fusion.engine import FusionEngine
+from gausslite.fusion.sqlite_store import SqliteStore
+from gausslite.fusion.store import FusionStore
+from gausslite.fusion.traffic import Acknowledgements
+from gausslite.plugins import Group, load
+from gausslite.wire.server import Service
+from gausslite_fusion_server.metrics import MessageCounts
+from gausslite_fusion_server.settings import ServerSettings
+
+
+class Share(Protocol):
+    """One of the servers of a mission: what it serves, and what it has to run meanwhile."""
+
+    @property
+    def services(self) -> list[Service]:
+        """The services for agents, watchers and other servers."""
+
+    @property
+    def acknowledgements(self) -> Acknowledgements:
+        """Of the messages that agents have sent to this server."""
+
+    async def run(self) -> None:
+        """Take part until it is cancelled; then end the open streams, and leave the rest to the other servers."""
+
+    def engine(self) -> FusionEngine:
+        """Return the engine of the part that this server owns. Raises UnavailableError while it is opened."""
+        ...
+
+    def counts(self) -> MessageCounts:
+        """Return how much of the mission's work this server has done."""
+        ...
+
+
+class Database(Protocol):
+    """A plug-in of the group gausslite.stores. Raises InvalidInputError, StorageError."""
+
+    def open_store(self, url: str) -> FusionStore:
+        """Return the store of a database for one server."""
+        ...
+
+    def open_share(self, settings: ServerSettings, url: str, peer_address: str) -> AbstractAsyncContextManager[Share]:
+        """Take part in the mission of a database, together with other servers, while the context is open."""
+        ...
+
+
+def open_store(settings: ServerSettings) -> FusionStore:
+    """Return the store. Raises InvalidInputError, StorageError."""
+    if settings.store is None:
+        return SqliteStore()
+    if isinstance(settings.store, Path):
+        return SqliteStore(settings.store, settings.store_max_bytes)
+    return database_of(settings.store).open_store(settings.store)
+
+
+def database_of(url: str) -> Database:
+    """Return the plug-in for a URL. Raises MissingPluginError, which names what is not installed."""
+    database: Database = load(Group.STORES, url.partition("://")[0])
+    return database
