@@ -29,7 +29,7 @@ class DetectorOptions:
 class DetectorReader(Protocol):
     """Opens files of one kind; a package registers it in the group `gausslite.detectors`."""
 
-    def open(self, path: Path, options: DetectorOptions) -> Detector | None:
+    def open(self, path: Path, options: DetectorOptions, /) -> Detector | None:
         """Return the detector of a file; None if the file is not of this kind.
 
         Raises ModelFileError if it is of this kind and damaged, InvalidInputError if the options do not fit it.
