@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gausslite.domain.errors import ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import Detection
@@ -51,8 +52,11 @@ class ColourReader:
         """Return the detector of a `.colours` file; None for another file."""
         if path.suffix != ".colours":
             return None
-        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        return ColourDetector({" ".join(name): (int(r), int(g), int(b)) for *name, r, g, b in rows})
+        try:
+            rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+            return ColourDetector({" ".join(name): (int(r), int(g), int(b)) for *name, r, g, b in rows})
+        except (OSError, ValueError) as error:
+            raise ModelFileError(f"{path}: expected lines such as 'mug 190 25 30', but {error}") from error
 
     def advice(self) -> str:
         """Return how to get a file."""
