@@ -21,7 +21,8 @@ pytest.importorskip("gausslite.render._kernels", reason="the native kernels are 
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the installed examples."""
     folder = tmp_path_factory.mktemp("plugins") / "site"
-    install("colour_detector", folder)
+    for example in ("colour_detector", "array_recording"):
+        install(example, folder)
     return folder
 
 
@@ -52,6 +53,27 @@ def test_a_detector_of_another_package_finds_the_target(installed: Path, tmp_pat
     report = json.loads((out / "report.json").read_text())
     assert [(found["noun"], found["confirmed_objects"]) for found in report["nouns"]] == [("cup", 1)]
     assert report["active_gaussians"] > 0
+
+
+def test_a_recording_of_another_packages_format_is_mapped(installed: Path, tmp_path: Path) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3), dtype=np.uint8)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = np.arange(3) / 20
+    arrays = {
+        "rgb": rgb,
+        "depth_m": np.full((3, 24, 32), 2.0, np.float32),
+        "T_world_camera": poses,
+        "times_ns": np.arange(3) * 10**8,
+    }
+    np.savez(tmp_path / "run.npz", camera=(30.0, 30.0, 16.0, 12.0), **arrays)
+    for name, address in (("by_suffix", tmp_path / "run.npz"), ("by_name", f"npz:{tmp_path / 'run.npz'}")):
+        done = gausslite(installed, "map", address, *FEW_GAUSSIANS, "--out", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        assert json.loads((tmp_path / name / "report.json").read_text())["frames"] == 3
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    done = gausslite(installed, "map", tmp_path / "broken.npz", "--out", tmp_path / "broken")
+    assert done.returncode == 2
+    assert "broken.npz: expected the arrays rgb, depth_m" in done.stderr.splitlines()[-1]
 
 
 def test_a_file_that_no_reader_knows_is_refused_by_the_default_reader(installed: Path, tmp_path: Path) -> None:
