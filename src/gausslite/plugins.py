@@ -87,5 +87,4 @@ def _import(entry: EntryPoint) -> Any:
         package = entry.module.partition(".")[0]
         missing = (error.name or package).partition(".")[0]
         needs = f"the package {package}" if missing == package else f"the package {missing}, for {package}"
-        name = entry.group if entry.name == DEFAULT else entry.name
-        raise MissingPluginError(f"{name}: needs {needs}, which is not installed") from error
+        raise MissingPluginError(f"{entry.name}: needs {needs}, which is not installed") from error

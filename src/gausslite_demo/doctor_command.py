@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -28,9 +28,8 @@ from gausslite.process import printable
 from gausslite.render.choose import DRIVER_DEVICES, choose_with_reason
 from gausslite.render.cpu import SIMD_VARIABLE, choose_simd, choose_threads, cores_allowed, usable_simd
 from gausslite.wire.channel import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
-
-if TYPE_CHECKING:
-    from gausslite_detectors.models import ModelEntry
+from gausslite_detectors.model_file import require_listed_checksum
+from gausslite_detectors.models import CATALOGUE, ModelEntry, detector_advice, inspect
 
 Status = Literal["ok", "warning", "error"]
 
@@ -229,23 +228,15 @@ def _level(amount: float, low: float, too_low: float) -> Status:
 
 def model_checks(folder: Path) -> Iterator[Check]:
     """Yield a check for each model file in the folder, ONNX files read completely and opened, or one for none."""
-    try:
-        from gausslite_detectors.models import CATALOGUE, READER
-    except ModuleNotFoundError as error:
-        yield Check("models", "warning", f"the package {error.name} is not installed", "--detector needs it")
-        return
     present = [entry for entry in CATALOGUE if (folder / entry.file_name).exists()]
     for entry in present:
         yield _model(entry, folder / entry.file_name)
     if not present:
-        advice = f"For --detector, {READER.advice()}; `gausslite models list` lists others"
+        advice = f"For --detector, {detector_advice()}; `gausslite models list` lists others"
         yield Check("models", "ok", f"no model files in {folder}", advice)
 
 
 def _model(entry: ModelEntry, path: Path) -> Check:
-    from gausslite_detectors.model_file import require_listed_checksum
-    from gausslite_detectors.models import inspect
-
     name = f"model {entry.name}"
     try:
         if path.suffix == ".onnx":

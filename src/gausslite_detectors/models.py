@@ -110,6 +110,13 @@ def entry_named(name: str) -> ModelEntry:
     raise InvalidInputError(f"model {name!r}: expected one of {', '.join(entry.name for entry in CATALOGUE)}")
 
 
+def detector_advice() -> str:
+    """Return how to make the simplest file for --detector, in one line."""
+    entry = entry_named("yolo-seg")
+    commands = entry.export.replace("\n", " && ")
+    return f"make {entry.file_name} ({entry.licence}) with: {commands}"
+
+
 VOCABULARY: Final = "vocab.txt"
 OWN_MASKS, DEPTH = "yolo", "depth"
 
@@ -177,9 +184,7 @@ class OnnxReader:
 
     def advice(self) -> str:
         """Return how to make the simplest file, in one line."""
-        entry = entry_named("yolo-seg")
-        commands = entry.export.replace("\n", " && ")
-        return f"make {entry.file_name} ({entry.licence}) with: {commands}"
+        return detector_advice()
 
 
 READER: Final = OnnxReader()

@@ -6,16 +6,14 @@ The user provides the network as an ONNX file: two images (n, 3, h, w) in [-1, 1
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped
 from numpy import ndarray
 
-from gausslite.domain.errors import MissingPluginError, ModelFileError, ShapeError
-
-if TYPE_CHECKING:
-    from gausslite_detectors.model_file import OpenModel
+from gausslite.domain.errors import ModelFileError, ShapeError
+from gausslite_detectors.model_file import OpenModel, open_model, run_once
 
 NAME: Final = "LPIPS (SqueezeNet)"
 LPIPS_HELP: Final = f"ONNX file of {NAME}, which is scored too (default: not computed)"
@@ -45,8 +43,6 @@ class Lpips:
             raise ShapeError(
                 f"{NAME}: expected two images (h, w, 3) of one shape, {sides}, got {a.shape} and {b.shape}"
             )
-        from gausslite_detectors.model_file import run_once
-
         first, second = _as_input(a), _as_input(b)
         if mask is not None:
             rows, columns = _interval(np.any(mask, axis=1)), _interval(np.any(mask, axis=0))
@@ -57,11 +53,7 @@ class Lpips:
 
 
 def load_lpips(path: Path, threads: int | None = None) -> Lpips:
-    """Return LPIPS of a file, checked on two known images. Raises ModelFileError, MissingPluginError."""
-    try:
-        from gausslite_detectors.model_file import open_model
-    except ModuleNotFoundError as error:
-        raise MissingPluginError(f"{NAME}: needs the package {error.name}, which is not installed") from error
+    """Return LPIPS of a file, checked on two known images. Raises ModelFileError, which names the file."""
     model = open_model(path, threads)
     if (count := len(model.session.get_inputs())) != 2:
         raise ModelFileError(f"model {path}: expected {NAME} with two images as inputs, got {count}")
