@@ -22,7 +22,7 @@ from gausslite.datasets.open import default_world_frame
 from gausslite.domain.checks import require_name
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
-from gausslite.mission.build import open_models
+from gausslite.mission.build import chosen_detector
 from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
 from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
@@ -209,7 +209,7 @@ def _require_valid(options: argparse.Namespace) -> None:
     """Raise InvalidInputError or ModelFileError for options that every agent would refuse later."""
     if options.view is not None:
         import_extra("viser", "view", "--view")
-    open_models(build(PerceptionSettings, options).at_rate(mission_settings(options)))
+    chosen_detector(build(PerceptionSettings, options).at_rate(mission_settings(options)))
 
 
 def _shared_agent_options(options: argparse.Namespace, scenario: Scenario) -> dict[str, Plain]:

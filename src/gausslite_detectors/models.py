@@ -8,9 +8,14 @@ from pathlib import Path
 from typing import Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
-from gausslite.perception.detector import BoxDetector, Detector, SegmentedDetector, Segmenter, TiledDetector, Tiling
+from gausslite.perception.depth_segmenter import DepthSegmenter
+from gausslite.perception.detector import BoxDetector, Detector, SegmentedDetector, Segmenter
+from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.model_file import OpenModel, open_model, sha256_of
-from gausslite_detectors.yolo_network import MASK_COEFFICIENTS
+from gausslite_detectors.open_vocabulary import GroundingDino, PromptedYolo, is_grounding, is_prompted
+from gausslite_detectors.text_features import TOKEN_ID_TYPES, BertTokenizer, open_phrase_vectors
+from gausslite_detectors.yolo import ClassAgnosticSegmenter, load_yolo
+from gausslite_detectors.yolo_network import MASK_COEFFICIENTS, YoloNetwork, class_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +133,6 @@ class ModelFamily(StrEnum):
 
 def identify_family(model: OpenModel) -> ModelFamily:
     """Return the family of an open model. Raises ModelFileError if it is not supported."""
-    from gausslite_detectors.open_vocabulary import is_grounding, is_prompted
-    from gausslite_detectors.text_features import TOKEN_ID_TYPES
-
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
     if is_grounding([port.name for port in inputs], [output.name for output in outputs]):
         return ModelFamily.GROUNDING_DINO
@@ -152,99 +154,58 @@ def identify_family(model: OpenModel) -> ModelFamily:
 
 def _has_named_boxes(model: OpenModel) -> bool:
     """Return True if the only output is [1, 4+c, A] for the c class names in the metadata."""
-    from gausslite_detectors.yolo_network import class_names
-
     (rows, *more), names = [output.shape for output in model.session.get_outputs()], class_names(model.session)
     return not more and bool(names) and len(rows) == 3 and rows[1] in (4 + len(names), None)
 
 
-class ModelRegistry:
-    """The detector of one mission, with its segmenter; each file is opened once."""
+class OnnxReader:
+    """The DetectorReader of ONNX files; each file is opened once."""
 
-    def __init__(
-        self, detector: Path, segmenter: str | None, vocabulary: Path | None, threads: int | None,
-        accept_similar: bool = False, tiling: Tiling | None = None,
-    ) -> None:  # fmt: skip
-        """Open the detector's file and build the segmenter.
+    def open(self, path: Path, options: DetectorOptions) -> Detector:
+        """Return the file's detector with its segmenter. Raises ModelFileError, InvalidInputError, KernelError.
 
-        segmenter: "yolo" (the detector's own masks), "depth" (by depth and colour), or the path of a FastSAM file. None
-        selects the detector's own masks if it has them, else "depth". vocabulary: the text encoder's, by default next
-        to the detector. accept_similar: also detect classes that are only similar to a noun. tiling: tiles in which the
-        detector also runs; by default none. Raises ModelFileError, InvalidInputError, KernelError.
+        segmenter: "yolo", "depth", or the path of a FastSAM file. None selects the detector's own masks if it has them,
+        else "depth". vocabulary: the text encoder's, by default next to the detector.
         """
-        model = open_model(detector, threads)
+        model = open_model(path, options.threads)
         family = identify_family(model)
         if family is ModelFamily.TEXT_ENCODER:
-            raise ModelFileError(f"model {detector}: expected a detector, got a {family}, which belongs beside one")
-        self._tiling = tiling or Tiling(1)
-        if family is ModelFamily.YOLO_SEG:
-            self._use_yolo_masks(model, segmenter, threads, accept_similar)
-            return
-        if segmenter == OWN_MASKS:
+            raise ModelFileError(f"model {path}: expected a detector, got a {family}, which belongs beside one")
+        if family is ModelFamily.YOLO_SEG and options.segmenter in (None, OWN_MASKS):
+            return load_yolo(model, options.accept_similar)
+        if options.segmenter == OWN_MASKS:
             raise InvalidInputError(
                 f"segmenter: {model.path} finds boxes only; expected depth or a FastSAM file, got {OWN_MASKS}"
             )
-        segmenters = _with_depth_fallback(_segmenter(segmenter or DEPTH, threads))
-        if family is ModelFamily.YOLO_BOXES:
-            from gausslite_detectors.yolo import load_yolo
+        segmenters = _segmenters(options.segmenter or DEPTH, options.threads)
+        if family in (ModelFamily.YOLO_SEG, ModelFamily.YOLO_BOXES):
+            return SegmentedDetector(load_yolo(model, options.accept_similar), segmenters)
+        return SegmentedDetector(_open_vocabulary(model, family, options), segmenters)
 
-            boxes: BoxDetector = load_yolo(model, accept_similar)
-        else:
-            boxes = _open_vocabulary(model, family, vocabulary, threads)
-        self._detector: Detector = SegmentedDetector(boxes, segmenters)
-
-    @property
-    def detector(self) -> Detector:
-        """The detector of the task's nouns, with masks."""
-        return self._detector if self._tiling.per_side == 1 else TiledDetector(self._detector, self._tiling)
-
-    def _use_yolo_masks(
-        self, model: OpenModel, segmenter: str | None, threads: int | None, accept_similar: bool
-    ) -> None:
-        from gausslite_detectors.yolo import load_yolo
-
-        network = load_yolo(model, accept_similar)
-        if segmenter in (None, OWN_MASKS):
-            self._detector = network
-        else:
-            self._detector = SegmentedDetector(network, _with_depth_fallback(_segmenter(str(segmenter), threads)))
+    def advice(self) -> str:
+        """Return how to make the simplest file, in one line."""
+        return detector_advice()
 
 
-def _open_vocabulary(
-    model: OpenModel, family: ModelFamily, vocabulary: Path | None, threads: int | None
-) -> BoxDetector:
+READER: Final = OnnxReader()
+
+
+def _open_vocabulary(model: OpenModel, family: ModelFamily, options: DetectorOptions) -> BoxDetector:
     """Return a detector of any phrase with its text encoder."""
+    folder = model.path.parent
     if family is ModelFamily.GROUNDING_DINO:
-        from gausslite_detectors.open_vocabulary import GroundingDino
-        from gausslite_detectors.text_features import BertTokenizer
-
-        return GroundingDino(model, BertTokenizer(vocabulary or model.path.parent / VOCABULARY))
-    from gausslite_detectors.open_vocabulary import PromptedYolo
-    from gausslite_detectors.text_features import open_phrase_vectors
-
-    return PromptedYolo(model, open_phrase_vectors(model.path.parent, vocabulary, threads))
+        return GroundingDino(model, BertTokenizer(options.vocabulary or folder / VOCABULARY))
+    return PromptedYolo(model, open_phrase_vectors(folder, options.vocabulary, options.threads))
 
 
-def _segmenter(name: str, threads: int | None) -> Segmenter:
-    """Return the depth segmenter, or a class-agnostic segmenter from a file."""
-    from gausslite.perception.depth_segmenter import DepthSegmenter
-
+def _segmenters(name: str, threads: int | None) -> tuple[Segmenter, ...]:
+    """Return the depth segmenter, after that of a file for boxes in which its network finds nothing."""
     if name == DEPTH:
-        return DepthSegmenter()
-    from gausslite_detectors.yolo import ClassAgnosticSegmenter
-    from gausslite_detectors.yolo_network import YoloNetwork
-
+        return (DepthSegmenter(),)
     network = YoloNetwork(open_model(Path(name), threads))
     if not network.has_masks:
         raise InvalidInputError(f"segmenter: expected depth or a FastSAM file, got {name}, which finds boxes only")
-    return ClassAgnosticSegmenter(network)
-
-
-def _with_depth_fallback(first: Segmenter) -> tuple[Segmenter, ...]:
-    """Return the segmenter, followed by the depth segmenter for boxes in which the network finds nothing."""
-    from gausslite.perception.depth_segmenter import DepthSegmenter
-
-    return (first,) if isinstance(first, DepthSegmenter) else (first, DepthSegmenter())
+    return ClassAgnosticSegmenter(network), DepthSegmenter()
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,4 +44,4 @@ def test_every_file_has_a_source_whose_commands_can_be_pasted(capsys, name):
         compile(command.split('"')[0], name, "exec")
     for command in found.export.splitlines():
         if command.startswith("tools/"):
-            assert (Path(__file__).resolve().parents[3] / command.split()[0]).is_file()
+            assert (Path(__file__).resolve().parents[2] / command.split()[0]).is_file()

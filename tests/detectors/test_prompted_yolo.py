@@ -13,9 +13,11 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError, ModelFileError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis
+from gausslite.perception.detector import Detector
+from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.class_match import NOUN_NAMES_FILE, NOUN_VECTORS_FILE
 from gausslite_detectors.model_file import open_model
-from gausslite_detectors.models import ModelFamily, ModelRegistry, identify_family
+from gausslite_detectors.models import READER, ModelFamily, identify_family
 from gausslite_detectors.open_vocabulary import PromptedYolo
 from gausslite_detectors.text_features import ClipTextEncoder, NounVectorTable
 
@@ -31,6 +33,10 @@ def frame() -> Frame:
     rgb[..., 0] = 255
     depth_m[20:44, 36:60] = 1.0
     return Frame(0, 0, rgb, depth_m, Camera(100, 100, 64, 32, 128, 64), np.eye(4))
+
+
+def opened(path: Path, segmenter: str | None = None) -> Detector:
+    return READER.open(path, DetectorOptions(segmenter, threads=1))
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
@@ -108,12 +114,12 @@ def test_a_table_of_text_vectors_replaces_the_encoder(tmp_path):
     (tmp_path / NOUN_NAMES_FILE).write_text(json.dumps(names), encoding="utf-8")
     np.save(tmp_path / NOUN_VECTORS_FILE, np.stack([3 * mug_vector(), anchors()[2]]).astype(np.float16))
     path = write_prompted(tmp_path / "world.onnx", BOXES, anchors())
-    networks = ModelRegistry(path, None, None, 1)
-    found = networks.detector.detect(frame(), ["beer tankard", "umbrella"])
+    detector = opened(path)
+    found = detector.detect(frame(), ["beer tankard", "umbrella"])
     assert {each.phrase for each in found} == {"beer tankard"}
     assert found[0].score == pytest.approx(expected_score(mug_vector(), anchors()[0]), abs=1e-3)
     assert found[0].mask.sum() == 24 * 24
-    tankard, umbrella = networks.detector.matches(["beer tankard", "umbrella"])
+    tankard, umbrella = detector.matches(["beer tankard", "umbrella"])
     assert (tankard.classes, tankard.is_searched) == (("tankard",), True)
     assert umbrella.warning == "no class of the detector matches 'umbrella'"
 
@@ -122,24 +128,24 @@ def test_the_registry_finds_the_encoder_beside_the_detector(tmp_path):
     path = write_prompted(tmp_path / "world.onnx", BOXES, anchors(), 81)
     assert identify_family(open_model(path, 1)) is ModelFamily.PROMPTED_YOLO
     encoder(tmp_path)
-    found = ModelRegistry(path, None, None, 1).detector.detect(frame(), ["mug"])
+    found = opened(path).detect(frame(), ["mug"])
     assert found[0].box_px == pytest.approx((32, 16, 64, 48), abs=1e-4)
     with pytest.raises(InvalidInputError, match="finds boxes only"):
-        ModelRegistry(path, "yolo", None, 1)
+        opened(path, "yolo")
     with pytest.raises(ModelFileError, match="expected a detector, got a text encoder"):
-        ModelRegistry(tmp_path / "text_encoder.onnx", None, None, 1)
+        opened(tmp_path / "text_encoder.onnx")
 
 
 def test_missing_and_wrong_text_files_are_named(tmp_path):
     path = write_prompted(tmp_path / "world.onnx", BOXES, anchors())
     with pytest.raises(ModelFileError, match=r"expected text_encoder\.onnx and tokenizer\.json, or lvis"):
-        ModelRegistry(path, None, None, 1)
+        opened(path)
     write_text_encoder(tmp_path / "text_encoder.onnx")
     with pytest.raises(ModelFileError, match=r"tokenizer\.json: expected a JSON file of up to 16 MiB, found none"):
-        ModelRegistry(path, None, None, 1)
+        opened(path)
     (tmp_path / "tokenizer.json").write_text("{}", encoding="utf-8")
     with pytest.raises(ModelFileError, match=r"tokenizer\.json: expected a tokenizer in JSON"):
-        ModelRegistry(path, None, None, 1)
+        opened(path)
     with pytest.raises(ModelFileError, match="expected a text encoder with projected text features"):
         encoder(tmp_path, output="pooler_output")
     with pytest.raises(ModelFileError, match=r"expected token ids \[n, length\], got images"):

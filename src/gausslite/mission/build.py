@@ -6,7 +6,6 @@ import copy
 import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
 from gausslite.domain.errors import InvalidInputError, MissingPluginError
 from gausslite.domain.gaussians import Gaussians
@@ -19,7 +18,8 @@ from gausslite.mapping.tracking import CameraTracker
 from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.settings import LoopMode, MissionSettings, PerceptionSettings, PoseMode, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
-from gausslite.perception.detector import Tiling
+from gausslite.perception.detector import Detector, RegionDetector, TiledDetector, Tiling
+from gausslite.perception.detector_file import DetectorOptions, detector_advice, open_detector
 from gausslite.perception.relevance import (
     AsyncRelevanceEstimator,
     NoTaskEstimator,
@@ -31,11 +31,6 @@ from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSett
 from gausslite.plugins import Group, load
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.rasterizer import Rasterizer
-
-if TYPE_CHECKING:
-    from gausslite.perception.detector import Detector
-    from gausslite_detectors.models import ModelRegistry
-
 
 EstimatorBuilder = Callable[[TaskGraph], RelevanceEstimator]
 """Returns the relevance estimator of a task."""
@@ -73,17 +68,16 @@ def build_tracker(settings: MissionSettings, mapper: GaussianMapper) -> CameraTr
     return CameraTracker(mapper.render) if settings.poses is PoseMode.TRACK else None
 
 
-def open_models(perception: PerceptionSettings) -> ModelRegistry | None:
-    """Open the user's model files and run each once; None without any. Raises ModelFileError, InvalidInputError."""
+def chosen_detector(perception: PerceptionSettings) -> Detector | None:
+    """Open the user's detector file; None without one. Raises ModelFileError, InvalidInputError, MissingPluginError."""
     if perception.model is None:
         return None
-    from gausslite_detectors.models import ModelRegistry
-
     tiling = Tiling(perception.tiles, perception.detection_time_s)
-    return ModelRegistry(
-        perception.model, perception.segmenter, perception.vocabulary, perception.threads, perception.accept_similar,
-        tiling,
-    )  # fmt: skip
+    options = DetectorOptions(
+        perception.segmenter, perception.vocabulary, perception.threads, perception.accept_similar
+    )
+    detector = open_detector(perception.model, options)
+    return detector if tiling.per_side == 1 else TiledDetector(detector, tiling)
 
 
 def region_estimator(regions: Sequence[Region]) -> RelevanceEstimator:
@@ -113,56 +107,51 @@ class EstimatorFactory:
     def __init__(
         self, perception: PerceptionSettings, scene: Callable[[], SceneInfo], needs_detector: bool = True
     ) -> None:
-        """Open the models. The scene is requested with the first task, because a simulated one takes seconds to build.
+        """Open the detector. The scene is requested with the first task: a simulated one takes seconds to build.
 
         needs_detector: False if a person can point at what nothing detects. Raises ModelFileError, InvalidInputError.
         """
         self._needs_detector = needs_detector
         self._perception = perception
         self._scene = functools.cache(scene)
-        self._models = open_models(perception)
+        self._detector = chosen_detector(perception)
         self._executor: ThreadPoolExecutor | None = None
 
     def in_scene(self, scene: Callable[[], SceneInfo]) -> EstimatorFactory:
-        """Return a factory with the same models for another scene."""
+        """Return a factory with the same detector for another scene."""
         other = copy.copy(self)
         other._scene = functools.cache(scene)
         return other
 
     def require_detector(self) -> None:
         """Raise InvalidInputError if one is needed, and there is neither a model file nor ground truth."""
-        if self._needs_detector and self._models is None and not self._scene().regions:
-            from gausslite_detectors.models import detector_advice
-
+        if self._needs_detector and self._detector is None and not self._scene().regions:
             raise InvalidInputError(
                 f"detector: expected --detector FILE.onnx, which finds the task's objects; {detector_advice()}"
             )
 
     def noun_matches(self, graph: TaskGraph) -> tuple[NounMatch, ...]:
         """Return what the detector searches for each noun of the task."""
-        detector = self._ground_truth_detector() if self._models is None else self._models.detector
-        return detector.matches(graph.queries)
+        return self._detector_or_truth().matches(graph.queries)
 
     def build(self, graph: TaskGraph) -> RelevanceEstimator:
         """Return the relevance estimator of a task.
 
-        It uses the user's models or, without any, the scene's ground truth. Raises InvalidInputError without both,
+        It uses the user's detector or, without any, the scene's ground truth. Raises InvalidInputError without both,
         unless a person points at all targets.
         """
         accept_similar = self._perception.accept_similar
         evidence = EvidenceSettings.accept_similar() if accept_similar else EvidenceSettings()
         settings = RelevanceTrackerSettings(up_axis=self._scene().up_axis, evidence=evidence)
-        if self._models is None:
-            return TaskRelevanceEstimator(graph, self._ground_truth_detector(bool(graph.queries)), settings)
-        detector = self._models.detector
-        if not self._perception.asynchronous:
+        detector = self._detector_or_truth(bool(graph.queries))
+        if self._detector is None or not self._perception.asynchronous:
             return TaskRelevanceEstimator(graph, detector, settings)
         self._executor = self._executor or ThreadPoolExecutor(1, "detector")
         return AsyncRelevanceEstimator(graph, detector, self._executor, settings)
 
-    def _ground_truth_detector(self, is_needed: bool = True) -> Detector:
+    def _detector_or_truth(self, is_needed: bool = True) -> Detector:
+        if self._detector is not None:
+            return self._detector
         if is_needed:
             self.require_detector()
-        from gausslite.perception.detector import RegionDetector
-
         return RegionDetector(self._scene().regions)

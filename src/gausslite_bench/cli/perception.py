@@ -17,7 +17,7 @@ from gausslite.cli.source_options import (
 )
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import option
+from gausslite.config.option import build, option
 from gausslite.config.plain_values import split_names
 from gausslite.config.program import Program
 from gausslite.datasets.source import Source, frame_size, select_frames
@@ -25,10 +25,11 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.relevance import Region
+from gausslite.mission.build import chosen_detector
 from gausslite.mission.results import as_text, prepare_folder
 from gausslite.mission.settings import PerceptionSettings, SourceSettings
 from gausslite.nouns import head_of, same_kind
-from gausslite.perception.detector import Detector, Tiling
+from gausslite.perception.detector import Detector
 from gausslite_bench.perception.absent_nouns import AbsentSummary, absent_queries, choose_absent_nouns
 from gausslite_bench.perception.contact_sheet import PerceptionSheet
 from gausslite_bench.perception.stage_scores import PerceptionBench, PerceptionStage, TaskQuery, TaskScore
@@ -82,26 +83,17 @@ def configure_perception(parser: CommandParser) -> None:
 
 def run_perception(options: argparse.Namespace) -> int:
     """Run every task on every frame and print the scores of each stage."""
-    from gausslite_detectors.models import ModelRegistry
-
-    if options.detector is None:
+    detector = chosen_detector(build(PerceptionSettings, options, threads=options.threads))
+    if detector is None:
         raise InvalidInputError("--detector: expected a model file to compare with ground truth, got none")
     source = _open(options)
     positions, size = select_frames(source, options.frames), frame_size(options.size, source)
     regions = _regions(options, source)
-    models = ModelRegistry(
-        options.detector,
-        options.segmenter,
-        options.vocabulary,
-        options.threads,
-        options.accept_similar,
-        Tiling(options.tiles),
-    )
-    absent = _absent_queries(options, models.detector, regions)
+    absent = _absent_queries(options, detector, regions)
     queries = [*_task_queries(options.task, regions), *absent]
     if options.pictures is not None:
         prepare_folder(options.pictures)
-    bench = PerceptionBench(models.detector, queries, regions, source.up_axis)
+    bench = PerceptionBench(detector, queries, regions, source.up_axis)
     sheets = [PerceptionSheet(len(positions)) for _ in queries] if options.pictures is not None else []
     for position in positions:
         masks = bench.process(source.frame(position, size))
@@ -109,7 +101,7 @@ def run_perception(options: argparse.Namespace) -> int:
             sheet.add(task_masks)
     for number, sheet in enumerate(sheets, start=1):
         write_png(options.pictures / f"task-{number}.png", sheet.draw())
-    matches = models.detector.matches([noun for query in absent for noun in query.graph.queries])
+    matches = detector.matches([noun for query in absent for noun in query.graph.queries])
     _print_scores(bench.scores(), matches, options.json)
     return 0
 

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from gausslite.cli.progress import print_above_bar, progress_bar
 from gausslite.codec.state_file import write_atomic
-from gausslite.mission.build import open_models
+from gausslite.mission.build import chosen_detector
 from gausslite.mission.results import write_json
 from gausslite_bench.quality.equal_time import first_visible_scene, load_rate, measure_rate, rate_trials
 from gausslite_bench.quality.scenes import UnseenRegionError
@@ -33,7 +33,7 @@ def run_with_progress(
     for plan in study.plans:
         for trial in study.trials(plan):
             _ = trial.mission
-    open_models(study.conditions.perception.detector)
+    chosen_detector(study.conditions.perception.detector)
     lpips = None if lpips_weights is None else load_lpips(lpips_weights, study.conditions.threads)
     cache = TrialCache(folder)
     study = _with_measured_rate(study, folder / RATE_FILE)

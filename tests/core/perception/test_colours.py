@@ -13,9 +13,10 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
 from gausslite.domain.task import ObjectAttributes, Predicate, Relation, TaskGraph
 from gausslite.perception.colours import ColourMatch, basic_terms, colour_counts, is_evaluated, match_colour, no_colours
+from gausslite.perception.detector_file import DetectorOptions
 from gausslite.perception.relevance import TaskRelevanceEstimator
 from gausslite.perception.settings import ColourSettings
-from gausslite_detectors.models import ModelRegistry
+from gausslite_detectors.models import READER
 
 # colours that every table of colour names gives these names
 FOCAL = {
@@ -99,7 +100,7 @@ def frame(index: int, left=FOCAL["red"], right=FOCAL["blue"]) -> Frame:
 def detector(tmp_path):
     # the blocks in the network's pixels, which halve the image and pad 16 rows
     boxes = [(14.0, 32.0, 12.0, 12.0, 0, 0.9), (46.0, 32.0, 12.0, 12.0, 0, 0.9)]
-    return ModelRegistry(write_boxes_only(tmp_path / "m.onnx", ("cup", "chair"), boxes), None, None, 1).detector
+    return READER.open(write_boxes_only(tmp_path / "m.onnx", ("cup", "chair"), boxes), DetectorOptions(threads=1))
 
 
 def colours(**names: str) -> tuple[ObjectAttributes, ...]:

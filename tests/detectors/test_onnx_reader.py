@@ -14,9 +14,10 @@ from gausslite.domain.errors import InvalidInputError, KernelError, ModelFileErr
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import DetectedBox
-from gausslite.perception.detector import SegmentedDetector
+from gausslite.perception.detector import Detector, SegmentedDetector
+from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.model_file import choose_providers, open_model
-from gausslite_detectors.models import ModelFamily, ModelRegistry, identify_family
+from gausslite_detectors.models import READER, ModelFamily, identify_family
 
 # in the network's pixels; in the image columns 32 to 64, rows 16 to 48
 CUP = (24.0, 32.0, 16.0, 16.0, 0, 0.9)
@@ -34,8 +35,12 @@ def yolo(tmp_path: Path, name: str = "yolo.onnx", classes=("cup", "chair"), boxe
     return write_tiny_yolo(tmp_path / name, classes, boxes)
 
 
-def found_pixels(networks: ModelRegistry) -> int:
-    (found,) = networks.detector.detect(frame(), ["cup"])
+def opened(path: Path, segmenter: str | None = None) -> Detector:
+    return READER.open(path, DetectorOptions(segmenter, threads=1))
+
+
+def found_pixels(detector: Detector) -> int:
+    (found,) = detector.detect(frame(), ["cup"])
     return int(found.mask.sum())
 
 
@@ -54,49 +59,49 @@ def test_a_family_is_identified_by_inputs_and_outputs(tmp_path):
 def test_boxes_with_class_names_get_masks_from_depth(tmp_path):
     """As an export of YOLO-World whose classes were set before the export: [1, 4+c, A] and names in the metadata."""
     path = write_boxes_only(tmp_path / "world.onnx", ("wall clock", "cup"), [(24.0, 32.0, 16.0, 16.0, 1, 0.8)])
-    networks = ModelRegistry(path, None, None, 1)
-    (found,) = networks.detector.detect(frame(), ["mug", "clock"])
+    detector = opened(path)
+    (found,) = detector.detect(frame(), ["mug", "clock"])
     assert (found.phrase, found.score) == ("mug", pytest.approx(0.8))
     assert found.box_px == pytest.approx((32, 16, 64, 48))
     assert found.mask.sum() == 24 * 24
     with pytest.raises(InvalidInputError, match="finds boxes only; expected depth or a FastSAM file"):
-        ModelRegistry(path, "yolo", None, 1)
+        opened(path, "yolo")
     with pytest.raises(InvalidInputError, match=r"expected depth or a FastSAM file, got .*world\.onnx"):
-        ModelRegistry(path, str(path), None, 1)
+        opened(path, str(path))
 
 
 @pytest.mark.parametrize("name", [None, "yolo"])
 def test_a_yolo_file_uses_its_own_masks(tmp_path, name):
-    networks = ModelRegistry(yolo(tmp_path), name, None, 1)
-    assert found_pixels(networks) > 0.97 * 32 * 32
+    detector = opened(yolo(tmp_path), name)
+    assert found_pixels(detector) > 0.97 * 32 * 32
 
 
 @pytest.mark.parametrize(("segmenter", "sessions"), [(None, 1), ("depth", 1), ("everything.onnx", 2)])
 def test_each_file_is_opened_once(tmp_path, monkeypatch, segmenter, sessions):
     import onnxruntime
 
-    opened, session_of = [], onnxruntime.InferenceSession
+    paths, session_of = [], onnxruntime.InferenceSession
 
     def counted(path, *more, **named):
-        opened.append(path)
+        paths.append(path)
         return session_of(path, *more, **named)
 
     monkeypatch.chdir(tmp_path)
     yolo(tmp_path, "everything.onnx", ("object",))
     monkeypatch.setattr(onnxruntime, "InferenceSession", counted)
-    ModelRegistry(yolo(tmp_path), segmenter, None, 1)
-    assert len(opened) == len(set(opened)) == sessions
+    opened(yolo(tmp_path), segmenter)
+    assert len(paths) == len(set(paths)) == sessions
 
 
 def test_the_depth_segmenter_replaces_a_networks_masks_on_request(tmp_path):
-    assert found_pixels(ModelRegistry(yolo(tmp_path), "depth", None, 1)) == 24 * 24
+    assert found_pixels(opened(yolo(tmp_path), "depth")) == 24 * 24
 
 
 def test_a_second_file_segments_boxes_and_depth_segments_the_rest(tmp_path):
     everything = yolo(tmp_path, "everything.onnx", ("object",))
-    assert found_pixels(ModelRegistry(yolo(tmp_path), str(everything), None, 1)) > 0.97 * 32 * 32
+    assert found_pixels(opened(yolo(tmp_path), str(everything))) > 0.97 * 32 * 32
     blind = yolo(tmp_path, "blind.onnx", ("object",), ())
-    assert found_pixels(ModelRegistry(yolo(tmp_path), str(blind), None, 1)) == 24 * 24
+    assert found_pixels(opened(yolo(tmp_path), str(blind))) == 24 * 24
 
 
 def test_boxes_without_a_mask_are_dropped():
@@ -119,19 +124,19 @@ def test_boxes_without_a_mask_are_dropped():
 def test_grounding_dino_needs_a_vocabulary_and_has_no_masks(tmp_path):
     path = write_tiny_grounding(tmp_path / "dino.onnx", [((0.5, 0.5, 0.2, 0.2), {})])
     with pytest.raises(InvalidInputError, match="finds boxes only; expected depth or a FastSAM file"):
-        ModelRegistry(path, "yolo", None, 1)
+        opened(path, "yolo")
     with pytest.raises(ModelFileError, match=r"vocab\.txt"):
-        ModelRegistry(path, None, None, 1)
+        opened(path)
 
 
 def test_grounding_dino_with_a_vocabulary_detects_and_segments(tmp_path):
     path = write_tiny_grounding(tmp_path / "dino.onnx", [((0.375, 0.5, 0.25, 0.5), {"mug": 2.0})], (64, 128))
     (tmp_path / "vocab.txt").write_text("\n".join(VOCABULARY), encoding="utf-8")
     try:
-        networks = ModelRegistry(path, None, None, 1)
+        detector = opened(path)
     except KernelError as error:
         pytest.skip(str(error))
-    (found,) = networks.detector.detect(frame(), ["mug"])
+    (found,) = detector.detect(frame(), ["mug"])
     assert found.box_px == pytest.approx((32, 16, 64, 48))
     assert found.mask.sum() == 24 * 24
 
@@ -166,4 +171,4 @@ def test_a_damaged_bit_is_detected_by_a_listed_checksum(tmp_path):
     path = yolo(tmp_path)
     (tmp_path / "SHA256SUMS").write_text(f"{'0' * 64}  other.onnx\n{'1' * 64} *yolo.onnx\n", encoding="utf-8")
     with pytest.raises(ModelFileError, match="of SHA256SUMS in its folder"):
-        ModelRegistry(path, None, None, 1)
+        opened(path)

@@ -1,0 +1,62 @@
+"""Open the user's detector file with the installed reader that knows its kind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from gausslite.domain.errors import ModelFileError
+from gausslite.perception.detector import Detector
+from gausslite.plugins import DEFAULT, Group, installed, load
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorOptions:
+    """What the user states beside the file; a reader ignores what its kind of file does not have."""
+
+    segmenter: str | None = None
+    """How boxes become masks: "yolo" (the file's own masks), "depth", or the path of a second file; None: the reader
+    chooses."""
+    vocabulary: Path | None = None
+    """The vocabulary of the file's text encoder; None: beside the file."""
+    threads: int | None = None
+    """None: as many as the runtime chooses."""
+    accept_similar: bool = False
+    """Also detect classes that are only similar to a noun."""
+
+
+class DetectorReader(Protocol):
+    """Opens files of one kind; a package registers it in the group `gausslite.detectors`."""
+
+    def open(self, path: Path, options: DetectorOptions, /) -> Detector | None:
+        """Return the detector of a file; None if the file is not of this kind.
+
+        Raises ModelFileError if it is of this kind and damaged, InvalidInputError if the options do not fit it.
+        """
+        ...
+
+    def advice(self) -> str:
+        """Return how a user without a file gets one, in one line."""
+        ...
+
+
+def open_detector(path: Path, options: DetectorOptions) -> Detector:
+    """Return the detector of the first reader that knows the file; the default reader is asked last.
+
+    Raises ModelFileError, InvalidInputError, KernelError, and MissingPluginError without the default reader.
+    """
+    others = [reader for name, reader in installed(Group.DETECTORS) if name != DEFAULT]
+    for reader in others:
+        detector: Detector | None = reader.open(path, options)
+        if detector is not None:
+            return detector
+    detector = load(Group.DETECTORS).open(path, options)
+    if detector is None:
+        raise ModelFileError(f"model {path}: expected a file that an installed reader of detectors knows")
+    return detector
+
+
+def detector_advice() -> str:
+    """Return how a user gets a file, of each reader. Raises MissingPluginError if no reader is installed."""
+    return "; or ".join(reader.advice() for _, reader in installed(Group.DETECTORS)) or load(Group.DETECTORS).advice()
