@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 
 from gausslite.domain.errors import InvalidInputError, StorageError
+from gausslite.domain.frame import FrameId
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.keyframe_selection import Coverage, KeyframeAddition, KeyframeSelection, SelectedKeyframe
 from gausslite.mapping.keyframes import Keyframe
@@ -82,13 +83,13 @@ class KeyframeUpload:
         """max_keyframes: the most that the server has at a time. during_mission: also send while mapping."""
         self._uplink, self._during_mission = uplink, during_mission
         self._selection = KeyframeSelection(max_keyframes, grid, _selected_keyframes(uplink))
-        self._last_considered: Keyframe | None = None
+        self._last_considered: FrameId | None = None
 
     def enqueue_newest(self, keyframes: Sequence[Keyframe]) -> None:
         """Send the newest keyframe of the mission, if it adds to the coverage and was not considered yet."""
-        if not self._during_mission or not keyframes or keyframes[-1] is self._last_considered:
+        if not self._during_mission or not keyframes or keyframes[-1].frame.id == self._last_considered:
             return
-        self._last_considered = keyframes[-1]
+        self._last_considered = keyframes[-1].frame.id
         self._send(self._selection.select(keyframes[-1]))
 
     def enqueue_all(self, keyframes: Sequence[Keyframe]) -> None:

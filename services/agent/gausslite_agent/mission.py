@@ -114,12 +114,14 @@ class AgentMission:
         self._corrupt = CorruptFrames(_log.warning)
         self._clock, self._latest_ns = ClockJumps(), _BEFORE_ALL_NS
         self._pending: Future[FrameReport] | None = None
-        # set while no source is replayed
+        # set while no source is mapped
         self._replay_ended = threading.Event()
         self._replay_ended.set()
         self._stopping = threading.Event()
         self._stop_deadline_s: float | None = None
         self._ending = threading.Lock()
+        # the first request to end this mission; it counts also if the thread that maps the source ends the mission
+        self._requested: EndRequest | None = None
         self._summary: MissionSummary | None = None
 
     @property
@@ -193,12 +195,15 @@ class AgentMission:
         An error after the first mapped frame ends the mission early: the map so far is sent and written first.
         """
         self._start_s, self._up_axis = time.monotonic(), stream.source.up_axis
+        self._replay_ended.clear()
         try:
             self.assign_task()
             failure = self._replay(stream)
         except GaussLiteError as error:
             self._state_machine.enter(MissionState.FAILED, str(error))
             raise
+        finally:
+            self._replay_ended.set()
         if failure is None and self._worker.status().mapped == 0:
             failure = self._corrupt.first_error
         if failure is None or self._worker.status().mapped > 0:
@@ -209,11 +214,14 @@ class AgentMission:
     def end(self, request: EndRequest) -> MissionSummary:
         """End the mission and return what was sent and left. A later call waits and returns the same.
 
+        The first request counts; without one, the options of the command line.
+
         Raises MismatchError before the first task, StorageError if the results cannot be written; the mission is FAILED
         then and can be ended again.
         """
         if self._state_machine.state is MissionState.WAITING_FOR_TASK:
             raise MismatchError("mission: expected a task first, got none yet; call AssignTask")
+        self._requested = self._requested or request
         self._stopping.set()
         self._replay_ended.wait()
         return self._end(request, None)
@@ -263,13 +271,12 @@ class AgentMission:
 
     def _begin(self) -> None:
         if self._state_machine.state is not MissionState.MAPPING:
-            self._summary = None
+            self._summary = self._requested = None
             self._latest_ns = _BEFORE_ALL_NS
             self._state_machine.enter(MissionState.MAPPING)
 
     def _replay(self, stream: FrameStream) -> GaussLiteError | None:
         """Map the frames of the stream, and return the error that ended it early."""
-        self._replay_ended.clear()
         try:
             last_index = -1 if self._resumed is None else self._resumed.last_index
             frames = stream.after(last_index).frames(None if self._settings.strict else self._corrupt)
@@ -277,8 +284,6 @@ class AgentMission:
             self._wait_for_pending()
         except GaussLiteError as error:
             return error
-        finally:
-            self._replay_ended.set()
         return result.stopped_by if isinstance(result.stopped_by, GaussLiteError) else None
 
     def _submit(self, frame: Frame) -> None:
@@ -296,12 +301,13 @@ class AgentMission:
             _log.info("frame %d %s: %s", report.index, report.outcome.value, report.reason)
 
     def _end(self, request: EndRequest, ended_by: str | None) -> MissionSummary:
-        """End the mission once; ended_by: the error that ended it early."""
+        """End the mission once, by `end`'s request if there is one; ended_by: the error that ended it early."""
         with self._ending:
             if self._summary is not None:
                 return self._summary
             # from here on frames are refused; those in the queue are still mapped
             self._state_machine.enter(MissionState.DRAINING)
+            request, self._requested = self._requested or request, None
             try:
                 summary = self._send_and_write(request, ended_by)
             except GaussLiteError as error:

@@ -178,7 +178,9 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         self._newest_task = NewestTask()
         # a thread of its own: calls that wait for the mapper must not delay a frame
         self._decoder = ThreadPoolExecutor(1, "decode")
-        # used on the worker thread only
+        # so do these, because the end of a mission and the hash of a whole map take long
+        self._ending, self._comparing = ThreadPoolExecutor(1, "end"), ThreadPoolExecutor(1, "compare")
+        # used on the comparing thread only
         self._change_logs = {roi_only: MapChangeLog(worker.grid, roi_only) for roi_only in (False, True)}
 
     def service(self) -> Service:
@@ -216,7 +218,7 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
             end = replace(end, handover=request.handover)
         if request.HasField("drain_seconds"):
             end = replace(end, drain_s=request.drain_seconds)
-        summary = await asyncio.to_thread(self._mission.end, end)
+        summary = await asyncio.get_running_loop().run_in_executor(self._ending, self._mission.end, end)
         return summary_to_message(self._mission.state, summary)
 
     async def GetAgentStatus(  # noqa: N802
@@ -256,11 +258,14 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         change_log = self._change_logs[request.roi_only]
 
         async def read(since_revision: int) -> AgentMapReader:
-            def read_changes(mapper: GaussianMapper) -> MapChanges:
-                change_log.update(mapper.gaussians(), self._worker.revision())
+            def read_changes() -> MapChanges:
+                # the mapper is only copied on its thread, and once for all watchers of a revision
+                if change_log.revision < self._worker.revision():
+                    copied = self._worker.run(lambda mapper: (mapper.gaussians(), self._worker.revision()))
+                    change_log.update(*copied.result())
                 return change_log.since(since_revision)
 
-            changes = await asyncio.wrap_future(self._worker.run(read_changes))
+            changes = await asyncio.get_running_loop().run_in_executor(self._comparing, read_changes)
             return AgentMapReader(changes, region, self._worker.grid, self._agent_id, self._encoded_parts)
 
         blocks = follow(read, self._worker.revision, request.since_revision, self._changes, asyncio.to_thread)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -110,6 +112,18 @@ MAX_COORDINATE_M = 10_000.0
 """Farther from the world's origin, float32 no longer resolves a millimetre, and voxel keys overflow."""
 
 
+class FrameId(NamedTuple):
+    """Identifies a captured frame, whatever becomes of its pose and pixels. Clocks restart, so times may repeat."""
+
+    index: int
+    capture_time_ns: int
+
+    @property
+    def number(self) -> int:
+        """The id as one number of 63 bits, for sets of views in saved states."""
+        return (self.index & 0x7FFFFFFF) << 32 | zlib.crc32(struct.pack("<q", self.capture_time_ns))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """A colour and depth image with its camera and pose.
@@ -145,6 +159,11 @@ class Frame:
             )
         if not np.isfinite(self.depth_m).all() or (self.depth_m < 0).any():
             raise InvalidInputError("frame depth_m: expected finite values of at least 0 (0 = no return)")
+
+    @property
+    def id(self) -> FrameId:
+        """What identifies the frame."""
+        return FrameId(self.index, self.capture_time_ns)
 
     @property
     def sharpest_rgb(self) -> UInt8[ndarray, "hs ws 3"]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.frame import Frame, without_depth_edges
+from gausslite.domain.frame import Frame, FrameId, without_depth_edges
 from gausslite.domain.pose import Twist, inverse, orthonormal
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
@@ -103,7 +104,8 @@ class Keyframe:
 
     recorded: the frame with the source's pose and colours, if `frame` has refined ones; otherwise None.
     evaluated: False until the relevance to the present task is known; `relevance` is empty until then. anchor: number
-    of the keyframe that the frame follows when poses are corrected; its own one, if it is a keyframe.
+    of the keyframe that the frame follows when poses are corrected; its own one, if it is a keyframe. hidden: pixels
+    that showed what has moved since; None if there are none.
     """
 
     frame: Frame
@@ -111,6 +113,12 @@ class Keyframe:
     recorded: Frame | None = None
     evaluated: bool = True
     anchor: int = 0
+    hidden: Bool[ndarray, "h w"] | None = None
+
+    def with_relevance(self, relevance: RelevanceMap) -> Keyframe:
+        """Return the keyframe evaluated with this relevance; what has moved since is not relevant."""
+        shown = relevance if self.hidden is None else relevance.without(self.hidden)
+        return replace(self, relevance=shown, evaluated=True)
 
     @property
     def as_recorded(self) -> Frame:
@@ -133,6 +141,7 @@ class Keyframe:
             **add_prefix("frame", frame_state(self.frame)),
             **add_prefix("relevance", relevance_state(self.relevance)),
             **add_prefix("recorded", recorded),
+            **({} if self.hidden is None else {"hidden": self.hidden}),
             "counts": int_array(self.evaluated, self.anchor),
         }
 
@@ -143,12 +152,8 @@ class Keyframe:
         recorded = select_prefix(state, "recorded")
         relevance = relevance_from_state(select_prefix(state, "relevance"), frame)
         evaluated, anchor = get_counts(state, "counts", 2)
-        return cls(frame, relevance, frame_from_state(recorded) if recorded else None, bool(evaluated), anchor)
-
-
-def is_same_frame(a: Keyframe, b: Keyframe) -> bool:
-    """True if both keyframes come from the same recorded frame."""
-    return a.as_recorded is b.as_recorded
+        hidden = get_array(state, "hidden", frame.depth_m.shape, np.bool_).copy() if "hidden" in state else None
+        return cls(frame, relevance, frame_from_state(recorded) if recorded else None, bool(evaluated), anchor, hidden)
 
 
 def motion_blur_px(frame: Frame) -> float:
@@ -248,26 +253,29 @@ class KeyframeStore:
     def __init__(self, settings: KeyframeSettings) -> None:
         self._settings = self._limits = settings
         self._largest_px = 1
-        self._recent: list[WindowView] = []
-        self._long_term: list[WindowView] = []
-        self._buffer: list[Keyframe] = []
+        self._keyframes: dict[FrameId, Keyframe] = {}
+        self._views: dict[FrameId, WindowView] = {}
+        self._recent: list[FrameId] = []
+        self._long_term: list[FrameId] = []
+        self._buffer: list[FrameId] = []
         self._mapped_frames = self._count = 0
 
     @property
     def window(self) -> tuple[WindowView, ...]:
         """The views to train on: long-term ones, then the most recent ones, each oldest first and none twice."""
-        recent = {id(view.keyframe) for view in self._recent}
-        return (*(view for view in self._long_term if id(view.keyframe) not in recent), *self._recent)
+        long_term = [frame for frame in self._long_term if frame not in self._recent]
+        return tuple(self._views[frame] for frame in (*long_term, *self._recent))
 
     @property
     def buffer(self) -> tuple[Keyframe, ...]:
         """Keyframes of the whole mission, oldest first, thinned evenly if the buffer is full."""
-        return tuple(self._buffer)
+        return tuple(self._keyframes[frame] for frame in self._buffer)
 
     @property
     def kept(self) -> tuple[Keyframe, ...]:
         """Every keyframe of the buffer and of the window once, by capture time."""
-        return tuple(sorted(self._keyframes(), key=lambda keyframe: keyframe.frame.capture_time_ns))
+        keyframes = (self._keyframes[frame] for frame in self._ids())
+        return tuple(sorted(keyframes, key=lambda keyframe: keyframe.frame.capture_time_ns))
 
     @property
     def next_anchor(self) -> int:
@@ -285,95 +293,102 @@ class KeyframeStore:
         return self._mapped_frames % self._settings.every == 0
 
     def add(self, view: WindowView) -> None:
-        """Store a mapped frame for the long term and, if it is the next `every`th one, among the most recent ones."""
+        """Store a mapped frame for the long term and, if it is the next `every`th one, among the most recent ones.
+
+        It replaces an earlier one with its id: that of a recording which is played again.
+        """
         self._limit_for(view.keyframe)
         is_keyframe = self.next_is_keyframe
         self._mapped_frames += 1
         self._count += is_keyframe
-        self._set_long_term([*self._long_term, view])
-        if not is_keyframe:
-            return
-        self._recent = [*self._recent, view][-self._limits.window :]
-        self._buffer.append(view.keyframe)
-        while len(self._buffer) > self._limits.buffer:
-            del self._buffer[_most_redundant(self._buffer)]
+        new = view.keyframe.frame.id
+        for frames in (self._recent, self._long_term, self._buffer):
+            if new in frames:
+                frames.remove(new)
+        self._keyframes[new], self._views[new] = view.keyframe, view
+        self._set_long_term([*self._long_term, new])
+        if is_keyframe:
+            self._recent = [*self._recent, new][-self._limits.window :]
+            self._buffer.append(new)
+            while len(self._buffer) > self._limits.buffer:
+                del self._buffer[_most_redundant(self.buffer)]
+        # here and not with each selection, so that a frame is known until the next one comes
+        self._keyframes = {frame: self._keyframes[frame] for frame in self._ids()}
+        self._views = {frame: self._views[frame] for frame in (*self._recent, *self._long_term)}
 
-    def replace_view(self, view: WindowView) -> None:
-        """Replace the view of the same recorded frame, if it is in the window."""
-        self._replace(view.keyframe, view.keyframe, lambda _: view)
-        self._set_long_term(self._long_term)
+    def get(self, frame: FrameId) -> Keyframe | None:
+        """Return the keyframe of a frame, or None if none is kept."""
+        return self._keyframes.get(frame)
+
+    def replace(self, keyframe: Keyframe, prepare: PrepareView | None) -> None:
+        """Replace the keyframe of the same frame, if it is kept; prepare: None if no pixel and no pose has changed."""
+        frame = keyframe.frame.id
+        if frame not in self._keyframes:
+            return
+        self._keyframes[frame] = keyframe
+        if frame in self._views:
+            view = replace(self._views[frame], keyframe=keyframe) if prepare is None else prepare(keyframe)
+            self._views[frame] = view
+            self._set_long_term(self._long_term)
+
+    def replace_relevance(self, keyframe: Keyframe, prepare: PrepareView) -> None:
+        """Replace the keyframe of the same frame, if it is kept; one that shows the ROI joins the window again."""
+        frame = keyframe.frame.id
+        self.replace(keyframe, prepare)
+        if frame not in self._keyframes or frame in self._long_term or not keyframe.relevance.roi.any():
+            return
+        if frame not in self._views:
+            self._views[frame] = prepare(keyframe)
+        self._set_long_term(sorted([*self._long_term, frame], key=self._capture_time_ns))
 
     def reset_roi(self) -> None:
         """Mark all keyframes as not evaluated for the new task; their relevance is empty until then."""
-        keyframes = self._keyframes()
-        empty = {k.frame.depth_m.shape: RelevanceMap.empty(*k.frame.depth_m.shape) for k in keyframes}
-        fresh = {id(old): replace(old, relevance=empty[old.frame.depth_m.shape], evaluated=False) for old in keyframes}
-        self._replace_all(fresh, lambda view: replace(view, roi=_no_tiles(view.keyframe.frame)))
+        shapes = {keyframe.frame.depth_m.shape for keyframe in self._keyframes.values()}
+        empty = {shape: RelevanceMap.empty(*shape) for shape in shapes}
+        self._update_all(
+            lambda keyframe: replace(keyframe, relevance=empty[keyframe.frame.depth_m.shape], evaluated=False),
+            lambda view: replace(view, roi=_no_tiles(view.keyframe.frame)),
+        )
 
     def move(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> None:
         """Move all keyframes with their anchors, given the motions by keyframe number."""
-        moved = {id(old): old.moved(T_corrected_earlier) for old in self._keyframes()}
-        self._replace_all(moved, lambda view: replace(view, T_camera_world=inverse(view.keyframe.frame.T_world_camera)))
+        self._update_all(
+            lambda keyframe: keyframe.moved(T_corrected_earlier),
+            lambda view: replace(view, T_camera_world=inverse(view.keyframe.frame.T_world_camera)),
+        )
 
-    def _replace_all(self, fresh: Mapping[int, Keyframe], update: Callable[[WindowView], WindowView]) -> None:
-        """Replace all keyframes, given by id of the old ones, and update their views."""
-        self._buffer = [fresh[id(keyframe)] for keyframe in self._buffer]
-        views = {id(view.keyframe): update(replace(view, keyframe=fresh[id(view.keyframe)])) for view in self.window}
-        self._recent = [views[id(view.keyframe)] for view in self._recent]
-        self._long_term = [views[id(view.keyframe)] for view in self._long_term]
+    def _update_all(self, update: Callable[[Keyframe], Keyframe], of_view: Callable[[WindowView], WindowView]) -> None:
+        self._keyframes = {frame: update(keyframe) for frame, keyframe in self._keyframes.items()}
+        self._views = {
+            frame: of_view(replace(view, keyframe=self._keyframes[frame])) for frame, view in self._views.items()
+        }
 
     @property
     def next_unevaluated(self) -> Keyframe | None:
         """The newest keyframe not evaluated for the present task, or None."""
-        newest_first = (*(view.keyframe for view in reversed(self.window)), *reversed(self._buffer))
-        return next((keyframe for keyframe in newest_first if not keyframe.evaluated), None)
+        return next((keyframe for keyframe in self._newest_first() if not keyframe.evaluated), None)
 
     def next_incomplete(self, known_objects: int) -> Keyframe | None:
         """The newest evaluated keyframe whose relevance was estimated with fewer known objects, or None."""
-        newest_first = (*(view.keyframe for view in reversed(self.window)), *reversed(self._buffer))
+        newest_first = self._newest_first()
         return next((k for k in newest_first if k.evaluated and k.relevance.known_objects < known_objects), None)
-
-    def replace_keyframe(self, keyframe: Keyframe) -> None:
-        """Replace a keyframe by a version whose relevance has the same pixels."""
-        self._replace(keyframe, keyframe, lambda view: replace(view, keyframe=keyframe))
-
-    def exchange(self, old: Keyframe, new: Keyframe, prepare: PrepareView) -> None:
-        """Replace a keyframe by one whose image has other pixels."""
-        self._replace(old, new, lambda _: prepare(new))
-
-    def set_evaluated(self, keyframe: Keyframe, prepare: PrepareView) -> None:
-        """Replace a keyframe by its evaluated version; one that shows the ROI joins the window again."""
-        self._buffer = [keyframe if is_same_frame(old, keyframe) else old for old in self._buffer]
-        shows_roi = bool(keyframe.relevance.roi.any())
-        in_window = any(is_same_frame(view.keyframe, keyframe) for view in self.window)
-        if not in_window and not shows_roi:
-            return
-        view = prepare(keyframe)
-        self.replace_view(view)
-        if shows_roi and not any(is_same_frame(prepared.keyframe, keyframe) for prepared in self._long_term):
-            self._set_long_term(sorted([*self._long_term, view], key=_capture_time_ns))
-
-    def find(self, recorded: Frame) -> WindowView | None:
-        """Return the window's view of a recorded frame, or None if the window has none."""
-        return next((view for view in self.window if view.keyframe.as_recorded is recorded), None)
 
     @property
     def image_bytes(self) -> int:
         """Memory of all keyframes' images, without the data that the rasterizer prepares for the window."""
-        return sum(array.nbytes for keyframe in self._keyframes() for array in keyframe.state().values())
+        return sum(array.nbytes for keyframe in self.kept for array in keyframe.state().values())
 
     def state(self) -> State:
         """Return all keyframes once, and their numbers in the three lists."""
-        keyframes = self._keyframes()
-        number = {id(keyframe): i for i, keyframe in enumerate(keyframes)}
+        number = {frame: i for i, frame in enumerate(self._ids())}
         state: dict[str, NDArray[Any]] = {
-            "recent": int_array(*(number[id(view.keyframe)] for view in self._recent)),
-            "long_term": int_array(*(number[id(view.keyframe)] for view in self._long_term)),
-            "buffer": int_array(*(number[id(keyframe)] for keyframe in self._buffer)),
+            "recent": int_array(*(number[frame] for frame in self._recent)),
+            "long_term": int_array(*(number[frame] for frame in self._long_term)),
+            "buffer": int_array(*(number[frame] for frame in self._buffer)),
             "counts": int_array(self._mapped_frames, self._count),
         }
-        for i, keyframe in enumerate(keyframes):
-            state |= add_prefix(str(i), keyframe.state())
+        for frame, i in number.items():
+            state |= add_prefix(str(i), self._keyframes[frame].state())
         return state
 
     def restore(self, state: State, prepare: PrepareView) -> None:
@@ -389,21 +404,15 @@ class KeyframeStore:
                 raise MapFileError(f"state keyframes {name}: expected at most {limit}, got {len(numbers[name])}")
         stored = sorted({i for number in numbers.values() for i in number})
         keyframes = {i: Keyframe.from_state(select_prefix(state, str(i))) for i in stored}
-        views = {i: prepare(keyframes[i]) for i in sorted({*numbers["recent"], *numbers["long_term"]})}
-        self._recent = [views[i] for i in numbers["recent"]]
-        self._long_term = [views[i] for i in numbers["long_term"]]
-        self._buffer = [keyframes[i] for i in numbers["buffer"]]
+        self._keyframes = {keyframe.frame.id: keyframe for keyframe in keyframes.values()}
+        self._recent, self._long_term, self._buffer = (
+            list(dict.fromkeys(keyframes[i].frame.id for i in numbers[name])) for name in limits
+        )
+        in_window = dict.fromkeys([*self._recent, *self._long_term])
+        self._views = {frame: prepare(self._keyframes[frame]) for frame in in_window}
         for keyframe in keyframes.values():
             self._limit_for(keyframe)
         self._mapped_frames, self._count = get_counts(state, "counts", 2)
-
-    def _replace(self, old: Keyframe, new: Keyframe, update: Callable[[WindowView], WindowView]) -> None:
-        """Replace the keyframe of one recorded frame, and update its views."""
-        self._buffer = [new if is_same_frame(keyframe, old) else keyframe for keyframe in self._buffer]
-        self._recent, self._long_term = (
-            [update(view) if is_same_frame(view.keyframe, old) else view for view in views]
-            for views in (self._recent, self._long_term)
-        )
 
     def _limit_for(self, keyframe: Keyframe) -> None:
         """Reduce the limits if this image is the largest so far."""
@@ -412,28 +421,30 @@ class KeyframeStore:
             self._largest_px = pixels
             self._limits = self._settings.for_image_size(pixels)
 
-    def _set_long_term(self, views: list[WindowView]) -> None:
+    def _set_long_term(self, frames: list[FrameId]) -> None:
         """Keep these long-term views, of those with and of those without the ROI each the least redundant ones."""
-        kept: set[int] = set()
+        kept: set[FrameId] = set()
         for shows_roi in (True, False):
-            kind = [view for view in views if view.shows_roi == shows_roi]
+            kind = [frame for frame in frames if self._views[frame].shows_roi == shows_roi]
             while len(kind) > self._limits.long_term_keyframes:
-                del kind[_most_redundant([view.keyframe for view in kind])]
-            kept |= {id(view) for view in kind}
-        self._long_term = [view for view in views if id(view) in kept]
+                del kind[_most_redundant([self._keyframes[frame] for frame in kind])]
+            kept.update(kind)
+        self._long_term = [frame for frame in frames if frame in kept]
 
-    def _keyframes(self) -> list[Keyframe]:
-        """Return every keyframe once, the buffer's first."""
-        views = (*self._recent, *self._long_term)
-        return list(dict.fromkeys([*self._buffer, *(view.keyframe for view in views)]))
+    def _ids(self) -> list[FrameId]:
+        """Return every kept frame once, the buffer's first."""
+        return list(dict.fromkeys([*self._buffer, *self._recent, *self._long_term]))
+
+    def _capture_time_ns(self, frame: FrameId) -> int:
+        return self._keyframes[frame].frame.capture_time_ns
+
+    def _newest_first(self) -> Iterator[Keyframe]:
+        """Yield the window's keyframes, then the buffer's, each the newest first."""
+        return itertools.chain((view.keyframe for view in reversed(self.window)), reversed(self.buffer))
 
 
 def _no_tiles(frame: Frame) -> Subset:
     return Subset(tiles_touching(np.zeros(frame.depth_m.shape, np.bool_), margin_px=0))
-
-
-def _capture_time_ns(view: WindowView) -> int:
-    return view.keyframe.frame.capture_time_ns
 
 
 def _most_redundant(keyframes: Sequence[Keyframe]) -> int:

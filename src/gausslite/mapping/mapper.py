@@ -12,7 +12,7 @@ from numpy import ndarray
 from gausslite.domain.arrays import require_array
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import Frame, FrameId
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, orthonormal
 from gausslite.domain.relevance import RelevanceMap
@@ -161,8 +161,9 @@ class GaussianMapper:
         if motions is not None:
             view = self._window_view(view.keyframe.moved(motions))
         iterations = self._train(view, motions, scheduler)
+        is_keyframe = self._keyframes.next_is_keyframe
         self._keyframes.add(view)
-        if self._has_prior and self._keyframes.buffer[-1] is view.keyframe:
+        if self._has_prior and is_keyframe:
             self._revise(view.keyframe)
         self._revision += 1
         return MappedFrame(
@@ -192,16 +193,15 @@ class GaussianMapper:
         self._trainer.idle_step(self._keyframes.window, self._extent_m)
         return True
 
-    def update_relevance(self, recorded: Frame, relevance: RelevanceMap) -> bool:
-        """Replace the relevance of an earlier frame. Return False if the frame is no longer in the window."""
-        view = self._keyframes.find(recorded)
-        if view is None:
-            return False
-        if view.keyframe.evaluated:
-            self._keyframes.replace_view(self._window_view(replace(view.keyframe, relevance=relevance)))
+    def update_relevance(self, frame: FrameId, relevance: RelevanceMap) -> None:
+        """Replace the relevance of an earlier frame, if its keyframe is still kept."""
+        keyframe = self._keyframes.get(frame)
+        if keyframe is None:
+            return
+        if keyframe.evaluated:
+            self._keyframes.replace(keyframe.with_relevance(relevance), self._window_view)
         else:
-            self.evaluate_keyframe(view.keyframe, relevance)
-        return True
+            self.evaluate_keyframe(keyframe, relevance)
 
     def reset_roi(self) -> None:
         """Start a new task: no Gaussian is active, and no keyframe is evaluated.
@@ -224,12 +224,12 @@ class GaussianMapper:
         within the cap.
         """
         require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
-        frame, table = keyframe.frame, self._table
-        self._keyframes.set_evaluated(replace(keyframe, relevance=relevance, evaluated=True), self._window_view)
-        update_roi_evidence(table, frame, relevance)
-        if not relevance.roi.any():
+        table, evaluated = self._table, keyframe.with_relevance(relevance)
+        self._keyframes.replace_relevance(evaluated, self._window_view)
+        update_roi_evidence(table, evaluated.frame, evaluated.relevance)
+        if not evaluated.relevance.roi.any():
             return 0
-        seeds = self._seeder.seed_roi(frame, relevance, table.means_m[table.active])
+        seeds = self._seeder.seed_roi(evaluated.frame, evaluated.relevance, table.means_m[table.active])
         return self._insert(Seeds(seeds, Gaussians.empty(), keyframe.anchor))
 
     def next_incomplete(self, known_objects: int) -> Keyframe | None:
@@ -242,13 +242,13 @@ class GaussianMapper:
         Gaussians that it shows on the added pixels become active, unless as many completed keyframes show them outside.
         """
         require_array("relevance pixel_weights", relevance.pixel_weights, keyframe.frame.depth_m.shape, np.float32)
-        completed = replace(keyframe, relevance=relevance)
-        added = relevance.without(keyframe.relevance.roi)
+        completed = keyframe.with_relevance(relevance)
+        added = completed.relevance.without(keyframe.relevance.roi)
         if not added.roi.any():
-            self._keyframes.replace_keyframe(completed)
+            self._keyframes.replace(completed, None)
             return 0
-        self._keyframes.set_evaluated(completed, self._window_view)
-        add_roi_evidence(self._table, keyframe.frame, relevance, added)
+        self._keyframes.replace_relevance(completed, self._window_view)
+        add_roi_evidence(self._table, keyframe.frame, completed.relevance, added)
         seeds = self._seeder.seed_roi(keyframe.frame, added, self._table.means_m[self._table.active])
         return self._insert(Seeds(seeds, Gaussians.empty(), keyframe.anchor))
 
@@ -260,7 +260,7 @@ class GaussianMapper:
 
     def mark_unavailable(self, keyframe: Keyframe) -> None:
         """Mark a keyframe as evaluated without a result: it shows no ROI and adds no evidence."""
-        self._keyframes.set_evaluated(replace(keyframe, evaluated=True), self._window_view)
+        self._keyframes.replace_relevance(replace(keyframe, evaluated=True), self._window_view)
 
     def without(self, pixels: Bool[ndarray, "h w"], frame: Frame) -> Frame:
         """Return the frame without depth in these pixels, and with the map's colours, so that nothing is seeded there.
@@ -284,8 +284,9 @@ class GaussianMapper:
             frame=self.without(moved, keyframe.frame),
             recorded=recorded,
             relevance=keyframe.relevance.without(moved),
+            hidden=moved if keyframe.hidden is None else keyframe.hidden | moved,
         )
-        self._keyframes.exchange(keyframe, hidden, self._window_view)
+        self._keyframes.replace(hidden, self._window_view)
 
     def render_view(self, frame: Frame) -> RenderedView | None:
         """Return alpha and depth of the map from a frame's pose; None if the map is empty."""
@@ -392,7 +393,7 @@ class GaussianMapper:
             if not scheduler.has_time_for(Stage.KEYFRAME_REFINEMENT):
                 return
             with scheduler.timing(Stage.KEYFRAME_REFINEMENT):
-                self._keyframes.replace_view(self._window_view(self._refiner.refine_keyframe(keyframe)))
+                self._keyframes.replace(self._refiner.refine_keyframe(keyframe), self._window_view)
 
     def _close_loop(
         self, prior: Frame, keyframe: Keyframe, scheduler: StageScheduler

@@ -20,13 +20,13 @@ from jaxtyping import Bool, Float32, UInt32
 from numpy import ndarray
 
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import FrameId
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
 from gausslite.mapping.density import densify, prune
 from gausslite.mapping.keyframes import WindowView
 from gausslite.mapping.settings import ActivePhase, MapperSettings, SaturationSettings
 from gausslite.mapping.splat_table import SplatTable
-from gausslite.mapping.view_rotation import ViewRotation, view_id
+from gausslite.mapping.view_rotation import ViewRotation
 from gausslite.render.rasterizer import AdamSettings, Rasterizer, Subset, UpdateCounter
 
 _HORIZON_VISITS = 32
@@ -63,11 +63,11 @@ class RegionSaturation:
         share = (settings.improving - self._improvement) / (settings.improving - settings.saturated)
         return min(max(share, 0.0), 1.0) * settings.max_released
 
-    def observe(self, recorded: Frame, loss: float) -> None:
-        """Compare the loss of an active iteration with the previous one on the view of this recorded frame."""
+    def observe(self, frame: FrameId, loss: float) -> None:
+        """Compare the loss of an active iteration with the previous one on the view of this frame."""
         if not 0.0 < loss < math.inf:
             return
-        view = view_id(recorded)
+        view = frame.number
         previous = self._last_loss.pop(view, None)
         self._last_loss[view] = loss
         if len(self._last_loss) > _MAX_VIEWS:
@@ -372,11 +372,10 @@ class Trainer:
         """
         for _ in range(_HALF_SIZE_VIEWS):
             view = next(turns)
-            image, adam = view.half_view, self._half_size_adam
-            if image is None:
-                image, adam = view.training_view, self._adam
+            half_size = view.half_view is not None
+            image, adam = (view.half_view, self._half_size_adam) if half_size else (view.training_view, self._adam)
             self._rasterizer.step(*binding.tables, image, view.T_camera_world, self._loss, adam)
-            if image is view.training_view:
+            if not half_size:
                 break
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
@@ -392,7 +391,7 @@ class Trainer:
             update_counter=binding.kappa_counter,
         )
         if self._saturation.enabled:
-            self._saturation.observe(view.keyframe.as_recorded, report.loss)
+            self._saturation.observe(view.keyframe.frame.id, report.loss)
 
     def _update_ema(self) -> None:
         if self._settings.optimization.ema_updates > 0:

@@ -6,24 +6,16 @@ frames, whose Gaussians need training most (bench/results).
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.frame import Frame
 from gausslite.domain.state import State, get_array
 from gausslite.mapping.keyframes import WindowView
 
 _MAX_VIEWS = 256
 """Views whose last visit is kept, those visited last."""
-
-
-def view_id(recorded: Frame) -> int:
-    """Return a number that identifies a recorded frame also after a restart, without its time: clocks may restart."""
-    pose = zlib.crc32(np.ascontiguousarray(recorded.T_world_camera).tobytes())
-    return (recorded.index & 0x7FFFFFFF) << 32 | pose
 
 
 class ViewRotation:
@@ -34,7 +26,7 @@ class ViewRotation:
 
     def turns(self, views: Sequence[WindowView]) -> Iterator[WindowView]:
         """Yield these views, which are given oldest first, in turn and without end; each counts as visited."""
-        ids = [view_id(view.keyframe.as_recorded) for view in views]
+        ids = [view.keyframe.frame.id.number for view in views]
         last_visit = {view: place for place, view in enumerate(self._visited)}
         order = sorted(range(len(views)), key=lambda i: (last_visit.get(ids[i], -1), -i))
         while order:

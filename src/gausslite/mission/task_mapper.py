@@ -37,6 +37,7 @@ from gausslite.render.rasterizer import Rendering
 
 TRACKING_LOST: Final = "tracking is lost: the frame agrees with no part of the map"
 REPEATED: Final = "the colour image is the one before, although the pose moved"
+MOVING: Final = "everything moves"
 _LEAST_MOTION_M, _LEAST_MOTION_DEG = 0.02, 1.0
 """An image that is repeated at a pose within these is of a robot at rest."""
 _NS_PER_S = 1e9
@@ -246,18 +247,19 @@ class TaskMapper:
     def process(self, frame: Frame, waited_s: float = 0.0) -> FrameOutcome:
         """Process one frame and return its outcome; waited_s is its time in the queue.
 
-        A frame with a defect is skipped, and one whose pose is not found by tracking.
+        A frame with a defect is skipped, one whose pose is not found by tracking, and one in which everything moves.
         """
         self._scheduler.begin(waited_s)
         repeats = self._last_image.is_repeated_by(frame)
         if defect := frame.defect or (REPEATED if repeats else ""):
-            self._defects.setdefault(defect, frame.index)
-            return self._skip(frame, defect)
+            return self._skip_defect(frame, defect)
         odometry, tracked = frame, self._track(frame)
         if tracked is None:
             return self._skip(frame, TRACKING_LOST)
         frame = tracked if self._tracker is not None else self._mapper.corrected(frame)
         frame = self._without_moving(frame)
+        if frame.defect:
+            return self._skip_defect(frame, MOVING)
         view = self._render(frame)
         estimate = self._estimate_relevance(frame, view)
         self._detected = estimate.detected or self._detected
@@ -321,6 +323,11 @@ class TaskMapper:
                 self._mapper.hide(moved, keyframes[chosen], [*frames[:chosen], *later])
         moving = moving_pixels(frame, frames)
         return self._mapper.without(moving, frame) if moving.any() else frame
+
+    def _skip_defect(self, frame: Frame, defect: str) -> FrameOutcome:
+        """Return the outcome of a frame with a defect, and note the first one."""
+        self._defects.setdefault(defect, frame.index)
+        return self._skip(frame, defect)
 
     def _skip(self, frame: Frame, reason: str) -> FrameOutcome:
         """Return the outcome of a frame that is not mapped."""

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from gausslite.domain.errors import InvalidInputError
-from gausslite.domain.frame import Frame
+from gausslite.domain.frame import Frame, FrameId
 from gausslite.domain.objects import NounReport, ObjectLandmark, match_warnings
 from gausslite.domain.relevance import NO_TARGET, DetectedImage, Detection, PointM, Region, RelevanceMap
 from gausslite.domain.state import State
@@ -29,7 +29,7 @@ from gausslite.perception.supporting_surface import nouns_known_by_height
 class DelayedRelevance:
     """The relevance of an earlier frame, from a detection that finished lag_frames frames after that frame."""
 
-    frame: Frame
+    frame: FrameId
     relevance: RelevanceMap
     lag_frames: int
 
@@ -226,7 +226,7 @@ class AsyncRelevanceEstimator(DetectingEstimator):
         self._skipped_keyframes = 0
         self._running: tuple[_Keyframe, Future[list[Detection]]] | None = None
         self._queued: _Keyframe | None = None
-        self._past_detection: tuple[Frame, Future[list[Detection]]] | None = None
+        self._past_detection: tuple[FrameId, Future[list[Detection]]] | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -252,8 +252,8 @@ class AsyncRelevanceEstimator(DetectingEstimator):
 
         Raises the detector's exceptions once; the next call starts the detection again.
         """
-        if self._past_detection is None or self._past_detection[0] is not frame:
-            self._past_detection = frame, self._executor.submit(self._detector.detect, frame, self._graph.queries)
+        if self._past_detection is None or self._past_detection[0] != frame.id:
+            self._past_detection = frame.id, self._executor.submit(self._detector.detect, frame, self._graph.queries)
         _, future = self._past_detection
         if not future.done():
             return None
@@ -267,7 +267,7 @@ class AsyncRelevanceEstimator(DetectingEstimator):
         (keyframe, future), self._running = self._running, None
         detections = future.result()
         relevance = self._tracker.integrate(keyframe.frame, keyframe.depth_m, detections)
-        delayed = DelayedRelevance(keyframe.frame, relevance, self._frames - keyframe.number)
+        delayed = DelayedRelevance(keyframe.frame.id, relevance, self._frames - keyframe.number)
         return delayed, DetectedImage.of(keyframe.frame, detections)
 
 

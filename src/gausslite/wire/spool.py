@@ -16,17 +16,18 @@ from __future__ import annotations
 
 import heapq
 import json
+import math
 import os
 import secrets
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -52,21 +53,16 @@ class SpooledKeyframe:
     data: bytes
     enqueue_count: int = 0
 
-    @property
-    def value_per_byte(self) -> float:
-        """The order of sending."""
-        return self.value / len(self.data)
-
 
 _WIRE_BYTES_PER_GAUSSIAN, _WIRE_BYTES_PER_VOXEL = 20, 20
 _MAX_INTEGER = (1 << 63) - 1
-_Row = tuple[int, int, int, int, bytes, float]
+_SLICE = 500
+"""Pending voxels that are compared while the lock is held: about a millisecond."""
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS voxel_updates (
     key INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, purpose INTEGER NOT NULL, kappa_sum INTEGER NOT NULL,
     count INTEGER NOT NULL, gaussians BLOB NOT NULL, pending INTEGER NOT NULL, sent_kappa INTEGER NOT NULL,
     sends INTEGER NOT NULL DEFAULT 0, acknowledged_seq INTEGER);
-CREATE INDEX IF NOT EXISTS voxel_updates_pending ON voxel_updates (pending) WHERE pending = 1;
 CREATE TABLE IF NOT EXISTS keyframes (
     frame_index INTEGER PRIMARY KEY, enqueue_count INTEGER NOT NULL, value REAL NOT NULL, coverage BLOB NOT NULL,
     data BLOB NOT NULL, pending INTEGER NOT NULL);
@@ -79,22 +75,41 @@ ON CONFLICT (key) DO UPDATE SET enqueue_count = enqueue_count + 1, purpose = exc
     kappa_sum = excluded.kappa_sum, count = excluded.count, gaussians = excluded.gaussians, pending = 1
 WHERE kappa_sum != excluded.kappa_sum OR gaussians != excluded.gaussians
 """
-_SELECT_DUE = f"""
-SELECT key, enqueue_count, kappa_sum, count, gaussians,
-    abs(kappa_sum - sent_kappa) / ({_WIRE_BYTES_PER_VOXEL}.0 + {_WIRE_BYTES_PER_GAUSSIAN}.0 * count) AS value_per_byte
-FROM voxel_updates
-WHERE pending = 1 AND purpose = ?
-    AND (sent_kappa < 0 OR count = 0 OR kappa_sum <= 0.75 * sent_kappa
-        OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1) * (1 << min(max(sends, 1) - 1, 2)))
-ORDER BY value_per_byte DESC, key
-"""  # noqa: S608 - two constants of this file
+# a byte's value with the opposite sign, so that value and key ascend together
+_SORTED = f"""
+ALTER TABLE voxel_updates ADD COLUMN place REAL AS
+    (-abs(kappa_sum - sent_kappa) / ({_WIRE_BYTES_PER_VOXEL}.0 + {_WIRE_BYTES_PER_GAUSSIAN}.0 * count)) VIRTUAL;
+CREATE INDEX voxel_updates_by_value ON voxel_updates (purpose, place, key) WHERE pending = 1;
+DROP INDEX IF EXISTS voxel_updates_pending;
+"""
+_SELECT_SLICE = f"""
+SELECT place, key, {_WIRE_BYTES_PER_VOXEL} + {_WIRE_BYTES_PER_GAUSSIAN} * count,
+    sent_kappa < 0 OR count = 0 OR kappa_sum <= 0.75 * sent_kappa
+        OR abs(kappa_sum - sent_kappa) >= ? * max(sent_kappa, 1) * (1 << min(max(sends, 1) - 1, 2))
+FROM voxel_updates WHERE pending = 1 AND purpose = ? AND place %s ORDER BY place, key LIMIT {_SLICE}
+"""  # noqa: S608 - constants of this file
+_SELECT_EQUAL, _SELECT_NEXT = (_SELECT_SLICE % condition for condition in ("= ? AND key > ?", "> ?"))
+_SELECT_PENDING = """
+SELECT key, enqueue_count, kappa_sum, count, gaussians FROM voxel_updates WHERE key = ? AND pending = 1
+"""
 _ENQUEUE_KEYFRAME = """
 INSERT INTO keyframes VALUES (?, 1, ?, ?, ?, 1)
 ON CONFLICT (frame_index) DO UPDATE SET enqueue_count = enqueue_count + 1, value = excluded.value,
     coverage = excluded.coverage, data = excluded.data, pending = 1
 """
 _SELECT_KEYFRAMES = "SELECT frame_index, value, coverage, data, enqueue_count FROM keyframes"
-_PENDING_KEYFRAMES = f"{_SELECT_KEYFRAMES} WHERE pending = 1 ORDER BY value / length(data) DESC, frame_index"
+_DUE_KEYFRAMES = """
+SELECT -value / length(data), frame_index, length(data) FROM keyframes WHERE pending = 1 ORDER BY 1, 2
+"""
+
+
+class _Due(NamedTuple):
+    """A pending voxel or keyframe in the order of sending, with its size on the wire."""
+
+    place: float
+    key: int
+    size_bytes: int
+    is_keyframe: bool = False
 
 
 class Purpose(IntEnum):
@@ -157,7 +172,7 @@ class Spool:
 
     def _add_new_columns(self) -> None:
         """Bring the tables of an earlier version up to date."""
-        columns = [row[1] for row in self._database.execute("PRAGMA table_info (voxel_updates)")]
+        columns = [row[1] for row in self._database.execute("PRAGMA table_xinfo (voxel_updates)")]
         if "sends" not in columns:
             self._database.execute("ALTER TABLE voxel_updates ADD COLUMN sends INTEGER NOT NULL DEFAULT 0")
         if "acknowledged_seq" not in columns:
@@ -166,6 +181,8 @@ class Spool:
             self._database.execute(f"UPDATE voxel_updates SET acknowledged_seq = ({acknowledged})")  # noqa: S608
             self._database.execute("DROP TABLE sent_updates")
             self._database.commit()
+        if "place" not in columns:
+            self._database.executescript(_SORTED)
 
     def enqueue(self, batch: VoxelBatch, purpose: Purpose) -> None:
         """Replace the stored updates of these voxels; an update equal to the stored one changes nothing."""
@@ -194,16 +211,15 @@ class Spool:
         A voxel sent once is due if its Σkappa has changed by the share resend_threshold of the sent value; twice: by
         double the share; more often: by four times the share. Voxels of the handover follow when nothing else is due.
         """
-        with self._transaction():
-            due = _by_value(self._due(Purpose.ROI, resend_threshold), self._select_keyframes(_PENDING_KEYFRAMES))
-            if chosen := _take(due, max_bytes):
-                return SpoolRound(
-                    _to_batch(Purpose.ROI, [item for item in chosen if isinstance(item, tuple)]),
-                    tuple(item for item in chosen if isinstance(item, SpooledKeyframe)),
-                )
-            if rows := _take(self._due(Purpose.HANDOVER, resend_threshold), max_bytes):
-                return SpoolRound(_to_batch(Purpose.HANDOVER, rows), ())
-        return None
+        due = heapq.merge(self._due_voxels(Purpose.ROI, resend_threshold), self._due_keyframes(), key=_place)
+        purpose, chosen = Purpose.ROI, _take(due, max_bytes)
+        if not chosen:
+            purpose, chosen = Purpose.HANDOVER, _take(self._due_voxels(Purpose.HANDOVER, resend_threshold), max_bytes)
+        if not chosen:
+            return None
+        rows = self._rows(_SELECT_PENDING, sorted({item.key for item in chosen if not item.is_keyframe}))
+        keyframes = self._rows(f"{_SELECT_KEYFRAMES} WHERE frame_index = ?", [i.key for i in chosen if i.is_keyframe])
+        return SpoolRound(_to_batch(purpose, rows), tuple(SpooledKeyframe(*row) for row in keyframes))
 
     def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
         """Store a selected keyframe as pending, and delete the one that it replaces in the selection."""
@@ -228,7 +244,8 @@ class Spool:
     def keyframes(self) -> list[SpooledKeyframe]:
         """Return all keyframes, in the order of their indices."""
         with self._transaction():
-            return list(self._select_keyframes(f"{_SELECT_KEYFRAMES} ORDER BY frame_index"))
+            rows = self._database.execute(f"{_SELECT_KEYFRAMES} ORDER BY frame_index")
+            return [SpooledKeyframe(*row) for row in rows]
 
     def keyframe_indices(self) -> tuple[int, ...]:
         """Return the indices of all keyframes, ascending."""
@@ -305,11 +322,31 @@ class Spool:
         with self._lock:
             self._database.close()
 
-    def _due(self, purpose: Purpose, resend_threshold: float) -> Iterator[_Row]:
-        return iter(self._database.execute(_SELECT_DUE, (int(purpose), resend_threshold)))
+    def _due_voxels(self, purpose: Purpose, resend_threshold: float) -> Iterator[_Due]:
+        """Yield the due voxels, those of the highest value first. Between two slices, others may use the spool."""
+        parameters = resend_threshold, int(purpose)
+        place, key = -math.inf, 0
+        while True:
+            with self._transaction():
+                rows = self._database.execute(_SELECT_EQUAL, (*parameters, place, key)).fetchall()
+                rows = rows or self._database.execute(_SELECT_NEXT, (*parameters, place)).fetchall()
+            if not rows:
+                return
+            for place, key, size_bytes, is_due in rows:
+                if is_due:
+                    yield _Due(place, key, size_bytes)
 
-    def _select_keyframes(self, query: str) -> Iterator[SpooledKeyframe]:
-        return (SpooledKeyframe(*row) for row in self._database.execute(query))
+    def _due_keyframes(self) -> list[_Due]:
+        with self._transaction():
+            return [_Due(*row, is_keyframe=True) for row in self._database.execute(_DUE_KEYFRAMES)]
+
+    def _rows(self, query: str, keys: Sequence[int]) -> list[tuple[Any, ...]]:
+        """Return the row of each key that has one, read in slices."""
+        rows = []
+        for start in range(0, len(keys), _SLICE):
+            with self._transaction():
+                rows += [row for key in keys[start : start + _SLICE] for row in self._database.execute(query, (key,))]
+        return rows
 
     def _acknowledged(self) -> tuple[Int64[ndarray, " k"], Int64[ndarray, " k"]]:
         """Return the voxels whose updates the server has stored, and the sequence numbers of these."""
@@ -342,22 +379,8 @@ class Spool:
         return None if row is None else row[0]
 
 
-_Due = TypeVar("_Due", bound="_Row | SpooledKeyframe")
-
-
-def _by_value(*sources: Iterable[_Row | SpooledKeyframe]) -> Iterator[_Row | SpooledKeyframe]:
-    """Merge sources that are sorted by value per byte, the highest first."""
-    return heapq.merge(*sources, key=_value_per_byte, reverse=True)
-
-
-def _value_per_byte(due: _Row | SpooledKeyframe) -> float:
-    return due.value_per_byte if isinstance(due, SpooledKeyframe) else due[5]
-
-
-def _size(due: _Row | SpooledKeyframe) -> int:
-    if isinstance(due, SpooledKeyframe):
-        return len(due.data)
-    return _WIRE_BYTES_PER_VOXEL + due[3] * _WIRE_BYTES_PER_GAUSSIAN
+def _place(due: _Due) -> float:
+    return due.place
 
 
 def _take(due: Iterable[_Due], max_bytes: int) -> list[_Due]:
@@ -365,17 +388,17 @@ def _take(due: Iterable[_Due], max_bytes: int) -> list[_Due]:
     chosen: list[_Due] = []
     spent = 0
     for item in due:
-        spent += _size(item)
+        spent += item.size_bytes
         if chosen and spent > max_bytes:
             break
         chosen.append(item)
     return chosen
 
 
-def _to_batch(purpose: Purpose, rows: list[_Row]) -> SpoolBatch | None:
+def _to_batch(purpose: Purpose, rows: list[tuple[Any, ...]]) -> SpoolBatch | None:
     if not rows:
         return None
-    keys, enqueue_counts, sums, counts, blobs, _ = zip(*sorted(rows), strict=True)
+    keys, enqueue_counts, sums, counts, blobs = zip(*rows, strict=True)
     batch = VoxelBatch(
         np.array(keys, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32), from_bytes(b"".join(blobs))
     )

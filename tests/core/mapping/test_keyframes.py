@@ -117,7 +117,7 @@ def test_a_policy_without_a_task_keeps_as_many_views() -> None:
         store.add(window_view(Keyframe(wall_frame(index), RelevanceMap.empty(48, 64)), rasterizer, settings))
     kept = [view.keyframe.frame.index for view in store.window]
     assert kept == [view.keyframe.frame.index for view in stored(settings, 40).window]
-    store.replace_view(store.window[0])
+    store.replace(store.window[0].keyframe, lambda keyframe: window_view(keyframe, rasterizer, settings))
     assert [view.keyframe.frame.index for view in store.window] == kept
     assert not uniform_policy().components.follow_task
     assert Components(sb=False, roi=False, sis=False).follow_task
@@ -128,8 +128,29 @@ def test_a_view_whose_revised_relevance_is_empty_counts_among_the_others() -> No
     store = stored(settings, 3)
     wrong = store.window[0].keyframe
     assert wrong.frame.index == 1
-    store.replace_view(window_view(Keyframe(wrong.frame, RelevanceMap.empty(48, 64)), rasterizer, settings))
+    empty = Keyframe(wrong.frame, RelevanceMap.empty(48, 64))
+    store.replace(empty, lambda keyframe: window_view(keyframe, rasterizer, settings))
     assert [(view.keyframe.frame.index, view.shows_roi) for view in store.window] == [(1, False), (2, True), (0, True)]
+
+
+def test_a_keyframe_is_found_by_its_frame_after_a_loop_has_moved_it() -> None:
+    store = stored(KeyframeSettings(every=2), 3)
+    T = np.eye(4)
+    T[0, 3] = 0.5
+    store.move(np.stack([T, T]))
+    moved = store.get(wall_frame(1).id)
+    assert moved is not None
+    assert moved.frame.T_world_camera[0, 3] == 0.5
+    assert store.get(wall_frame(9).id) is None
+
+
+def test_a_frame_that_comes_again_replaces_its_keyframe() -> None:
+    store, rasterizer, settings = stored(KeyframeSettings(every=1), 3), CpuRasterizer(threads=1), KeyframeSettings()
+    again = wall_frame(1, shift_m=0.3)
+    store.add(window_view(Keyframe(again, middle_relevance(again)), rasterizer, settings))
+    assert [keyframe.frame.index for keyframe in store.buffer] == [0, 2, 1]
+    assert [view.keyframe.frame.index for view in store.window] == [0, 2, 1]
+    assert store.buffer[-1].frame.T_world_camera[0, 3] == 0.3
 
 
 def test_tiles_cover_the_region_and_its_margin() -> None:

@@ -14,7 +14,7 @@ from gausslite.domain.frame import Frame
 from gausslite.mapping.moving import moving_pixels
 from gausslite.mission.build import build_mapper, region_estimator
 from gausslite.mission.settings import MissionSettings
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_mapper import MOVING, TaskMapper
 from gausslite_sim.home_settings import HomeSettings
 
 CAMERA = Camera(160.0, 160.0, 80.0, 60.0, 160, 120)
@@ -63,6 +63,21 @@ def test_a_thing_that_moves_is_neither_seeded_nor_kept_in_a_keyframe() -> None:
     for keyframe in mapper.keyframes():
         depths_m = keyframe.frame.depth_m[32:88]
         assert np.count_nonzero((depths_m > 0) & (depths_m < WALL_M)) < 0.01 * depths_m.size
+
+
+def test_a_frame_in_which_everything_moves_is_skipped() -> None:
+    mapper = TaskMapper(
+        region_estimator([]), build_mapper(MissionSettings(max_gaussians=3000, iterations=1, threads=1))
+    )
+    for index in range(6):
+        mapper.process(frame(index, None))
+    close = frame(6, None)
+    close.depth_m[:] = BOX_M
+    outcome = mapper.process(close)
+    assert (outcome.skipped, outcome.iterations) == (MOVING, 0)
+    assert len(mapper.poses) == 6
+    assert mapper.notes == ("frames are skipped in which everything moves; the first one is 6",)
+    assert mapper.process(frame(7, None)).skipped is None
 
 
 def test_a_keyframe_loses_what_has_left_its_place_later() -> None:

@@ -25,7 +25,7 @@ def visited(improvement: float, visits: int = 60, settings: SaturationSettings =
     saturation = RegionSaturation(settings)
     for visit in range(visits):
         for view in range(2):
-            saturation.observe(wall_frame(view), (1 + view) * math.exp(-improvement * visit))
+            saturation.observe(wall_frame(view).id, (1 + view) * math.exp(-improvement * visit))
     return saturation
 
 
@@ -44,7 +44,7 @@ def test_views_are_compared_with_themselves_alone() -> None:
     assert visited(0.0).released_share == SETTINGS.max_released
     saturation = RegionSaturation(SETTINGS)
     for index in range(60):  # each view once: nothing to compare with
-        saturation.observe(wall_frame(index), 1.0)
+        saturation.observe(wall_frame(index).id, 1.0)
     assert saturation.released_share == 0.0
 
 
@@ -66,7 +66,7 @@ def test_a_new_task_starts_again() -> None:
 def test_a_loss_without_logarithm_is_ignored(loss: float) -> None:
     saturation = visited(0.08)
     before = saturation.released_share
-    saturation.observe(wall_frame(0), loss)
+    saturation.observe(wall_frame(0).id, loss)
     assert saturation.released_share == before
 
 
@@ -75,7 +75,7 @@ def test_a_restored_measurement_continues_alike() -> None:
     saturation.releases_next()
     restored.restore(saturation.state())
     for each in (saturation, restored):
-        each.observe(wall_frame(1), 0.5)
+        each.observe(wall_frame(1).id, 0.5)
     assert restored.released_share == saturation.released_share
     assert [restored.releases_next() for _ in range(9)] == [saturation.releases_next() for _ in range(9)]
 

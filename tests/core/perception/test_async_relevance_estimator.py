@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def test_delayed_relevance_refers_to_its_keyframe() -> None:
     assert delayed is not None
     assert detected is not None
     assert (detected.index, detected.rgb is frames[0].rgb, len(detected.boxes)) == (0, True, 1)
-    assert delayed.frame is frames[0]
+    assert delayed.frame == frames[0].id
     assert delayed.lag_frames == 3
     synchronous = TaskRelevanceEstimator(TASK, RegionDetector({"mug": MUG})).estimate(frames[0])
     np.testing.assert_array_equal(delayed.relevance.target, synchronous.relevance.target)
@@ -153,7 +154,7 @@ def test_a_keyframe_in_the_window_receives_its_delayed_relevance() -> None:
     assert mapper.gaussians().kappa.any()
 
 
-def test_a_frame_outside_the_window_is_not_revised() -> None:
+def test_a_keyframe_outside_the_window_receives_its_delayed_relevance() -> None:
     executor = DeferredExecutor()
     mapper = GaussianMapper(
         MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=1, window=2, long_term_keyframes=0)),
@@ -164,4 +165,33 @@ def test_a_frame_outside_the_window_is_not_revised() -> None:
         loop.process(frame_at(index))
     executor.run_next()
     assert loop.process(frame_at(4)).detection_lag_frames == 4
-    assert not mapper.keyframes()[0].relevance.roi.any()
+    assert mapper.keyframes()[0].relevance.roi.any()
+
+
+def test_a_detection_on_a_past_frame_continues_when_its_pose_and_pixels_change() -> None:
+    executor, earlier = DeferredExecutor(), frame_at(0)
+    estimator = async_estimator(executor)
+    assert estimator.evaluate_past(earlier) is None
+    executor.run_next()
+    relevance = estimator.evaluate_past(replace(earlier, T_world_camera=frame_at(1).T_world_camera))
+    assert relevance is not None
+    assert not executor.jobs
+
+
+def test_a_keyframe_of_which_a_part_has_moved_receives_its_delayed_relevance_without_it() -> None:
+    executor = DeferredExecutor()
+    settings = MapperSettings(max_gaussians=500, keyframes=KeyframeSettings(every=1))
+    loop = TaskMapper(async_estimator(executor, every=99), GaussianMapper(settings, CpuRasterizer(threads=1)))
+    close = frame_at(0)
+    # a thing before the left half, gone in the next frames
+    close.depth_m[:, :32] = 1.0
+    for frame in (close, *map(frame_at, range(1, 20))):
+        loop.process(frame)
+    first = loop.keyframes()[0]
+    assert first.hidden is not None
+    assert not first.relevance.roi.any()
+    executor.run_next()
+    loop.process(frame_at(20))
+    relevance = loop.keyframes()[0].relevance
+    assert relevance.roi.any()
+    assert not relevance.roi[first.hidden].any()

@@ -45,7 +45,7 @@ from gausslite_agent.background import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.settings import AgentSettings, parse_arguments
-from gausslite_agent.state import MissionState
+from gausslite_agent.state import EndRequest, MissionState
 from gausslite_language.rules import RuleParser
 
 MUG = BallRegion((0.0, 0.0, 1.2), 0.2)
@@ -181,6 +181,19 @@ def test_a_stopped_mission_writes_its_current_map(tmp_path: Path) -> None:
         assert mission.state == MissionState.ENDED
     assert json.loads((tmp_path / "report.json").read_text())["frames"] < 10_000
     assert len(read_ply(tmp_path / "map.ply")) > 0
+
+
+def test_a_request_ends_a_replay_with_its_handover(tmp_path: Path) -> None:
+    options, wall = settings(tmp_path), Wall(10_000)
+    with fusion_server() as fusion, agent_mission(options, fusion.client.address) as (mission, _):
+        thread = threading.Thread(target=mission.run, args=(stream_of(wall, options),))
+        thread.start()
+        assert wall.reached.wait(20)
+        summary = mission.end(EndRequest(handover=True, drain_s=20.0))
+        thread.join(20)
+        [stored] = fusion.client.status().agents
+    assert stored.handover_bytes > 0
+    assert stored.gaussians == summary.gaussians
 
 
 def test_errors_of_task_source_and_disk_are_raised(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
-from gausslite_agent.servicer import NewestTask
+from gausslite_agent.servicer import MapChangeLog, NewestTask
 from gausslite_language.rules import RuleParser
 
 
@@ -391,6 +391,29 @@ def test_a_watcher_follows_the_map() -> None:
         follow(resumed, seen)
         resumed.close()
         assert seen == counts_now(a.worker)
+
+
+def test_frames_are_mapped_while_the_map_is_compared_for_a_watcher(monkeypatch: pytest.MonkeyPatch) -> None:
+    update, begun, continued = MapChangeLog.update, threading.Event(), threading.Event()
+
+    def slow_update(*arguments: object) -> None:
+        begun.set()
+        assert continued.wait(60)
+        update(*arguments)
+
+    monkeypatch.setattr(MapChangeLog, "update", slow_update)
+    with agent() as a:
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(0)]))
+        watching = a.stub.WatchMap(pb.WatchMapRequest())
+        try:
+            assert begun.wait(20)
+            [answer] = a.stub.IngestFrames(iter([pb.IngestFramesRequest(frame=convert.frame_to_message(frame(1)))]), timeout=20)
+            assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
+        finally:
+            continued.set()
+        assert len(next(watching).block.subset) > 0
+        watching.cancel()
 
 
 def test_a_watcher_may_select_a_box_or_the_tasks_region() -> None:

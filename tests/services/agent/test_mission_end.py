@@ -15,6 +15,7 @@ import pytest
 from agent_running import TASK, agent
 from fusion_running import GRID, frame, fusion_server, red_frame
 from tiny_yolo import write_tiny_yolo
+from waiting import wait_until
 
 from gausslite.codec.ply import read_ply
 from gausslite.domain.errors import InvalidInputError, MismatchError
@@ -104,6 +105,22 @@ def test_two_callers_get_the_result_of_one_end() -> None:
             thread.join(30)
     assert len(answers) == 2
     assert answers[0] == answers[1]
+
+
+def test_calls_that_wait_for_the_end_leave_threads_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    drained = threading.Event()
+    monkeypatch.setattr(Uplink, "drain", lambda *_: drained.wait(60))
+    with fusion_server() as fusion, linked(fusion.client.address) as link, agent(uplink=link, queue_frames=100) as a:
+        a.client.assign_task(TASK)
+        list(a.client.ingest([frame(0)]))
+        # more than asyncio's own threads
+        calls = [a.stub.EndMission.future(pb.EndMissionRequest()) for _ in range(48)]
+        try:
+            wait_until(lambda: state_name(a.client) == "DRAINING")
+            assert a.stub.GetCameraView(pb.GetCameraViewRequest(), timeout=20).frame_index == 0
+        finally:
+            drained.set()
+        assert len({call.result(20).SerializeToString(deterministic=True) for call in calls}) == 1
 
 
 def test_a_phase_that_cannot_follow_is_refused() -> None:
