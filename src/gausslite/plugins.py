@@ -10,7 +10,7 @@ import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, distributions
 from typing import Any, Final
 
 from gausslite.domain.errors import MissingPluginError
@@ -84,13 +84,19 @@ def installed(group: Group) -> Iterator[tuple[str, Any]]:
             yield name, plugin
 
 
-@functools.cache
-def _all_entry_points() -> EntryPoints:
-    return entry_points()
-
-
 def _registered(group: Group) -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in _all_entry_points().select(group=group)}
+    return _entry_points().get(group, {})
+
+
+@functools.cache
+def _entry_points() -> dict[str, dict[str, EntryPoint]]:
+    """Return the entry points of all groups; one pass over what is installed takes some 30 ms."""
+    found: dict[str, dict[str, EntryPoint]] = {}
+    for distribution in distributions():
+        for entry in distribution.entry_points:
+            # of a distribution that is installed twice, the first one on the path counts
+            found.setdefault(entry.group, {}).setdefault(entry.name, entry)
+    return found
 
 
 def _import(entry: EntryPoint, purpose: str) -> Any:
