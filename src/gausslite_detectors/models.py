@@ -12,9 +12,6 @@ from gausslite.perception.depth_segmenter import DepthSegmenter
 from gausslite.perception.detector import BoxDetector, Detector, SegmentedDetector, Segmenter
 from gausslite.perception.detector_file import DetectorOptions
 from gausslite_detectors.model_file import OpenModel, open_model, sha256_of
-from gausslite_detectors.open_vocabulary import GroundingDino, PromptedYolo, is_grounding, is_prompted
-from gausslite_detectors.text_features import TOKEN_ID_TYPES, BertTokenizer, open_phrase_vectors
-from gausslite_detectors.yolo import ClassAgnosticSegmenter, load_yolo
 from gausslite_detectors.yolo_network import MASK_COEFFICIENTS, YoloNetwork, class_names
 
 
@@ -133,6 +130,9 @@ class ModelFamily(StrEnum):
 
 def identify_family(model: OpenModel) -> ModelFamily:
     """Return the family of an open model. Raises ModelFileError if it is not supported."""
+    from gausslite_detectors.open_vocabulary import is_grounding, is_prompted
+    from gausslite_detectors.text_features import TOKEN_ID_TYPES
+
     inputs, outputs = model.session.get_inputs(), model.session.get_outputs()
     if is_grounding([port.name for port in inputs], [output.name for output in outputs]):
         return ModelFamily.GROUNDING_DINO
@@ -167,6 +167,8 @@ class OnnxReader:
         segmenter: "yolo", "depth", or the path of a FastSAM file. None selects the detector's own masks if it has them,
         else "depth". vocabulary: the text encoder's, by default next to the detector.
         """
+        from gausslite_detectors.yolo import load_yolo
+
         model = open_model(path, options.threads)
         family = identify_family(model)
         if family is ModelFamily.TEXT_ENCODER:
@@ -192,6 +194,9 @@ READER: Final = OnnxReader()
 
 def _open_vocabulary(model: OpenModel, family: ModelFamily, options: DetectorOptions) -> BoxDetector:
     """Return a detector of any phrase with its text encoder."""
+    from gausslite_detectors.open_vocabulary import GroundingDino, PromptedYolo
+    from gausslite_detectors.text_features import BertTokenizer, open_phrase_vectors
+
     folder = model.path.parent
     if family is ModelFamily.GROUNDING_DINO:
         return GroundingDino(model, BertTokenizer(options.vocabulary or folder / VOCABULARY))
@@ -202,6 +207,8 @@ def _segmenters(name: str, threads: int | None) -> tuple[Segmenter, ...]:
     """Return the depth segmenter, after that of a file for boxes in which its network finds nothing."""
     if name == DEPTH:
         return (DepthSegmenter(),)
+    from gausslite_detectors.yolo import ClassAgnosticSegmenter
+
     network = YoloNetwork(open_model(Path(name), threads))
     if not network.has_masks:
         raise InvalidInputError(f"segmenter: expected depth or a FastSAM file, got {name}, which finds boxes only")

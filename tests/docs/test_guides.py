@@ -36,6 +36,7 @@ def own_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_home(folder / "my_recording")
     writer = ROOT / "tools" / "write_bag.py"
     subprocess.run([sys.executable, writer, folder / "my_recording", folder / "run1.mcap"], check=True)
+    shutil.copytree(ROOT / "examples" / "colour_detector", folder / "colour_detector")
     write_tiny_yolo(folder / "yolo11n-seg.onnx", ("cup", "chair"), [(32, 32, 20, 20, 0, 0.9)])
     return folder
 

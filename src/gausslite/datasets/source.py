@@ -160,7 +160,7 @@ class SourceReader(Protocol):
         """True if an address without a name is of this kind, by the names of files."""
         ...
 
-    def open(self, address: str, up_axis: UpAxis | None, require_poses: bool) -> Source:
+    def open(self, address: str, up_axis: UpAxis | None, require_poses: bool, /) -> Source:
         """Return the sequence, as `open_source` does. Raises DatasetError, PoseError, InvalidInputError."""
         ...
 
