@@ -99,6 +99,9 @@ class _Sequence(WrappedSource):
     def __init__(self, regions: Mapping[str, Region]) -> None:
         self._regions = regions
 
+    def frame(self, i: int, size: tuple[int, int] | None = None) -> Frame:
+        raise NotImplementedError
+
     def regions(self) -> Mapping[str, Region]:
         return self._regions
 
