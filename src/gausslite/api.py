@@ -256,7 +256,7 @@ def render_view(
 ) -> RenderedImage:
     """Render a map from a camera pose (x right, y down, z forward; metres).
 
-    backend: "cpu", "cuda", "reference", or "auto" for cuda if it can run, else cpu. threads: of the cpu backend; None
+    backend: "cpu", "cuda", or "auto" for cuda if it can run, else cpu. threads: of the cpu backend; None
     uses all. Raises PoseError, ShapeError, KernelError.
     """
     pose = np.asarray(T_world_camera, np.float64)

@@ -24,8 +24,9 @@ from packaging.utils import canonicalize_name
 import gausslite
 from gausslite.config.values import read_path
 from gausslite.domain.errors import KernelError, ModelFileError
+from gausslite.plugins import Group, find
 from gausslite.process import printable
-from gausslite.render.choose import DRIVER_DEVICES, choose_with_reason
+from gausslite.render.choose import choose_with_reason
 from gausslite.render.cpu import SIMD_VARIABLE, choose_simd, choose_threads, cores_allowed, usable_simd
 from gausslite.wire.channel import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
 from gausslite_detectors.model_file import require_listed_checksum
@@ -257,7 +258,7 @@ def rasterizer_checks() -> Iterator[Check]:
     yield _threads()
     yield _gpu()
     torch = _installed_version(Requirement("torch"))
-    yield Check("torch", "ok", torch or "not installed; only the backends cuda and reference need it")
+    yield Check("torch", "ok", torch or "not installed; only the backend cuda needs it")
     yield _backend()
 
 
@@ -294,7 +295,8 @@ def _gpu() -> Check:
         models += [line.partition(":")[2].strip() for line in lines if line.startswith("Model:")]
     if models:
         return Check("gpu", "ok", ", ".join(models))
-    if any(device.exists() for device in DRIVER_DEVICES):
+    cuda = find(Group.RASTERIZERS, "cuda")
+    if cuda is not None and cuda.has_driver():
         return Check("gpu", "ok", "an NVIDIA driver is present; it does not state the model")
     return Check("gpu", "ok", "no NVIDIA GPU; none is needed")
 

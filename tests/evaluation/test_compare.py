@@ -19,8 +19,9 @@ from gausslite_evaluation.views import HeldOutView, MapViewer
 
 pytest.importorskip("torch", reason="the reference rasterizer needs torch, which is not installed")
 
+from torch_oracle.rasterizer import ReferenceRasterizer
+
 from gausslite.render.rasterizer import Rendering
-from gausslite.render.reference import ReferenceRasterizer
 
 CAMERA = Camera(40.0, 40.0, 20.0, 16.0, 40, 32)
 
