@@ -42,10 +42,10 @@ from gausslite.mission.settings import (
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.pointing import region_at, region_on_image
 from gausslite.perception.questions import Z_UP, Answer, answer
+from gausslite.render.map_viewer import view_map
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
 from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
-from gausslite_evaluation.views import view_map
 
 __all__ = [
     "AgentClient",

@@ -27,6 +27,8 @@ from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writa
 from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
 from gausslite.process import Sibling, import_extra, print_message, sibling, size_text
+from gausslite.render.choose import choose_rasterizer
+from gausslite.render.map_viewer import MapViewer
 from gausslite.wire.channel import MAX_PORT
 from gausslite_demo.services import (
     HOME_SIZE,
@@ -43,7 +45,7 @@ from gausslite_demo.services import (
     watch_missions,
 )
 from gausslite_evaluation.compare import MAP_PURPOSES, TeamScores, score_team, team_sentence
-from gausslite_evaluation.views import HeldOutView, view_maps
+from gausslite_evaluation.views import HeldOutView
 
 _AGENT_KEYS = ("frames", "hz", "gaussians", "roi_share", "bytes_sent", "map_shared_percent")
 
@@ -241,7 +243,8 @@ def _score(
     views = [HeldOutView.of(frame, regions) for frame in frames if not frame.defect]
     if not views and corrupt.first_error is not None:
         raise corrupt.first_error
-    viewers = view_maps({name: read_ply(path, print_message) for name, path in maps.items()}, options.threads)
+    rasterizer = choose_rasterizer(threads=options.threads)
+    viewers = {name: MapViewer(read_ply(path, print_message), rasterizer) for name, path in maps.items()}
     return score_team(viewers, views, scenario.task_regions, scenario.fit_views)
 
 

@@ -12,7 +12,7 @@ from gausslite.config.command_parser import bounded
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mission.results import as_text, map_file, prepare_folder, read_report, require_absent
 from gausslite.process import print_message, size_text
-from gausslite_evaluation.views import view_map
+from gausslite.render.map_viewer import view_map
 from gausslite_export.formats import FORMATS, ExportSettings, MapContent, read_map, upright
 from gausslite_export.occupancy import OccupancySettings
 

@@ -13,9 +13,10 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import BallRegion
+from gausslite.render.map_viewer import MapViewer
 from gausslite_evaluation.compare import MAX_PSNR_DB, average, evaluate, score_view
 from gausslite_evaluation.metrics import psnr
-from gausslite_evaluation.views import HeldOutView, MapViewer
+from gausslite_evaluation.views import HeldOutView
 
 pytest.importorskip("torch", reason="the reference rasterizer needs torch, which is not installed")
 

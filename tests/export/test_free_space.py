@@ -11,7 +11,7 @@ import yaml
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
-from gausslite_evaluation.views import view_map
+from gausslite.render.map_viewer import view_map
 from gausslite_export.formats import FORMATS, ExportSettings, MapContent
 from gausslite_export.occupancy import OccupancySettings, occupied_voxels
 
