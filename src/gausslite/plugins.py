@@ -16,6 +16,7 @@ from typing import Any, Final
 from gausslite.domain.errors import MissingPluginError
 
 DEFAULT: Final = "default"
+_BESIDE_THE_CORE: Final = "gausslite_"
 
 
 class Group(StrEnum):
@@ -83,6 +84,12 @@ def installed(group: Group) -> Iterator[tuple[str, Any]]:
         plugin = find(group, name)
         if plugin is not None:
             yield name, plugin
+
+
+def absent_package(error: ModuleNotFoundError) -> str | None:
+    """Return the package beside the core that an import has not found; None for another module."""
+    package = (error.name or "").partition(".")[0]
+    return package if package.startswith(_BESIDE_THE_CORE) else None
 
 
 def _registered(group: Group) -> dict[str, EntryPoint]:

@@ -14,9 +14,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -29,8 +30,9 @@ from gausslite.process import printable
 from gausslite.render.choose import choose_with_reason
 from gausslite.render.cpu import SIMD_VARIABLE, choose_simd, choose_threads, cores_allowed, usable_simd
 from gausslite.wire.channel import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
-from gausslite_detectors.model_file import require_listed_checksum
-from gausslite_detectors.models import CATALOGUE, ModelEntry, detector_advice, inspect
+
+if TYPE_CHECKING:
+    from gausslite_detectors.models import ModelEntry
 
 Status = Literal["ok", "warning", "error"]
 
@@ -229,6 +231,11 @@ def _level(amount: float, low: float, too_low: float) -> Status:
 
 def model_checks(folder: Path) -> Iterator[Check]:
     """Yield a check for each model file in the folder, ONNX files read completely and opened, or one for none."""
+    if find_spec("gausslite_detectors") is None:
+        yield Check("models", "ok", "the package gausslite_detectors, which reads them, is not installed")
+        return
+    from gausslite_detectors.models import CATALOGUE, detector_advice
+
     present = [entry for entry in CATALOGUE if (folder / entry.file_name).exists()]
     for entry in present:
         yield _model(entry, folder / entry.file_name)
@@ -238,6 +245,9 @@ def model_checks(folder: Path) -> Iterator[Check]:
 
 
 def _model(entry: ModelEntry, path: Path) -> Check:
+    from gausslite_detectors.model_file import require_listed_checksum
+    from gausslite_detectors.models import inspect
+
     name = f"model {entry.name}"
     try:
         if path.suffix == ".onnx":

@@ -32,6 +32,7 @@ from gausslite.mission.results import MAP, REPORT_PAGE, require_absent
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import SceneInfo
 from gausslite.wire.clients import AgentClient, Export, FusionClient, is_done
+from gausslite_language.rules import RuleParser
 
 STORE = "fusion.sqlite"
 """Name of the fusion server's file; it holds the voxels of all agents."""
@@ -158,8 +159,6 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
     """Return the objects of --objects or, without them, the targets of the tasks. Raises InvalidInputError."""
     if options.objects:
         return dict(zip(options.objects, choose_regions(regions, options.objects), strict=True))
-    from gausslite_language.rules import RuleParser
-
     targets = {t for task in (options.task_a, options.task_b) for t in RuleParser().parse(task).targets}
     chosen = SceneInfo(regions=regions).regions_of(targets)
     if not chosen:
@@ -172,8 +171,6 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
 
 def _task_regions(agents: Sequence[AgentPlan], regions: Mapping[str, Region]) -> dict[str, Sequence[Region]]:
     """Return the scored regions of each agent's task; none of them if one has none, as figures would be missing."""
-    from gausslite_language.rules import RuleParser
-
     scene = SceneInfo(regions=regions)
     found = {agent.agent_id: scene.regions_of(set(RuleParser().parse(agent.task).targets)) for agent in agents}
     return {name: list(own.values()) for name, own in found.items()} if all(found.values()) else {}

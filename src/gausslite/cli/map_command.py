@@ -63,8 +63,9 @@ from gausslite.mission.settings import (
     TaskSettings,
 )
 from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome, TaskMapper
+from gausslite.pages import load_pages
 from gausslite.plugins import Group, load
-from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, Sibling, import_extra, print_message, sibling
+from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, print_message
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.channel import MAX_PORT
@@ -168,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results. Errors in the options are raised before the work starts."""
     require_name("world-frame", options.world_frame or "")
     if options.view is not None:
-        import_extra("viser", "view", "--view")
+        load_pages().require_usable("--view")
     if options.prior is not None and options.resume is not None:
         raise InvalidInputError("--prior: expected it without resume; a saved run knows the map that it continues")
     require_other_folder(options.prior, options.out)
@@ -403,9 +404,7 @@ def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextMana
     """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
     if port is None:
         return nullcontext(lambda _outcome: None)
-    page: AbstractContextManager[Callable[[FrameOutcome], None]]
-    page = sibling(Sibling.MISSION_PAGE).mission_view(port, mission)
-    return page
+    return load_pages().mission_view(port, mission)
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult, has_preview: bool) -> str:
