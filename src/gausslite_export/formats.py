@@ -182,8 +182,9 @@ def _nav2(path: Path, content: MapContent, settings: ExportSettings) -> None:
 
 
 def _occupancy(settings: ExportSettings) -> OccupancySettings:
-    given = {"voxel_m": settings.voxel_m, "min_opacity": settings.min_opacity}
-    return OccupancySettings(**{name: value for name, value in given.items() if value is not None})
+    default = OccupancySettings()
+    min_opacity = default.min_opacity if settings.min_opacity is None else settings.min_opacity
+    return OccupancySettings(settings.voxel_m or default.voxel_m, min_opacity)
 
 
 def _free(content: MapContent, settings: ExportSettings, occupancy: OccupancySettings) -> Int64[ndarray, "f 3"]:
