@@ -186,8 +186,12 @@ POINTS = Format(".xyz", "points as text", write_points, uses=("voxel",))
 
 
 def test_a_format_of_another_package_is_listed_and_written(results, tmp_path, capsys, monkeypatch):
-    entries = [*entry_points(), EntryPoint("points", f"{__name__}:POINTS", Group.EXPORTERS)]
-    monkeypatch.setattr("gausslite.plugins.entry_points", lambda **wanted: EntryPoints(entries).select(**wanted))
+    theirs = EntryPoints([EntryPoint("points", f"{__name__}:POINTS", Group.EXPORTERS)])
+
+    def all_entry_points(**wanted):
+        return EntryPoints([*entry_points(**wanted), *theirs.select(**wanted)])
+
+    monkeypatch.setattr("gausslite.plugins.entry_points", all_entry_points)
     out = tmp_path / "map.xyz"
     assert main(["export", str(results), "--to", "points", "--voxel", "1", "--out", str(out)]) == 0
     assert "points as text" in capsys.readouterr().out
