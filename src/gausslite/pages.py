@@ -48,7 +48,7 @@ class Pages(Protocol):
         ...
 
 
-def load_pages() -> Pages:
-    """Return the installed pages. Raises MissingPluginError."""
-    pages: Pages = load(Group.PAGES)
+def load_pages(purpose: str) -> Pages:
+    """Return the installed pages. Raises MissingPluginError, which names the option or file that needs them."""
+    pages: Pages = load(Group.PAGES, purpose=purpose)
     return pages

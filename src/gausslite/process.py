@@ -1,4 +1,4 @@
-"""What every program of the package shares: messages, signals, optional packages, and packages beside the core.
+"""What every program of the package shares: messages, signals and optional packages.
 
 Programs call `run_program`, which handles signals before the other imports: those take most of the start-up. The
 handler is our own and not the system's default, because process 1 of a container ignores signals without a handler.

@@ -172,7 +172,7 @@ def configure(parser: CommandParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the services, score the maps, write and print the report. Returns the exit code."""
     signal.signal(signal.SIGHUP, signal.default_int_handler)
-    pages = load_pages()
+    pages = load_pages(REPORT_PAGE)
     _require_valid(options, pages)
     require_name("world-frame", options.world_frame or "")
     if not options.overwrite:

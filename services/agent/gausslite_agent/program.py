@@ -186,7 +186,7 @@ async def _serve(settings: AgentSettings) -> int:
         mission = AgentMission(settings, worker, first_parser, resumed, can_find, source_notes)
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
         if settings.view is not None:
-            page = load_pages().service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls)
+            page = load_pages("--view").service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls)
             stack.enter_context(page)
         run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)

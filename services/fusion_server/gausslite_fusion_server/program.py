@@ -134,7 +134,7 @@ async def _serve(settings: ServerSettings) -> None:
 def _page(settings: ServerSettings) -> AbstractContextManager[None]:
     if settings.view is None:
         return nullcontext()
-    return load_pages().service_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
+    return load_pages("--view").service_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
 
 
 async def _serve_mission(settings: ServerSettings, engine: FusionEngine, servicer: FusionServicer) -> None:

@@ -169,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results. Errors in the options are raised before the work starts."""
     require_name("world-frame", options.world_frame or "")
     if options.view is not None:
-        load_pages().require_usable("--view")
+        load_pages("--view").require_usable("--view")
     if options.prior is not None and options.resume is not None:
         raise InvalidInputError("--prior: expected it without resume; a saved run knows the map that it continues")
     require_other_folder(options.prior, options.out)
@@ -404,7 +404,7 @@ def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextMana
     """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
     if port is None:
         return nullcontext(lambda _outcome: None)
-    return load_pages().mission_view(port, mission)
+    return load_pages("--view").mission_view(port, mission)
 
 
 def _interrupted_text(options: argparse.Namespace, result: MissionResult, has_preview: bool) -> str:
@@ -421,9 +421,9 @@ def _interrupted_text(options: argparse.Namespace, result: MissionResult, has_pr
 def _evaluator() -> tuple[Evaluator | None, tuple[str, ...]]:
     """Return what scores the run; None and a note without its package."""
     try:
-        evaluator: Evaluator = load(Group.EVALUATORS)
+        evaluator: Evaluator = load(Group.EVALUATORS, purpose=f"no scores and no {PREVIEW}")
     except MissingPluginError as error:
-        return None, (f"no scores and no {PREVIEW}: {error}",)
+        return None, (str(error),)
     return evaluator, ()
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
-from typing import Any
 
 import pytest
+from plugin_entries import register
 
 from gausslite.cli.main import main
 from gausslite.plugins import Group
@@ -15,12 +14,8 @@ from gausslite.plugins import Group
 
 @pytest.fixture(autouse=True)
 def without_evaluators_and_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    absent = (Group.EVALUATORS, Group.PAGES)
-
-    def others(**wanted: Any) -> EntryPoints:
-        return EntryPoints(entry for entry in entry_points(**wanted) if entry.group not in absent)
-
-    monkeypatch.setattr("gausslite.plugins.entry_points", others)
+    for group in (Group.EVALUATORS, Group.PAGES):
+        register(monkeypatch, group)
 
 
 def arguments(out: Path) -> list[str]:
@@ -31,7 +26,7 @@ def test_the_map_is_written_and_one_line_says_what_is_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments(tmp_path)) == 0
-    missing = "no scores and no preview.png: default: expected a plug-in of gausslite.evaluators; installed are: none"
+    missing = "no scores and no preview.png: expected a plug-in of gausslite.evaluators; installed are: none"
     printed = capsys.readouterr().out
     assert missing in printed
     assert "in the same folder shows it" not in printed
@@ -45,6 +40,6 @@ def test_the_map_is_written_and_one_line_says_what_is_left_out(
 def test_a_page_is_refused_before_the_first_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*arguments(tmp_path / "out"), "--set", "view=0"]) == 2
     assert capsys.readouterr().err.splitlines() == [
-        "gausslite: default: expected a plug-in of gausslite.pages; installed are: none"
+        "gausslite: --view: expected a plug-in of gausslite.pages; installed are: none"
     ]
     assert not (tmp_path / "out").exists()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from importlib.metadata import EntryPoint, EntryPoints
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from plugin_entries import register
 
 from gausslite.domain.errors import KernelError, MissingPluginError
 from gausslite.plugins import Group
@@ -64,16 +64,11 @@ class _Backend:
 WORKING, BLOCKED = _Backend(None), _Backend("no device")
 
 
-def register(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
-    found = EntryPoints(EntryPoint(name, value, Group.RASTERIZERS) for name, value in entries.items())
-    monkeypatch.setattr("gausslite.plugins.entry_points", lambda **wanted: found.select(**wanted))
-
-
 def test_a_registered_backend_has_a_name_and_is_preferred_where_it_can_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    register(monkeypatch, theirs=f"{__name__}:WORKING")
+    register(monkeypatch, Group.RASTERIZERS, theirs=f"{__name__}:WORKING")
     assert backends() == ("auto", "cpu", "theirs")
     assert choose_with_reason()[1] == "a device are usable"
-    register(monkeypatch, theirs=f"{__name__}:BLOCKED")
+    register(monkeypatch, Group.RASTERIZERS, theirs=f"{__name__}:BLOCKED")
     rasterizer, reason = choose_with_reason(threads=1)
     assert (rasterizer.name, reason) == ("cpu", "no device")
 
@@ -81,7 +76,7 @@ def test_a_registered_backend_has_a_name_and_is_preferred_where_it_can_run(monke
 def test_auto_leaves_out_a_backend_whose_package_is_absent_and_its_name_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    register(monkeypatch, cuda="gausslite_absent.backend:CUDA")
+    register(monkeypatch, Group.RASTERIZERS, cuda="gausslite_absent.backend:CUDA")
     assert choose_with_reason(threads=1)[1] == "no other backend is installed"
     with pytest.raises(MissingPluginError, match="cuda: needs the package gausslite_absent, which is not installed"):
         choose_rasterizer("cuda")
