@@ -42,10 +42,10 @@ from gausslite.mission.settings import (
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.pointing import region_at, region_on_image
 from gausslite.perception.questions import Z_UP, Answer, answer
+from gausslite.render.map_viewer import view_map
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
 from gausslite.wire.robot import AgentLink
 from gausslite.wire.security import Tls
-from gausslite_evaluation.views import view_map
 
 __all__ = [
     "AgentClient",
@@ -256,7 +256,7 @@ def render_view(
 ) -> RenderedImage:
     """Render a map from a camera pose (x right, y down, z forward; metres).
 
-    backend: "cpu", "cuda", "reference", or "auto" for cuda if it can run, else cpu. threads: of the cpu backend; None
+    backend: "cpu", "cuda", or "auto" for cuda if it can run, else cpu. threads: of the cpu backend; None
     uses all. Raises PoseError, ShapeError, KernelError.
     """
     pose = np.asarray(T_world_camera, np.float64)

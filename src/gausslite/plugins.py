@@ -16,6 +16,7 @@ from typing import Any, Final
 from gausslite.domain.errors import MissingPluginError
 
 DEFAULT: Final = "default"
+_BESIDE_THE_CORE: Final = "gausslite_"
 
 
 class Group(StrEnum):
@@ -32,6 +33,7 @@ class Group(StrEnum):
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
+    EVALUATORS = "gausslite.evaluators"  # says how well a finished run fits its images
     EXPORTERS = "gausslite.exporters"  # writes a map for another tool; the name is the format
     PAGES = "gausslite.pages"  # shows a run or a service in the browser
 
@@ -82,6 +84,12 @@ def installed(group: Group) -> Iterator[tuple[str, Any]]:
         plugin = find(group, name)
         if plugin is not None:
             yield name, plugin
+
+
+def absent_package(error: ModuleNotFoundError) -> str | None:
+    """Return the package beside the core that an import has not found; None for another module."""
+    package = (error.name or "").partition(".")[0]
+    return package if package.startswith(_BESIDE_THE_CORE) else None
 
 
 def _registered(group: Group) -> dict[str, EntryPoint]:

@@ -1,4 +1,4 @@
-"""What every program of the package shares: messages, signals, optional packages, and packages beside the core.
+"""What every program of the package shares: messages, signals and optional packages.
 
 Programs call `run_program`, which handles signals before the other imports: those take most of the start-up. The
 handler is our own and not the system's default, because process 1 of a container ignores signals without a handler.
@@ -10,7 +10,6 @@ import os
 import signal
 import sys
 import threading
-from enum import StrEnum
 from importlib import import_module
 from types import FrameType, TracebackType
 from typing import Any, Final
@@ -155,22 +154,6 @@ class DeferredInterrupt:
         if self.pending_exception is not None:
             raise self.pending_exception
         self.pending_exception = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
-
-
-class Sibling(StrEnum):
-    """A module of a package beside the core; what the core calls in it."""
-
-    PAGES = "gausslite_view.pages"
-    """live_page, service_page."""
-    MISSION_PAGE = "gausslite_view.mission_view"
-    """mission_view."""
-    REPORT = "gausslite_view.report"
-    """write_report."""
-
-
-def sibling(module: Sibling) -> Any:
-    """Return the module; it is loaded at the first call."""
-    return import_module(module)
 
 
 _SWITCHES = {"ORT_DISABLE_TELEMETRY": "1"}

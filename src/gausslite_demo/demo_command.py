@@ -26,7 +26,10 @@ from gausslite.mission.build import chosen_detector
 from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
 from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
-from gausslite.process import Sibling, import_extra, print_message, sibling, size_text
+from gausslite.pages import Pages, load_pages
+from gausslite.process import print_message, size_text
+from gausslite.render.choose import choose_rasterizer
+from gausslite.render.map_viewer import MapViewer
 from gausslite.wire.channel import MAX_PORT
 from gausslite_demo.services import (
     HOME_SIZE,
@@ -43,7 +46,7 @@ from gausslite_demo.services import (
     watch_missions,
 )
 from gausslite_evaluation.compare import MAP_PURPOSES, TeamScores, score_team, team_sentence
-from gausslite_evaluation.views import HeldOutView, view_maps
+from gausslite_evaluation.views import HeldOutView
 
 _AGENT_KEYS = ("frames", "hz", "gaussians", "roi_share", "bytes_sent", "map_shared_percent")
 
@@ -169,7 +172,8 @@ def configure(parser: CommandParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the services, score the maps, write and print the report. Returns the exit code."""
     signal.signal(signal.SIGHUP, signal.default_int_handler)
-    _require_valid(options)
+    pages = load_pages(REPORT_PAGE)
+    _require_valid(options, pages)
     require_name("world-frame", options.world_frame or "")
     if not options.overwrite:
         require_no_demo(options.out)
@@ -179,7 +183,7 @@ def run(options: argparse.Namespace) -> int:
     plan = DemoPlan(scenario.agents, shared, options.voxel_size.size_m, options.refine_iterations, options.seed)
     remove_results(options.out)
     with running_services(plan, options.out.absolute()) as services:
-        with _page(options, services.fusion_address):
+        with _page(options, pages, services.fusion_address):
             watch_missions(services)
         maps = collect_maps(services, options.out)
         agents = agent_reports(scenario.agents, options.out)
@@ -189,26 +193,26 @@ def run(options: argparse.Namespace) -> int:
     write_json(options.out / "report.json", report)
     _write_pictures(options.out / "pictures", result)
     print(report_tables(agents, result, scenario.fit_views))
-    sibling(Sibling.REPORT).write_report(options.out / REPORT_PAGE, [options.out])
+    pages.write_report(options.out / REPORT_PAGE, [options.out])
     print(f"maps and pictures are in {options.out}; {options.out / REPORT_PAGE} shows them")
     return 0
 
 
 @contextmanager
-def _page(options: argparse.Namespace, fusion_address: str) -> Iterator[None]:
+def _page(options: argparse.Namespace, pages: Pages, fusion_address: str) -> Iterator[None]:
     """Show the fusion server on a page, if view is set."""
     if options.view is None:
         yield
         return
-    with sibling(Sibling.PAGES).live_page(options.view, fusion_address, is_agent=False) as url:
+    with pages.live_page(options.view, fusion_address, is_agent=False) as url:
         print_message(f"the page is at {url}")
         yield
 
 
-def _require_valid(options: argparse.Namespace) -> None:
+def _require_valid(options: argparse.Namespace, pages: Pages) -> None:
     """Raise InvalidInputError or ModelFileError for options that every agent would refuse later."""
     if options.view is not None:
-        import_extra("viser", "view", "--view")
+        pages.require_usable("--view")
     chosen_detector(build(PerceptionSettings, options).at_rate(mission_settings(options)))
 
 
@@ -241,7 +245,8 @@ def _score(
     views = [HeldOutView.of(frame, regions) for frame in frames if not frame.defect]
     if not views and corrupt.first_error is not None:
         raise corrupt.first_error
-    viewers = view_maps({name: read_ply(path, print_message) for name, path in maps.items()}, options.threads)
+    rasterizer = choose_rasterizer(threads=options.threads)
+    viewers = {name: MapViewer(read_ply(path, print_message), rasterizer) for name, path in maps.items()}
     return score_team(viewers, views, scenario.task_regions, scenario.fit_views)
 
 

@@ -14,9 +14,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution, version
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -24,12 +25,14 @@ from packaging.utils import canonicalize_name
 import gausslite
 from gausslite.config.values import read_path
 from gausslite.domain.errors import KernelError, ModelFileError
+from gausslite.plugins import Group, find
 from gausslite.process import printable
-from gausslite.render.choose import DRIVER_DEVICES, choose_with_reason
+from gausslite.render.choose import choose_with_reason
 from gausslite.render.cpu import SIMD_VARIABLE, choose_simd, choose_threads, cores_allowed, usable_simd
 from gausslite.wire.channel import AGENT_ADDRESS, FUSION_ADDRESS, PARSER_ADDRESS
-from gausslite_detectors.model_file import require_listed_checksum
-from gausslite_detectors.models import CATALOGUE, ModelEntry, detector_advice, inspect
+
+if TYPE_CHECKING:
+    from gausslite_detectors.models import ModelEntry
 
 Status = Literal["ok", "warning", "error"]
 
@@ -228,6 +231,11 @@ def _level(amount: float, low: float, too_low: float) -> Status:
 
 def model_checks(folder: Path) -> Iterator[Check]:
     """Yield a check for each model file in the folder, ONNX files read completely and opened, or one for none."""
+    if find_spec("gausslite_detectors") is None:
+        yield Check("models", "ok", "the package gausslite_detectors, which reads them, is not installed")
+        return
+    from gausslite_detectors.models import CATALOGUE, detector_advice
+
     present = [entry for entry in CATALOGUE if (folder / entry.file_name).exists()]
     for entry in present:
         yield _model(entry, folder / entry.file_name)
@@ -237,6 +245,9 @@ def model_checks(folder: Path) -> Iterator[Check]:
 
 
 def _model(entry: ModelEntry, path: Path) -> Check:
+    from gausslite_detectors.model_file import require_listed_checksum
+    from gausslite_detectors.models import inspect
+
     name = f"model {entry.name}"
     try:
         if path.suffix == ".onnx":
@@ -257,7 +268,7 @@ def rasterizer_checks() -> Iterator[Check]:
     yield _threads()
     yield _gpu()
     torch = _installed_version(Requirement("torch"))
-    yield Check("torch", "ok", torch or "not installed; only the backends cuda and reference need it")
+    yield Check("torch", "ok", torch or "not installed; only the backend cuda needs it")
     yield _backend()
 
 
@@ -294,7 +305,8 @@ def _gpu() -> Check:
         models += [line.partition(":")[2].strip() for line in lines if line.startswith("Model:")]
     if models:
         return Check("gpu", "ok", ", ".join(models))
-    if any(device.exists() for device in DRIVER_DEVICES):
+    cuda = find(Group.RASTERIZERS, "cuda")
+    if cuda is not None and cuda.has_driver():
         return Check("gpu", "ok", "an NVIDIA driver is present; it does not state the model")
     return Check("gpu", "ok", "no NVIDIA GPU; none is needed")
 

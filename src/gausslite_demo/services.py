@@ -22,6 +22,7 @@ from gausslite.cli.source_options import calibrate_with_messages, open_recorded,
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import Plain, to_toml
 from gausslite.config.program import without_options
+from gausslite.config.task_parser import DefaultParser
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.source import HeldOutSplit, frame_size, select_frames
@@ -158,9 +159,7 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
     """Return the objects of --objects or, without them, the targets of the tasks. Raises InvalidInputError."""
     if options.objects:
         return dict(zip(options.objects, choose_regions(regions, options.objects), strict=True))
-    from gausslite_language.rules import RuleParser
-
-    targets = {t for task in (options.task_a, options.task_b) for t in RuleParser().parse(task).targets}
+    targets = {t for task in (options.task_a, options.task_b) for t in DefaultParser().parse(task).targets}
     chosen = SceneInfo(regions=regions).regions_of(targets)
     if not chosen:
         raise InvalidInputError(
@@ -172,10 +171,8 @@ def _scored_regions(options: argparse.Namespace, regions: Mapping[str, Region]) 
 
 def _task_regions(agents: Sequence[AgentPlan], regions: Mapping[str, Region]) -> dict[str, Sequence[Region]]:
     """Return the scored regions of each agent's task; none of them if one has none, as figures would be missing."""
-    from gausslite_language.rules import RuleParser
-
     scene = SceneInfo(regions=regions)
-    found = {agent.agent_id: scene.regions_of(set(RuleParser().parse(agent.task).targets)) for agent in agents}
+    found = {agent.agent_id: scene.regions_of(set(DefaultParser().parse(agent.task).targets)) for agent in agents}
     return {name: list(own.values()) for name, own in found.items()} if all(found.values()) else {}
 
 

@@ -31,7 +31,7 @@ from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import CorrectionTrack
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.domain.relevance import Region
+from gausslite.domain.relevance import MIN_ROI_PIXELS, Region
 from gausslite.mission.results import (
     EVALUATION,
     MAP_TO_ODOM,
@@ -48,10 +48,11 @@ from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import PoseMode, SourceSettings, TaskSettings
 from gausslite.process import print_message
 from gausslite.render.cpu import MAX_THREADS, choose_threads
+from gausslite.render.map_viewer import MapViewer, view_map
 from gausslite_evaluation.compare import CorrectedScores, MapScores, ViewScore, average, score_view
 from gausslite_evaluation.lpips import LPIPS_HELP, NAME, Lpips, load_lpips
 from gausslite_evaluation.pictures import comparison_sheet
-from gausslite_evaluation.views import MIN_ROI_PIXELS, HeldOutView, MapViewer, render_fitted, view_map
+from gausslite_evaluation.views import HeldOutView, render_fitted
 
 _PICTURES = 8
 

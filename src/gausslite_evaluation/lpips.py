@@ -6,14 +6,16 @@ The user provides the network as an ONNX file: two images (n, 3, h, w) in [-1, 1
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped
 from numpy import ndarray
 
 from gausslite.domain.errors import ModelFileError, ShapeError
-from gausslite_detectors.model_file import OpenModel, open_model, run_once
+
+if TYPE_CHECKING:
+    from gausslite_detectors.model_file import OpenModel
 
 NAME: Final = "LPIPS (SqueezeNet)"
 LPIPS_HELP: Final = f"ONNX file of {NAME}, which is scored too (default: not computed)"
@@ -48,12 +50,16 @@ class Lpips:
             rows, columns = _interval(np.any(mask, axis=1)), _interval(np.any(mask, axis=0))
             first = np.where(mask, first, second)[..., rows, columns]
             second = second[..., rows, columns]
+        from gausslite_detectors.model_file import run_once
+
         outputs = run_once(self._model, dict(zip(self._names, (first, second), strict=True)))
         return float(np.mean(outputs[0]))
 
 
 def load_lpips(path: Path, threads: int | None = None) -> Lpips:
     """Return LPIPS of a file, checked on two known images. Raises ModelFileError, which names the file."""
+    from gausslite_detectors.model_file import open_model
+
     model = open_model(path, threads)
     if (count := len(model.session.get_inputs())) != 2:
         raise ModelFileError(f"model {path}: expected {NAME} with two images as inputs, got {count}")

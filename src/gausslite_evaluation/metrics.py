@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
@@ -12,6 +11,7 @@ from numpy import ndarray
 from gausslite.domain.arrays import require_array
 from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.domain.pose import Trajectory
+from gausslite.mission.evaluation import TrajectoryError
 
 SSIM_WINDOW_PX = 11
 SSIM_SIGMA_PX = 1.5
@@ -173,15 +173,6 @@ def _inside(mask: Bool[ndarray, "h w"] | None, image: Shaped[ndarray, "h w 3"]) 
 
 _MAX_TIME_GAP_S = 1e-3
 _MIN_POSES = 3
-
-
-@dataclass(frozen=True, slots=True)
-class TrajectoryError:
-    """ATE over the poses at common times (Sturm et al. 2012), aligned in SE(3), without scale."""
-
-    rmse_m: float
-    max_m: float
-    poses: int
 
 
 def trajectory_error(estimated: Trajectory, reference: Trajectory) -> TrajectoryError | None:

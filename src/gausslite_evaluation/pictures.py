@@ -10,7 +10,9 @@ from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
 from gausslite.domain.frame import Frame
-from gausslite_evaluation.views import HeldOutView, MapViewer, largest_roi_per_segment
+from gausslite.domain.relevance import largest_roi_per_segment
+from gausslite.render.map_viewer import MapViewer
+from gausslite_evaluation.views import HeldOutView
 
 _HEADER_PX = 26
 _GAP_PX = 6

@@ -1,4 +1,4 @@
-"""Render a finished map from any pose, and score it on held-out views, also after fitting their pose and exposure.
+"""Views that no map was trained on, and their renderings after fitting pose and exposure.
 
 Poses of real cameras have errors and exposures differ between frames. Without fitting, a sharp map rendered from a
 slightly wrong pose scores below a blurred map. The raw score includes pose errors; the fitted score measures the map.
@@ -6,7 +6,7 @@ slightly wrong pose scores below a blurred map. The raw score includes pose erro
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,19 +15,14 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from gausslite.domain.arrays import require_array
-from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.frame import Frame
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.recording import HANDHELD_PRIOR, PoseExposurePrior
-from gausslite.domain.relevance import Region
+from gausslite.domain.relevance import MIN_ROI_PIXELS, Region, largest_roi_per_segment
 from gausslite.pose_fit.exposure import fit_exposure
 from gausslite.pose_fit.photometric import fit_pose
-from gausslite.render.choose import choose_rasterizer
-from gausslite.render.rasterizer import Rasterizer, Rendering, gaussians_to_rows
-
-MIN_ROI_PIXELS = 64
-"""Views with fewer region pixels are not scored inside the region."""
+from gausslite.render.map_viewer import MapViewer
+from gausslite.render.rasterizer import Rendering
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,47 +52,6 @@ class HeldOutView:
 def largest_roi_views(views: Sequence[HeldOutView], count: int) -> set[int]:
     """Return the positions of the views with the largest region in each of `count` segments of the sequence."""
     return largest_roi_per_segment([int(np.count_nonzero(view.roi)) for view in views], count)
-
-
-def largest_roi_per_segment(roi_pixels: Sequence[int], count: int) -> set[int]:
-    """Return the place of the largest region in each of `count` segments; of small ones only if all are small."""
-    if count < 1:
-        return set()
-    pixels = np.array(roi_pixels)
-    segments = [part for part in np.array_split(np.arange(len(pixels)), count) if len(part)]
-    best = {int(part[np.argmax(pixels[part])]) for part in segments}
-    return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best
-
-
-class MapViewer:
-    """Renders one map from many poses; converts it to splat rows once. It owns neither the map nor the rasterizer."""
-
-    def __init__(self, gaussians: Gaussians, rasterizer: Rasterizer) -> None:
-        self._rows = gaussians_to_rows(gaussians)
-        self._rasterizer = rasterizer
-
-    def render(
-        self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], motion: CameraMotion | None = None
-    ) -> Rendering:
-        """Return the map's rendering from this camera pose; colours are clipped to [0, 1]. Raises ShapeError."""
-        rendering = self._rasterizer.forward(self._rows, camera, inverse(T_world_camera), motion=motion)
-        # copies: a backend may reuse its images for the next rendering
-        return Rendering(np.clip(rendering.rgb, 0.0, 1.0), rendering.depth_m.copy(), rendering.alpha.copy(), None)
-
-    def render_frame(self, frame: Frame) -> Rendering:
-        """Return the map's rendering from the frame's camera pose, with the frame's motion."""
-        return self.render(frame.camera, frame.T_world_camera, frame.motion)
-
-
-def view_map(gaussians: Gaussians, backend: str = "auto", threads: int | None = None) -> MapViewer:
-    """Return a viewer with a rasterizer of its own, see `choose_rasterizer`. Raises KernelError."""
-    return MapViewer(gaussians, choose_rasterizer(backend, threads))
-
-
-def view_maps(maps: Mapping[str, Gaussians], threads: int | None = None) -> dict[str, MapViewer]:
-    """Return a viewer of each map; all of them share one rasterizer. Raises KernelError."""
-    rasterizer = choose_rasterizer(threads=threads)
-    return {name: MapViewer(gaussians, rasterizer) for name, gaussians in maps.items()}
 
 
 _ROUNDS = 4

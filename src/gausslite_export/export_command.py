@@ -10,32 +10,30 @@ from gausslite.cli.progress import progress_bar
 from gausslite.codec.run_files import KeyframeView
 from gausslite.config.command_parser import bounded
 from gausslite.domain.errors import InvalidInputError
+from gausslite.mission.exporting import ExportSettings, Format, MapContent
 from gausslite.mission.results import as_text, map_file, prepare_folder, read_report, require_absent
+from gausslite.plugins import Group, installed, load, names
 from gausslite.process import print_message, size_text
-from gausslite_evaluation.views import view_map
-from gausslite_export.formats import FORMATS, ExportSettings, MapContent, read_map, upright
+from gausslite.render.map_viewer import view_map
+from gausslite_export.formats import MESH_VOXEL_M, VIDEO_S, read_map, upright
 from gausslite_export.occupancy import OccupancySettings
 
-_MESH_VOXEL_M, _OCCUPANCY_VOXEL_M, _MIN_OPACITY, _VIDEO_S = 0.01, 0.05, 0.3, 12.0
-_FORMATS_OF = {"voxel": ("octomap", "nav2", "mesh"), "min_opacity": ("octomap", "nav2"), "seconds": ("video",)}
-"""The formats on which an option has an effect."""
+_OCCUPANCY = OccupancySettings()
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the options of `gausslite export`."""
     add = parser.add_argument
-    formats = "; ".join(
-        f"{name}: {file_format.summary} ({file_format.suffix})" for name, file_format in FORMATS.items()
-    )
+    formats = "; ".join(f"{name}: {chosen.summary} ({chosen.suffix})" for name, chosen in installed(Group.EXPORTERS))
     add("map", metavar="RUN", type=Path, help="a results folder of `gausslite map`, or a PLY file")
-    add("--to", metavar="FORMAT", choices=tuple(FORMATS), required=True, help=formats)
+    add("--to", metavar="FORMAT", choices=names(Group.EXPORTERS), required=True, help=formats)
     add("--out", metavar="FILE", type=Path, help="the file to write (default: RUN/map with the format's suffix)")
     add("--region", choices=("roi", "all"), help="only the task's region, or all (default: depends on the format)")
-    voxel_help = f"voxel size in metres (default: {_OCCUPANCY_VOXEL_M:g}; mesh: {_MESH_VOXEL_M:g})"
+    voxel_help = f"voxel size in metres (default: {_OCCUPANCY.voxel_m:g}; mesh: {MESH_VOXEL_M:g})"
     add("--voxel", metavar="M", type=bounded(float, 0.001, 10), help=voxel_help)
-    opacity_help = f"for octomap and nav2 (default: {_MIN_OPACITY:g})"
+    opacity_help = f"for octomap and nav2 (default: {_OCCUPANCY.min_opacity:g})"
     add("--min-opacity", metavar="A", type=bounded(float, 0, 1), help=opacity_help)
-    add("--seconds", metavar="S", type=bounded(float, 0.1, 600), help=f"length of a video (default: {_VIDEO_S:g})")
+    add("--seconds", metavar="S", type=bounded(float, 0.1, 600), help=f"length of a video (default: {VIDEO_S:g})")
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
@@ -43,8 +41,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read the map and write the file. Returns the exit code."""
-    _require_effect(options)
-    chosen = FORMATS[options.to]
+    chosen: Format = load(Group.EXPORTERS, options.to)
+    _require_effect(options, chosen)
     region = options.region or ("roi" if chosen.region_only else "all")
     report = read_report(options.map)
     if options.to == "json" and not report and (options.map / "report.json").exists():
@@ -57,22 +55,18 @@ def run(options: argparse.Namespace) -> int:
     content = read_map(options.map, region, report, chosen.max_extent_m)
     content = upright(content) if chosen.is_upright else content
     prepare_folder(out.absolute().parent)
-    voxel_m = options.voxel or (_MESH_VOXEL_M if options.to == "mesh" else _OCCUPANCY_VOXEL_M)
-    min_opacity = _MIN_OPACITY if options.min_opacity is None else options.min_opacity
-    occupancy = OccupancySettings(voxel_m=voxel_m, min_opacity=min_opacity)
-    seconds = options.seconds or _VIDEO_S
-    settings = ExportSettings(lambda gaussians: view_map(gaussians).render, occupancy, _with_progress, seconds)
+    settings = ExportSettings(view_map, _with_progress, options.voxel, options.min_opacity, options.seconds)
     chosen.write(out, content, settings)
-    _report(options, content, out, "of the task's region" if region == "roi" else "of the map")
+    _report(options, chosen, content, out, "of the task's region" if region == "roi" else "of the map")
     return 0
 
 
-def _report(options: argparse.Namespace, content: MapContent, out: Path, part: str) -> None:
+def _report(options: argparse.Namespace, chosen: Format, content: MapContent, out: Path, part: str) -> None:
     """Print what was written, and on stderr what was left out."""
-    chosen, size = FORMATS[options.to], out.stat().st_size
+    size = out.stat().st_size
     for note in content.notes:
         print_message(note)
-    if options.to in _FORMATS_OF["min_opacity"] and not content.views:
+    if "min_opacity" in chosen.uses and not content.views:
         print_message("free space is unknown: expected a results folder with keyframes.json, got none")
     if options.json:
         counts = {"gaussians": len(content.chosen), "left_out": content.left_out, "bytes": size}
@@ -81,12 +75,13 @@ def _report(options: argparse.Namespace, content: MapContent, out: Path, part: s
         print(f"{len(content.chosen):,} Gaussians {part} → {out} ({chosen.summary}, {size_text(size)})")
 
 
-def _require_effect(options: argparse.Namespace) -> None:
+def _require_effect(options: argparse.Namespace, chosen: Format) -> None:
     """Raise InvalidInputError for an option that the chosen format does not use."""
-    for name, formats in _FORMATS_OF.items():
-        if getattr(options, name) is not None and options.to not in formats:
-            flag = "--" + name.replace("_", "-")
-            raise InvalidInputError(f"{flag}: expected with --to {' or '.join(formats)}, got --to {options.to}")
+    for option in ("voxel", "min_opacity", "seconds"):
+        if getattr(options, option) is not None and option not in chosen.uses:
+            formats = " or ".join(name for name, each in installed(Group.EXPORTERS) if option in each.uses)
+            flag = "--" + option.replace("_", "-")
+            raise InvalidInputError(f"{flag}: expected with --to {formats}, got --to {options.to}")
 
 
 def _default_file(source: Path, suffix: str) -> Path:

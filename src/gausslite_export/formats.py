@@ -1,27 +1,29 @@
-"""The table of export formats, the content of a map that they write, and the writers of point clouds."""
+"""The formats of this package, what they write of a map, and the writers of point clouds."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Int64
 from numpy import ndarray
 
 from gausslite.codec.ply import left_out_note, read_stored_map, write_ply
-from gausslite.codec.run_files import KeyframeView, read_keyframe_views
+from gausslite.codec.run_files import read_keyframe_views
 from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of
+from gausslite.mission.exporting import MAX_EXTENT_M, ExportSettings, Format, MapContent
 from gausslite.mission.results import map_file, stated_up
 from gausslite.process import import_extra
 from gausslite_export.free_cells import free_voxels
-from gausslite_export.mesh import Render, write_mesh
+from gausslite_export.mesh import write_mesh
 from gausslite_export.occupancy import (
     NAV2_IMAGE,
     NO_VOXELS,
@@ -81,69 +83,8 @@ def write_las(path: Path, gaussians: Gaussians) -> None:
 
 
 _LEAST_TURN = 1e-6
-Progress = Callable[[Iterable[KeyframeView]], Iterable[KeyframeView]]
-MAX_EXTENT_M = 1e5
-"""Limit of the coordinates that the mapper's voxel grid of 0.1 m can hold; a file with larger ones is damaged."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapContent:
-    """A map and the other content of its results folder; `views` and `report` are empty for a single PLY file.
-
-    gaussians: the whole map. chosen: the Gaussians to write, at least one. left_out: how many Gaussians of the file are
-    in neither; notes: why, because they are no numbers, too far away or too large.
-    """
-
-    gaussians: Gaussians
-    chosen: Gaussians
-    left_out: int = 0
-    notes: tuple[str, ...] = ()
-    world_frame: str = ""
-    views: Sequence[KeyframeView] = ()
-    report: Mapping[str, object] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class ExportSettings:
-    """How to write a map.
-
-    renderer: returns a function that renders a map; all formats that use the keyframes need it. occupancy: for octomap
-    and nav2; its voxel size is also the mesh's. progress: wraps the rendered views. video_s: length of a video.
-    """
-
-    renderer: Callable[[Gaussians], Render]
-    occupancy: OccupancySettings = field(default_factory=OccupancySettings)
-    progress: Progress = iter
-    video_s: float = 12.0
-
-
-@dataclass(frozen=True, slots=True)
-class Format:
-    """A file format.
-
-    suffix: of the written file. companion: suffix of a second file with the same name. summary: one line of the help.
-    region_only: if the user selects nothing, write only the
-    Gaussians of the task's region. max_extent_m: the largest coordinate and standard deviation that the format holds.
-    is_upright: its z axis points up.
-    """
-
-    suffix: str
-    summary: str
-    write: Callable[[Path, MapContent, ExportSettings], None]
-    region_only: bool = False
-    max_extent_m: float = MAX_EXTENT_M
-    companion: str = ""
-    is_upright: bool = False
-
-    def files(self, out: Path) -> tuple[Path, ...]:
-        """Return the files written for this path. Raises InvalidInputError for the suffix of another format."""
-        suffixes = (".yaml", ".yml") if self.suffix == ".yaml" else (Path(f"x{self.suffix}").suffix,)
-        if out.suffix.lower() not in suffixes:
-            expected = " or ".join(suffixes)
-            raise InvalidInputError(
-                f"--out {out}: expected a name with the suffix {expected}, such as map{self.suffix}"
-            )
-        return (out, out.with_suffix(self.companion)) if self.companion else (out,)
+MESH_VOXEL_M, VIDEO_S = 0.01, 12.0
+"""Of a mesh and of a video, if the user sets nothing."""
 
 
 def read_map(
@@ -226,56 +167,61 @@ def _objects(path: Path, content: MapContent, _settings: ExportSettings) -> None
 
 
 def _mesh(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    render, voxel_m = settings.renderer(content.gaussians), settings.occupancy.voxel_m
+    render, voxel_m = settings.viewer(content.gaussians).render, settings.voxel_m or MESH_VOXEL_M
     write_mesh(path, content.chosen, content.views, render, voxel_m, settings.progress)
 
 
-def _free(content: MapContent, settings: ExportSettings) -> Int64[ndarray, "f 3"]:
+def _octomap(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    occupancy = _occupancy(settings)
+    write_octomap(path, content.chosen, occupancy, _free(content, settings, occupancy))
+
+
+def _nav2(path: Path, content: MapContent, settings: ExportSettings) -> None:
+    occupancy = _occupancy(settings)
+    write_nav2(path, content.chosen, occupancy, _free(content, settings, occupancy))
+
+
+def _occupancy(settings: ExportSettings) -> OccupancySettings:
+    default = OccupancySettings()
+    min_opacity = default.min_opacity if settings.min_opacity is None else settings.min_opacity
+    return OccupancySettings(settings.voxel_m or default.voxel_m, min_opacity)
+
+
+def _free(content: MapContent, settings: ExportSettings, occupancy: OccupancySettings) -> Int64[ndarray, "f 3"]:
     """Return the free voxels in the box around the chosen Gaussians; none of them holds a Gaussian of the whole map."""
     if not content.views:
         return NO_VOXELS
-    occupancy = settings.occupancy
     chosen, occupied = require_voxels(content.chosen, occupancy), occupied_voxels(content.gaussians, occupancy)
-    views, render = settings.progress(content.views), settings.renderer(content.gaussians)
+    views, render = settings.progress(content.views), settings.viewer(content.gaussians).render
     return free_voxels(views, render, chosen, occupied, occupancy.voxel_m)
 
 
 def _video(path: Path, content: MapContent, settings: ExportSettings) -> None:
-    write_video(path, content.views, settings.renderer(content.chosen), settings.video_s, settings.progress)
+    render = settings.viewer(content.chosen).render
+    write_video(path, content.views, render, settings.seconds or VIDEO_S, settings.progress)
 
 
-FORMATS: Mapping[str, Format] = MappingProxyType(
-    {
-        "ply": Format(
-            ".ply", "3D Gaussian splatting PLY", lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame)
-        ),
-        "spz": Format(
-            ".spz",
-            "compressed splats (SPZ)",
-            lambda path, map_, _: write_spz(path, map_.chosen),
-            max_extent_m=MAX_SPZ_COORDINATE_M,
-        ),
-        "splat": Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen)),
-        "gltf": Format(
-            ".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen), is_upright=True
-        ),
-        "pcd": Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen)),
-        "las": Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen)),
-        "octomap": Format(
-            ".bt",
-            "occupied and free voxels of the region",
-            lambda path, map_, settings: write_octomap(path, map_.chosen, settings.occupancy, _free(map_, settings)),
-            region_only=True,
-        ),
-        "nav2": Format(
-            ".yaml",
-            "2D grid",
-            lambda path, map_, settings: write_nav2(path, map_.chosen, settings.occupancy, _free(map_, settings)),
-            companion=NAV2_IMAGE,
-            is_upright=True,
-        ),
-        "mesh": Format(".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True),
-        "video": Format(".mp4", "fly-through along the keyframes", _video),
-        "json": Format(".json", "objects of the mission", _objects, region_only=True),
-    }
+PLY: Final = Format(
+    ".ply", "3D Gaussian splatting PLY", lambda path, map_, _: write_ply(path, map_.chosen, map_.world_frame)
 )
+SPZ: Final = Format(
+    ".spz",
+    "compressed splats (SPZ)",
+    lambda path, map_, _: write_spz(path, map_.chosen),
+    max_extent_m=MAX_SPZ_COORDINATE_M,
+)
+SPLAT: Final = Format(".splat", "splats of 32 bytes", lambda path, map_, _: write_splat(path, map_.chosen))
+GLTF: Final = Format(
+    ".glb", "KHR_gaussian_splatting", lambda path, map_, _: write_gltf(path, map_.chosen), is_upright=True
+)
+PCD: Final = Format(".pcd", "coloured points", lambda path, map_, _: write_pcd(path, map_.chosen))
+LAS: Final = Format(".las", "coloured points (LAS 1.4)", lambda path, map_, _: write_las(path, map_.chosen))
+OCTOMAP: Final = Format(
+    ".bt", "occupied and free voxels of the region", _octomap, region_only=True, uses=("voxel", "min_opacity")
+)
+NAV2: Final = Format(".yaml", "2D grid", _nav2, companion=NAV2_IMAGE, is_upright=True, uses=("voxel", "min_opacity"))
+MESH: Final = Format(
+    ".mesh.ply", "triangles of the region, from rendered depth", _mesh, region_only=True, uses=("voxel",)
+)
+VIDEO: Final = Format(".mp4", "fly-through along the keyframes", _video, uses=("seconds",))
+OBJECTS: Final = Format(".json", "objects of the mission", _objects, region_only=True)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
@@ -19,6 +18,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse, transform_points
 from gausslite.process import import_extra
+from gausslite.render.rasterizer import Rendering
 
 _TRUNCATION_VOXELS = 4.0
 _MIN_ALPHA = 0.5
@@ -28,26 +28,7 @@ _VERTEX = np.dtype([("position_m", "<f4", 3), ("rgb", "u1", 3)])
 _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 
 
-@runtime_checkable
-class MapRendering(Protocol):
-    """A rendering of the map: colours in [0, 1], opacity in [0, 1], expected depth in metres (0 where unknown)."""
-
-    @property
-    def rgb(self) -> Float32[ndarray, "h w 3"]:
-        """The colours."""
-        ...
-
-    @property
-    def alpha(self) -> Float32[ndarray, "h w"]:
-        """The opacities."""
-        ...
-
-    def expected_depth_m(self) -> Float32[ndarray, "h w"]:
-        """Return the distances along the optical axis."""
-        ...
-
-
-Render = Callable[[Camera, Float64[ndarray, "4 4"]], MapRendering]
+Render = Callable[[Camera, Float64[ndarray, "4 4"]], Rendering]
 """Renders the whole map from a camera pose (camera, T_world_camera)."""
 
 
@@ -75,7 +56,7 @@ class TsdfVolume:
         indices = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1).reshape(-1, 3)
         self._centres_m = (self.origin_m + (indices + 0.5) * self.voxel_m).astype(np.float32)
 
-    def integrate(self, view: KeyframeView, rendering: MapRendering) -> None:
+    def integrate(self, view: KeyframeView, rendering: Rendering) -> None:
         """Add one rendered view."""
         rows, pixels, depth_m = self._visible(view)
         surface_m = rendering.expected_depth_m()[pixels]

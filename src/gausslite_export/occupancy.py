@@ -1,6 +1,6 @@
 """Find the voxels that the Gaussians occupy and write them for planners: OctoMap trees and nav2 grids.
 
-A map of Gaussians holds surfaces; free space is what its keyframes see through (`free_space`). All other space is
+A map of Gaussians holds surfaces; free space is what its keyframes see through (`free_cells`). All other space is
 unknown. Without keyframes a voxel is never free, and a grid cell only where the map has a floor.
 """
 

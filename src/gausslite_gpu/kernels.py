@@ -1,13 +1,7 @@
-"""The gsplat operations of this backend and the projection of rows, with an emulation for machines without a GPU.
-
-gsplat (Ye et al. 2025, Apache-2.0) compiles its kernels for CUDA only. Its torch versions of the two projection steps
-run on the CPU. The emulation replaces sorting and compositing by those of the reference backend, with gsplat's two
-different rules (GSPLAT_LIMITS).
-"""
+"""The gsplat operations of this backend (Ye et al. 2025, Apache-2.0), and the projection of rows to their input."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Protocol, cast, runtime_checkable
@@ -19,11 +13,11 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
-from gausslite.domain.camera import Camera
 from gausslite.domain.errors import KernelError
 from gausslite.render.rasterizer import (
     LOG_SCALE,
     MEAN,
+    MIN_ALPHA,
     NEAR_M,
     OPACITY_LOGIT,
     QUAT,
@@ -31,12 +25,8 @@ from gausslite.render.rasterizer import (
     TILE_PX,
     UPDATE_COUNT,
 )
-from gausslite.render.reference import Limits, render_images, render_images_backward
-from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, determinants
+from gausslite_gpu.motion import determinants
 from gausslite_gpu.tables import DeviceCamera, to_device
-
-GSPLAT_LIMITS = Limits(max_alpha=0.999, blends_last_splat=False)
-"""gsplat clamps alpha at 0.999 and skips the splat that would take the transmittance to 1e-4."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +88,19 @@ def load_gsplat() -> ModuleType:
     return cast(ModuleType, gsplat)
 
 
+def open_device(name: str = "cuda") -> GsplatKernels:
+    """Return gsplat on a CUDA device, as "cuda" or "cuda:1". Raises KernelError if it cannot be used."""
+    device = torch.device(name)
+    if device.type != "cuda":
+        raise KernelError(f"cuda backend: expected device cuda or cuda:N, got {name}")
+    if not torch.cuda.is_available():
+        raise KernelError("cuda backend: expected a CUDA device that torch can use, got none")
+    try:
+        return GsplatKernels(load_gsplat(), device)
+    except ImportError as reason:
+        raise KernelError(f"cuda backend: needs gsplat; pip install gausslite[cuda] ({reason})") from reason
+
+
 class GsplatKernels:
     """gsplat on a CUDA device."""
 
@@ -157,90 +160,6 @@ class GsplatKernels:
         # gsplat's kernel does not write alpha in inactive tiles
         is_active = tiles.repeat_interleave(TILE_PX, 0).repeat_interleave(TILE_PX, 1)[:height_px, :width_px]
         return torch.where(is_active[..., None], channels[0], 0.0), torch.where(is_active, alpha[0, ..., 0], 0.0)
-
-
-class TorchKernels:
-    """The same operations on the CPU, slow, for tests of the code around the kernels.
-
-    They compute in double precision. gsplat's functions use matrix products, whose rounding depends on the number of
-    rows and on the processor. In single precision the image of a subset would differ from that of the whole map.
-    """
-
-    def __init__(self) -> None:
-        from gsplat.cuda import _torch_impl
-
-        self._gsplat: Any = _torch_impl
-
-    @property
-    def device(self) -> torch.device:
-        """The CPU."""
-        return torch.device("cpu")
-
-    def covariances(self, quats_wxyz: Float32[Tensor, "m 4"], scales_m: Float32[Tensor, "m 3"]) -> Tensor:
-        """Return the covariances [m 3 3]."""
-        covariances, _ = self._gsplat._quat_scale_to_covar_preci(
-            quats_wxyz.double(), scales_m.double(), compute_preci=False
-        )
-        return cast(Tensor, covariances).float()
-
-    def project(
-        self,
-        points_m: Float32[Tensor, "m 3"],
-        covariances_m2: Float32[Tensor, "m 3 3"],
-        intrinsics: Float32[Tensor, "3 3"],
-        size: tuple[int, int],
-    ) -> tuple[Tensor, Tensor]:
-        """Return means and covariances in the image."""
-        means_px, covariances_px2 = self._gsplat._persp_proj(
-            points_m[None].double(), covariances_m2[None].double(), intrinsics[None].double(), *size
-        )
-        return means_px[0].float(), covariances_px2[0].float()
-
-    def composite(
-        self, footprints: Footprints, size: tuple[int, int], tiles: Bool[Tensor, "th tw"] | None
-    ) -> tuple[Tensor, Tensor]:
-        """Blend front to back with gsplat's limits."""
-        columns = (footprints.means_px, footprints.conics, footprints.opacities, footprints.channels)
-        blend: Callable[..., Tensor] = _Composite.apply
-        images = blend(*columns, footprints.order_m, footprints.radius_px, size, tiles)
-        return images[..., :4].float(), images[..., 4].float()
-
-
-class _Composite(torch.autograd.Function):
-    """Forward and backward pass of the reference compositing as one differentiable operation."""
-
-    @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> Tensor:
-        """Return images of five channels, in double precision."""
-        means_px, conics, opacities, channels, order_m, radius_px, (width_px, height_px), tiles = inputs
-        order = torch.argsort(order_m, stable=True)
-        columns = (column[order].double() for column in (means_px, conics, opacities, channels, radius_px))
-        means_px, conics, opacities, channels, radius_px = columns
-        ctx.ellipses = Ellipses(
-            row_ids=order,
-            means_px=means_px,
-            conics=conics,
-            opacities=opacities,
-            rgb=channels[:, :3],
-            z_m=channels[:, 3],
-            half_box_px=torch.ceil(radius_px),
-        )
-        # compositing uses only the image size of a camera
-        ctx.camera = Camera(1.0, 1.0, 0.0, 0.0, width_px, height_px)
-        ctx.tiles = None if tiles is None else tiles.numpy()
-        return render_images(ctx.ellipses, ctx.camera, ctx.tiles, GSPLAT_LIMITS)
-
-    @staticmethod
-    def backward(ctx: Any, *d_images: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the gradients in single precision, in the order of the input."""
-        ellipses: Ellipses = ctx.ellipses
-        with torch.enable_grad():
-            sums = render_images_backward(ellipses, ctx.camera, ctx.tiles, d_images[0], GSPLAT_LIMITS)
-        d_means_px, d_conics, d_opacities, d_rgb, d_z_m = sums
-        d_channels = torch.cat([d_rgb, d_z_m[:, None]], dim=1)
-        inverse_order = torch.argsort(ellipses.row_ids)
-        columns = (d_means_px, d_conics, d_opacities, d_channels)
-        return (*(column[inverse_order].float() for column in columns), None, None, None, None)
 
 
 def project(

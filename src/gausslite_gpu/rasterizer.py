@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gausslite.domain.camera import Camera, CameraMotion
-from gausslite.domain.errors import InvalidInputError, KernelError, ShapeError
+from gausslite.domain.errors import InvalidInputError, ShapeError
 from gausslite.render.rasterizer import (
     DILATION_PX2,
     FULL_FRAME,
@@ -34,10 +34,7 @@ from gausslite.render.rasterizer import (
 )
 from gausslite_gpu.kernels import (
     Footprints,
-    GsplatKernels,
     Kernels,
-    TorchKernels,
-    load_gsplat,
     project,
     visible_rows,
 )
@@ -95,13 +92,12 @@ class CudaRasterizer:
     less than 0.01 if no alpha exceeds 0.99, else by less than 0.12: gsplat skips a nearly opaque splat behind others of
     transmittance 0.1 or less. A GPU adds gradients in varying order, so results repeat only to rounding.
 
-    device `cpu` runs the same code on a slow emulation of the kernels, for tests. Bound tables stay on the device
-    between steps. Each step synchronises twice, to read counts: of tile intersections (gsplat) and of visible rows.
-    Raises KernelError if the device cannot be used.
+    Bound tables stay on the device between steps. Each step synchronises twice, to read counts: of tile intersections
+    (gsplat) and of visible rows.
     """
 
-    def __init__(self, device: str = "cuda") -> None:
-        self._kernels = _kernels_for(device)
+    def __init__(self, kernels: Kernels) -> None:
+        self._kernels = kernels
         self._bound: DeviceTables | None = None
 
     @property
@@ -112,8 +108,7 @@ class CudaRasterizer:
     @property
     def device_name(self) -> str:
         """Name of the device."""
-        device = self._kernels.device
-        return str(torch.cuda.get_device_name(device)) if device.type == "cuda" else "CPU (emulation)"
+        return str(torch.cuda.get_device_name(self._kernels.device))
 
     def forward(
         self,
@@ -289,20 +284,6 @@ class CudaRasterizer:
         window_means_px = torch.stack([footprints.means_px[:, 0] - left, footprints.means_px[:, 1] - top], dim=1)
         part = replace(footprints, means_px=window_means_px)
         return self._kernels.composite(part, window.size, window_tiles)
-
-
-def _kernels_for(device: str) -> Kernels:
-    try:
-        if device == "cpu":
-            return TorchKernels()
-        chosen = torch.device(device)
-        if chosen.type != "cuda":
-            raise KernelError(f"cuda backend: expected device cuda, cuda:N or cpu, got {device}")
-        if not torch.cuda.is_available():
-            raise KernelError("cuda backend: expected a CUDA device that torch can use, got none")
-        return GsplatKernels(load_gsplat(), chosen)
-    except ImportError as reason:
-        raise KernelError(f"cuda backend: needs gsplat; pip install gausslite[cuda] ({reason})") from reason
 
 
 def _norms_2d(d_means_px: Float32[Tensor, "m 2"], device_camera: DeviceCamera) -> Float32[Tensor, " m"]:

@@ -22,7 +22,7 @@ from gausslite.render.rasterizer import (
     AdamSettings,
     UpdateCounter,
 )
-from gausslite.render.reference_projection import ImageMotion
+from gausslite_gpu.motion import ImageMotion
 
 _COUNTER_BATCH = 8
 """Number of steps per update of the counters: each update waits for the device."""

@@ -21,7 +21,7 @@ from gausslite.domain.pose import inverse, orthonormal, rotation_angle_deg, tran
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.mapping.free_space import DepthView
 from gausslite.mission.results import MAP, read_report
-from gausslite_evaluation.views import MapViewer, view_map
+from gausslite.render.map_viewer import MapViewer, view_map
 from gausslite_places.localisation import PlaceMap, rendered_frame
 from gausslite_places.map_diff import Change, Visit, compare_visits
 

@@ -23,7 +23,7 @@ from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.prior_map import PRIOR_FOLDER, MapChanges, PriorMap
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import MissionSettings
-from gausslite_evaluation.views import view_map
+from gausslite.render.map_viewer import view_map
 from gausslite_places.map_diff import Change, Visit, compare_visits, with_earlier_objects
 from gausslite_places.moved_source import MovedSource, moved_frame
 from gausslite_places.prior_map import MAX_LOCALISED_FRAMES, SavedMap, SequenceLocaliser

@@ -8,15 +8,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, MissingPluginError
 from gausslite.wire.robot import AgentLink, LinkSettings
 from gausslite.wire.security import Tls
-from gausslite_export.occupancy import OccupancySettings
 from gausslite_ros.bag_file import BagOptions
 from gausslite_ros.live_frames import LiveFrames
-from gausslite_ros.live_map import LiveMap
 from gausslite_ros.outgoing import (
     Fields,
     correction_transform,
@@ -26,6 +24,9 @@ from gausslite_ros.outgoing import (
     point_cloud,
 )
 from gausslite_ros.topics import camera_name
+
+if TYPE_CHECKING:
+    from gausslite_ros.live_map import LiveMap
 
 _AXES = ("optical", "body")
 _LIMITS = (
@@ -238,6 +239,18 @@ def _grid_topic(number: int) -> str:
     return OCCUPANCY if number == 0 else f"{OCCUPANCY}_{number + 1}"
 
 
+def _live_map(link: AgentLink, parameters: NodeParameters) -> LiveMap:
+    """Return the grids of the agent's map. Raises MissingPluginError without the package that computes them."""
+    try:
+        from gausslite_export.occupancy import OccupancySettings
+        from gausslite_ros.live_map import LiveMap
+    except ModuleNotFoundError as error:
+        raise MissingPluginError(
+            "the occupancy grids of the node need the package gausslite_export, which is not installed"
+        ) from error
+    return LiveMap(link.map, OccupancySettings(parameters.cell_m), parameters.heights())
+
+
 class RobotSession:
     """Converts the robot's messages to frames for the agent, and the agent's status to messages. Not thread-safe."""
 
@@ -248,7 +261,7 @@ class RobotSession:
         self._seen_images, self._seen_at_s = 0, clock()
         self._live = LiveFrames(parameters.topic_options(), parameters.max_wait_s)
         self._message_problem = ""
-        self._live_map = LiveMap(link.map, OccupancySettings(parameters.cell_m), parameters.heights())
+        self._live_map = _live_map(link, parameters)
         self._map_problem = ""
         self._map_thread: threading.Thread | None = None
         self._closing = threading.Event()

@@ -15,6 +15,7 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from gausslite.codec.run_files import KeyframeView
+from gausslite.config.task_parser import DefaultParser
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.relevance import PointedObject, PointM
@@ -23,7 +24,6 @@ from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.schedule import ScheduledTaskMapper
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.process import print_message
-from gausslite_language.rules import RuleParser
 from gausslite_view.cameras import CameraPanel
 from gausslite_view.contents import ViewContents
 from gausslite_view.map_page import MapPage, TaskField
@@ -61,7 +61,7 @@ class MissionRequests:
 
     def assign(self, task: str) -> TaskGraph:
         """Change the task as `ScheduledTaskMapper.assign`, with its errors; also raises TaskError, UnavailableError."""
-        graph = RuleParser().parse(task)
+        graph = DefaultParser().parse(task)
         return self._ask(lambda: self._mission.assign(graph))
 
     def answer(self) -> None:

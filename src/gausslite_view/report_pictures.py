@@ -17,6 +17,8 @@ from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox
 from gausslite.domain.pose import upward_axis
+from gausslite.domain.relevance import MIN_ROI_PIXELS
+from gausslite.render.map_viewer import MapViewer, view_map
 from gausslite_evaluation.metrics import psnr, ssim
 from gausslite_evaluation.pictures import (
     DIFFERENCE_GAIN,
@@ -26,7 +28,6 @@ from gausslite_evaluation.pictures import (
     outline_roi,
     to_uint8,
 )
-from gausslite_evaluation.views import MIN_ROI_PIXELS, MapViewer, view_map
 from gausslite_view.contents import ColourMode, ViewContents, colours_of, legend_of, object_boxes
 from gausslite_view.report_elements import element, picture, picture_url, styled
 from gausslite_view.report_parts import RunResults

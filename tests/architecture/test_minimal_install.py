@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
 NEED_AN_EXTRA = {
-    "torch": ("gausslite.render.reference", "gausslite.render.cuda", "gausslite_bench.raster.gsplat_baseline"),
+    "torch": ("gausslite_gpu", "gausslite_bench.raster.gsplat_baseline"),
     "psycopg": tuple(f"gausslite_cluster.{name}" for name in ("peers", "postgres_", "region_", "shared_")),
     "rclpy": ("gausslite_ros.node",),
     "rospy": ("gausslite_ros.node_ros1",),

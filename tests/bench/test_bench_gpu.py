@@ -20,10 +20,11 @@ pytest.importorskip("gsplat", reason="gsplat is not installed; pip install gauss
 
 import gsplat
 import torch
+from torch_oracle.emulated_kernels import TorchKernels
 
 from gausslite_bench.raster.gsplat_baseline import GsplatBaseline
-from gausslite_gpu import CudaRasterizer
-from gausslite_gpu.kernels import TorchKernels, project
+from gausslite_gpu.kernels import project
+from gausslite_gpu.rasterizer import CudaRasterizer
 from gausslite_gpu.tables import DeviceCamera
 
 torch.set_num_threads(1)
@@ -52,7 +53,7 @@ def rasterization(*args: Any, **options: Any) -> tuple[torch.Tensor, torch.Tenso
 @pytest.fixture(scope="module")
 def bench() -> GpuBench:
     return GpuBench(
-        CudaRasterizer("cpu"),
+        CudaRasterizer(TorchKernels()),
         gaussians=(60, 90),
         frame_gaussians=80,
         size=SIZE,
@@ -78,7 +79,7 @@ def test_every_size_of_map_is_measured_and_a_whole_frame(bench: GpuBench) -> Non
 
 
 def test_the_gsplat_baseline_has_the_loss_of_our_step() -> None:
-    rasterizer, view, loss = CudaRasterizer("cpu"), held_out_view(*SIZE), LossWeights()
+    rasterizer, view, loss = CudaRasterizer(TorchKernels()), held_out_view(*SIZE), LossWeights()
     prepared = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera)
     rows = seed_rows(60)
     step = rasterizer.step(rows, rows * 0, rows * 0, prepared, view.T_camera_world, loss, ZERO_LEARNING_RATES)

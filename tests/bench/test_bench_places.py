@@ -11,9 +11,9 @@ from place_scenes import CAMERA, MapCamera, looking, room
 from gausslite.cli.main import main
 from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, write_keyframe_views
+from gausslite.render.map_viewer import view_map
 from gausslite_bench.cli.places import PlaceScore, mirrored
 from gausslite_bench.loop_trials import LoopTrials
-from gausslite_evaluation.views import view_map
 from gausslite_places.prior_map import SavedMap
 
 POSE = (0.5, 0.5, 30.0)

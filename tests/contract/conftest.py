@@ -19,7 +19,7 @@ torch.set_num_threads(1)
 
 
 def _reference() -> Rasterizer:
-    from gausslite.render.reference import ReferenceRasterizer
+    from torch_oracle.rasterizer import ReferenceRasterizer
 
     return ReferenceRasterizer()
 
@@ -30,10 +30,15 @@ def _cpu(simd: str) -> Rasterizer:
     return CpuRasterizer(threads=2, simd=simd)
 
 
-def _cuda(device: str) -> Rasterizer:
-    from gausslite_gpu import CudaRasterizer
+def _cuda(is_emulated: bool) -> Rasterizer:
+    from gausslite_gpu.kernels import open_device
+    from gausslite_gpu.rasterizer import CudaRasterizer
 
-    return CudaRasterizer(device)
+    if not is_emulated:
+        return CudaRasterizer(open_device())
+    from torch_oracle.emulated_kernels import TorchKernels
+
+    return CudaRasterizer(TorchKernels())
 
 
 BACKENDS: dict[str, Callable[[], Rasterizer]] = {
@@ -42,8 +47,8 @@ BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "cpu avx2": lambda: _cpu("avx2"),
     "cpu neon": lambda: _cpu("neon"),
     "cpu portable": lambda: _cpu("portable"),
-    "cuda": lambda: _cuda("cuda"),
-    "cuda emulation": lambda: _cuda("cpu"),
+    "cuda": lambda: _cuda(is_emulated=False),
+    "cuda emulation": lambda: _cuda(is_emulated=True),
 }
 
 
@@ -57,7 +62,7 @@ def rasterizer(request: pytest.FixtureRequest) -> Rasterizer:
 
 
 class RememberingOracle:
-    """The reference backend, which computes an image, and the gradients for it, once for all other backends."""
+    """The oracle, which computes an image, and the gradients for it, once for all other backends."""
 
     def __init__(self) -> None:
         reference = _reference()
@@ -91,5 +96,5 @@ def oracle() -> RememberingOracle:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave out the comparisons of the reference backend with itself."""
+    """Leave out the comparisons of the oracle with itself."""
     items[:] = [item for item in items if not ("oracle" in item.originalname and "[reference" in item.name)]

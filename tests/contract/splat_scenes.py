@@ -8,12 +8,15 @@ from functools import cache, cached_property
 
 import numpy as np
 import torch
+from torch_oracle.projection import Ellipses, ImageModel, project
+from torch_oracle.rasterizer import MAX_ALPHA, MIN_TRANSMITTANCE
 
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.render.rasterizer import (
     DILATION_PX2,
     LOG_SCALE,
     MEAN,
+    MIN_ALPHA,
     OPACITY_LOGIT,
     QUAT,
     RGB,
@@ -21,8 +24,6 @@ from gausslite.render.rasterizer import (
     Rendering,
     TrainingView,
 )
-from gausslite.render.reference import MAX_ALPHA, MIN_TRANSMITTANCE
-from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, ImageModel, project
 
 GROUPS = {
     "means": MEAN,

@@ -20,12 +20,12 @@ from splat_scenes import (
 from step_training import ADAM, LOSS, tables, target_for
 from test_rasterizer_gradients import assert_same_gradients
 from test_reference_oracle import STEP, exp_twist
+from torch_oracle.projection import ImageModel, project
+from torch_oracle.rasterizer import render_images
 
 from gausslite.domain.camera import CameraMotion
 from gausslite.domain.pose import Twist
 from gausslite.render.rasterizer import Rasterizer, Rendering, SplatGradients, Subset
-from gausslite.render.reference import render_images
-from gausslite.render.reference_projection import ImageModel, project
 
 _TWIST = Twist(np.array([0.7, -0.4, 0.5]), np.array([-0.8, 1.6, 0.9]))
 MOTIONS = {

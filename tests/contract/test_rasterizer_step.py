@@ -10,6 +10,7 @@ import pytest
 import torch
 from splat_scenes import GROUPS, Scene, TargetImage, named_scene, relative_error, scene_for
 from step_training import ADAM, LOSS, applied_gradient, tables, target_for, train
+from torch_oracle.rasterizer import training_loss
 
 from gausslite.render.rasterizer import (
     FULL_FRAME,
@@ -21,7 +22,6 @@ from gausslite.render.rasterizer import (
     Rasterizer,
     Subset,
 )
-from gausslite.render.reference import training_loss
 
 TOLERANCE = 1e-4
 SATURATED_TOLERANCE = {"cuda": 0.1}

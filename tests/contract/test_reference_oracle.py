@@ -1,4 +1,4 @@
-"""The reference backend against finite differences and against direct sums."""
+"""The torch oracle against finite differences and against direct sums."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from splat_scenes import CAMERA, GROUPS, Scene, named_scene, random_image_gradients, relative_error, rotated_pose
+from torch_oracle.projection import ImageModel, project
+from torch_oracle.rasterizer import ReferenceView, render_images, ssim_map, training_loss
 
 from gausslite.render.rasterizer import LossWeights, Rasterizer
-from gausslite.render.reference import ReferenceView, render_images, ssim_map, training_loss
-from gausslite.render.reference_projection import ImageModel, project
 
 STEP = 5e-8
 """Step of finite differences: small enough that no alpha crosses a threshold, large against float64 rounding."""

@@ -13,14 +13,16 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import BallRegion
+from gausslite.render.map_viewer import MapViewer
 from gausslite_evaluation.compare import MAX_PSNR_DB, average, evaluate, score_view
 from gausslite_evaluation.metrics import psnr
-from gausslite_evaluation.views import HeldOutView, MapViewer
+from gausslite_evaluation.views import HeldOutView
 
 pytest.importorskip("torch", reason="the reference rasterizer needs torch, which is not installed")
 
+from torch_oracle.rasterizer import ReferenceRasterizer
+
 from gausslite.render.rasterizer import Rendering
-from gausslite.render.reference import ReferenceRasterizer
 
 CAMERA = Camera(40.0, 40.0, 20.0, 16.0, 40, 32)
 

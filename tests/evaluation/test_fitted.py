@@ -12,8 +12,9 @@ from gausslite.domain.frame import Frame
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import MapperSettings, OptimizationSettings
 from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.map_viewer import MapViewer
 from gausslite_evaluation.metrics import psnr
-from gausslite_evaluation.views import HeldOutView, MapViewer, render_fitted, render_fitted_at_region
+from gausslite_evaluation.views import HeldOutView, render_fitted, render_fitted_at_region
 
 SIZE = (96, 72)
 

@@ -5,12 +5,14 @@ import shutil
 
 import numpy as np
 import pytest
+from plugin_entries import register
 
 from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.domain.gaussians import Gaussians
-from gausslite_export.formats import FORMATS
+from gausslite.mission.exporting import Format
+from gausslite.plugins import Group, installed
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,7 @@ OPTIONS = {
 }
 
 
-ALL_FORMATS = tuple(FORMATS)
+FORMATS = dict(installed(Group.EXPORTERS))
 
 
 def run_with_map(results, folder, gaussians):
@@ -51,7 +53,7 @@ def test_an_empty_map_and_one_of_nan_are_refused_by_every_format(results, tmp_pa
     gaussians.means_m[:, 1] = np.nan
     empty = run_with_map(results, tmp_path / "empty", Gaussians.empty())
     not_finite = run_with_map(results, tmp_path / "nan", gaussians)
-    for name in ALL_FORMATS:
+    for name in FORMATS:
         for run, message in (
             (empty, "expected a map with at least one Gaussian, got an empty map"),
             (not_finite, "column y: expected finite values"),
@@ -62,7 +64,7 @@ def test_an_empty_map_and_one_of_nan_are_refused_by_every_format(results, tmp_pa
             assert {file.name for file in run.iterdir()} == {"map.ply", "keyframes.json", "report.json"}
 
 
-@pytest.mark.parametrize("name", ALL_FORMATS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_gaussians_far_outside_are_left_out_with_one_line(results, tmp_path, name, capsys):
     gaussians = read_ply(results / "map.ply")
     gaussians.means_m[3, 1] = gaussians.scales_m[4, 1] = 1e30
@@ -78,7 +80,7 @@ def test_gaussians_far_outside_are_left_out_with_one_line(results, tmp_path, nam
     ]
 
 
-@pytest.mark.parametrize("name", ALL_FORMATS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_a_gaussian_of_nan_is_left_out_with_one_line(results, tmp_path, name, capsys):
     gaussians = read_ply(results / "map.ply")
     gaussians.means_m[3, 1] = np.nan
@@ -90,7 +92,7 @@ def test_a_gaussian_of_nan_is_left_out_with_one_line(results, tmp_path, name, ca
     assert notes == [f"left out 1 of {len(gaussians)} Gaussians: column y: expected finite values, got NaN or infinity"]
 
 
-@pytest.mark.parametrize("name", ALL_FORMATS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_the_suffix_of_another_format_is_refused(results, tmp_path, name, capsys):
     for suffix in (".ply", ".gltf", ".pgm", ".txt", ""):
         out = tmp_path / f"map{suffix}"
@@ -114,7 +116,7 @@ def test_the_image_of_a_grid_replaces_no_file_without_overwrite(results, tmp_pat
     assert image.read_bytes()[:2] == b"P5"
 
 
-@pytest.mark.parametrize("name", ALL_FORMATS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_one_gaussian_is_exported_unless_it_has_no_surface(results, tmp_path, name, capsys):
     gaussians = read_ply(results / "map.ply")
     run = run_with_map(results, tmp_path / "one", gaussians.take(np.flatnonzero(gaussians.opacities > 0.5)[:1]))
@@ -127,7 +129,7 @@ def test_one_gaussian_is_exported_unless_it_has_no_surface(results, tmp_path, na
         assert (code, captured.out[:13]) == (0, "1 Gaussians o")
 
 
-@pytest.mark.parametrize("name", ALL_FORMATS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_every_format_writes_its_default_file(results, name, capsys):
     command = ["export", str(results), "--to", name, "--region", "all", *OPTIONS.get(name, ())]
     assert main([*command, "--json"]) == 0
@@ -156,8 +158,8 @@ def test_the_objects_of_a_damaged_report_are_not_exported_as_none(results, tmp_p
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        (("--voxel", "0.1"), "--voxel: expected with --to octomap or nav2 or mesh, got --to spz"),
-        (("--min-opacity", "0.1"), "--min-opacity: expected with --to octomap or nav2, got --to spz"),
+        (("--voxel", "0.1"), "--voxel: expected with --to mesh or nav2 or octomap, got --to spz"),
+        (("--min-opacity", "0.1"), "--min-opacity: expected with --to nav2 or octomap, got --to spz"),
         (("--seconds", "3"), "--seconds: expected with --to video, got --to spz"),
     ],
 )
@@ -174,3 +176,21 @@ def test_a_missing_run_and_a_map_far_outside_as_a_whole_are_refused(results, tmp
     run = run_with_map(results, tmp_path / "far", gaussians)
     assert main(["export", str(run), "--to", "nav2"]) == 2
     assert "expected Gaussians within 100000 m of the origin, got none" in capsys.readouterr().err
+
+
+def write_points(path, content, _settings):
+    np.savetxt(path, content.chosen.means_m)
+
+
+POINTS = Format(".xyz", "points as text", write_points, uses=("voxel",))
+
+
+def test_a_format_of_another_package_is_listed_and_written(results, tmp_path, capsys, monkeypatch):
+    theirs, ours = f"{__name__}:POINTS", "gausslite_export.formats"
+    register(monkeypatch, Group.EXPORTERS, points=theirs, mesh=f"{ours}:MESH", spz=f"{ours}:SPZ")
+    out = tmp_path / "map.xyz"
+    assert main(["export", str(results), "--to", "points", "--voxel", "1", "--out", str(out)]) == 0
+    assert "points as text" in capsys.readouterr().out
+    assert len(np.loadtxt(out)) == len(read_ply(results / "map.ply"))
+    assert main(["export", str(results), "--to", "spz", "--voxel", "0.1"]) == 2
+    assert "expected with --to mesh or points, got" in capsys.readouterr().err

@@ -18,7 +18,9 @@ from gausslite.codec.run_files import read_keyframe_views
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of
-from gausslite_export.formats import FORMATS, ExportSettings, MapContent, read_map, upright
+from gausslite.mission.exporting import ExportSettings, Format, MapContent
+from gausslite.plugins import Group, load
+from gausslite_export.formats import read_map, upright
 from gausslite_export.occupancy import OccupancySettings, occupied_voxels
 
 COUNT = 50
@@ -46,9 +48,10 @@ def no_rendering(gaussians):
 def export(tmp_path: Path, name: str, gaussians: Gaussians, region: str = "all", voxel_m: float = 0.05) -> Path:
     source = tmp_path / "map.ply"
     write_ply(source, gaussians)
-    out = tmp_path / f"out{FORMATS[name].suffix}"
-    content = read_map(source, region, max_extent_m=FORMATS[name].max_extent_m)
-    FORMATS[name].write(out, content, ExportSettings(no_rendering, OccupancySettings(voxel_m=voxel_m)))
+    chosen: Format = load(Group.EXPORTERS, name)
+    out = tmp_path / f"out{chosen.suffix}"
+    content = read_map(source, region, max_extent_m=chosen.max_extent_m)
+    chosen.write(out, content, ExportSettings(no_rendering, voxel_m=voxel_m))
     return out
 
 

@@ -11,8 +11,8 @@ import yaml
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
-from gausslite_evaluation.views import view_map
-from gausslite_export.formats import FORMATS, ExportSettings, MapContent
+from gausslite.mission.exporting import ExportSettings, Format, MapContent
+from gausslite.plugins import Group, load
 from gausslite_export.occupancy import OccupancySettings, occupied_voxels
 
 VOXEL_M, HALF_M, WALL_M, EYE_M = 0.1, 2.0, 1.5, 0.75
@@ -48,8 +48,9 @@ VIEWS = [KeyframeView(i, i, CAMERA, turned(i * np.pi / 4), 0) for i in range(8)]
 
 
 def export(path: Path, name: str, content: MapContent) -> Path:
-    out = path / f"map{FORMATS[name].suffix}"
-    FORMATS[name].write(out, content, ExportSettings(lambda gaussians: view_map(gaussians).render, SETTINGS))
+    chosen: Format = load(Group.EXPORTERS, name)
+    out = path / f"map{chosen.suffix}"
+    chosen.write(out, content, ExportSettings(voxel_m=VOXEL_M))
     return out
 
 

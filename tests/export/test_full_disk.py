@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_formats import plate
-from test_video import CAMERA, Picture, turned
+from test_video import CAMERA, turned
 
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.errors import StorageError
+from gausslite.render.rasterizer import Rendering
 from gausslite_export.occupancy import OccupancySettings, write_octomap
 from gausslite_export.video import write_video
 
@@ -29,9 +30,9 @@ def largest_file(size_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def noise(camera: object, T_world_camera: np.ndarray) -> Picture:
+def noise(camera: object, T_world_camera: np.ndarray) -> Rendering:
     rng = np.random.default_rng(int(1000 * T_world_camera[0, 3]))
-    return Picture(rng.random((48, 64, 3), np.float32), np.ones((48, 64), np.float32))
+    return Rendering(rng.random((48, 64, 3), np.float32), *np.ones((2, 48, 64), np.float32), None)
 
 
 def test_a_video_cut_short_is_an_error(tmp_path: Path) -> None:

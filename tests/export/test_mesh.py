@@ -7,7 +7,7 @@ from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
-from gausslite_evaluation.views import view_map
+from gausslite.render.map_viewer import view_map
 from gausslite_export.mesh import write_mesh
 
 VOXEL_M = 0.02

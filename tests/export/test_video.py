@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import require_rigid
+from gausslite.render.rasterizer import Rendering
 from gausslite_export.video import smooth_path, write_video
 
 CAMERA = Camera(50.0, 50.0, 32.0, 24.0, 65, 49)
@@ -24,20 +23,11 @@ def turned(angle_rad: float, x_m: float) -> np.ndarray:
     return pose
 
 
-@dataclass
-class Picture:
-    """A grey that follows the camera's x."""
-
-    rgb: np.ndarray
-    alpha: np.ndarray
-
-    def expected_depth_m(self) -> np.ndarray:
-        raise AssertionError("a video needs no depth")
-
-
-def render(camera: Camera, T_world_camera: np.ndarray) -> Picture:
+def render(camera: Camera, T_world_camera: np.ndarray) -> Rendering:
+    """Return a grey that follows the camera's x."""
     size = camera.height_px, camera.width_px
-    return Picture(np.full((*size, 3), T_world_camera[0, 3], np.float32), np.ones(size, np.float32))
+    grey = np.full((*size, 3), T_world_camera[0, 3], np.float32)
+    return Rendering(grey, np.zeros(size, np.float32), np.ones(size, np.float32), None)
 
 
 def test_a_video_follows_the_keyframes_in_the_order_of_their_times(tmp_path):

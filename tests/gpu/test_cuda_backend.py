@@ -20,9 +20,10 @@ pytest.importorskip("gsplat", reason="gsplat is not installed; pip install gauss
 
 import gsplat
 import torch
+from torch_oracle.emulated_kernels import TorchKernels
 
-from gausslite_gpu import CudaRasterizer
-from gausslite_gpu.kernels import Footprints, GsplatKernels
+from gausslite_gpu.kernels import Footprints, GsplatKernels, open_device
+from gausslite_gpu.rasterizer import CudaRasterizer
 
 # small tensors: more threads only add synchronisation
 torch.set_num_threads(1)
@@ -44,12 +45,12 @@ def mapped(rasterizer: Rasterizer, seed: int = 0) -> GaussianMapper:
 
 def test_mapping_error_matches_the_oracle() -> None:
     """The maps differ: Adam amplifies rounding of a first gradient to a whole step, which also changes clones."""
-    from gausslite.render.reference import ReferenceRasterizer
+    from torch_oracle.rasterizer import ReferenceRasterizer
 
     frame = wall_frame(0, SIZE, shift_m=0.05)
     region = middle_relevance(frame).roi
     errors, kappas = np.zeros((2, 4)), np.zeros((2, 4))
-    for backend, rasterizer in enumerate((CudaRasterizer("cpu"), ReferenceRasterizer())):
+    for backend, rasterizer in enumerate((CudaRasterizer(TorchKernels()), ReferenceRasterizer())):
         for seed in range(4):
             mapper = mapped(rasterizer, seed)
             rendering = mapper.render(frame.camera, frame.T_world_camera)
@@ -105,7 +106,7 @@ def tables(n: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_one_binding_at_a_time() -> None:
-    rasterizer = CudaRasterizer("cpu")
+    rasterizer = CudaRasterizer(TorchKernels())
     with rasterizer.bind_tables(*tables()):
         with pytest.raises(InvalidInputError, match="second binding"), rasterizer.bind_tables(*tables()):
             pass
@@ -116,7 +117,7 @@ def test_one_binding_at_a_time() -> None:
 
 
 def test_bound_arrays_change_at_the_end_of_the_binding() -> None:
-    rasterizer, bound = CudaRasterizer("cpu"), tables()
+    rasterizer, bound = CudaRasterizer(TorchKernels()), tables()
     frame = wall_frame(0, SIZE)
     view = rasterizer.prepare_view(frame.rgb, frame.depth_m, frame.camera)
     before = bound[0].copy()
@@ -129,13 +130,13 @@ def test_bound_arrays_change_at_the_end_of_the_binding() -> None:
 def test_missing_device_is_named() -> None:
     if not torch.cuda.is_available():
         with pytest.raises(KernelError, match="expected a CUDA device"):
-            CudaRasterizer("cuda")
-    with pytest.raises(KernelError, match="expected device cuda, cuda:N or cpu, got meta"):
-        CudaRasterizer("meta")
+            open_device()
+    with pytest.raises(KernelError, match="expected device cuda or cuda:N, got meta"):
+        open_device("meta")
 
 
 def test_read_only_inputs_are_accepted() -> None:
-    rasterizer, frame = CudaRasterizer("cpu"), wall_frame(0, SIZE)
+    rasterizer, frame = CudaRasterizer(TorchKernels()), wall_frame(0, SIZE)
     bound, rgb, trainable = tables(), frame.rgb.copy(), np.ones(4, np.bool_)
     tiles = np.ones((1, 2), np.bool_)
     rows = bound[0].copy()

@@ -16,6 +16,7 @@ import grpc
 import numpy as np
 from sample_gaussians import plain_gaussians
 from serving import serving
+from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.camera import Camera
@@ -27,7 +28,6 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire.clients import FusionClient

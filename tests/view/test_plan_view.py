@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
-from gausslite_evaluation.views import view_map
+from gausslite.render.map_viewer import view_map
 from gausslite_view.contents import ViewContents
 from gausslite_view.report_pictures import PlanCamera
 

@@ -23,7 +23,7 @@ from gausslite.mission.prior_map import PriorMap, open_prior_map, require_other_
 from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
-from gausslite.process import Sibling, sibling
+from gausslite.pages import load_pages
 from gausslite.wire.clients import FusionClient, ParserClient
 from gausslite.wire.run_service import run_service
 from gausslite.wire.server import serve_until_stopped
@@ -186,8 +186,8 @@ async def _serve(settings: AgentSettings) -> int:
         mission = AgentMission(settings, worker, first_parser, resumed, can_find, source_notes)
         servicer = AgentServicer(settings.agent_id, worker, mission, parser, changes)
         if settings.view is not None:
-            live = sibling(Sibling.PAGES)
-            stack.enter_context(live.service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls))
+            page = load_pages("--view").service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls)
+            stack.enter_context(page)
         run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
         lost = mission.describe_lost_data()

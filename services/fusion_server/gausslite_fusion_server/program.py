@@ -18,8 +18,9 @@ from gausslite.fusion import store_maintenance
 from gausslite.fusion.alignment import FrameAligner
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.store_maintenance import StoreReport
+from gausslite.pages import load_pages
 from gausslite.plugins import Group, find
-from gausslite.process import Sibling, print_message, sibling
+from gausslite.process import print_message
 from gausslite.render.choose import choose_rasterizer
 from gausslite.wire.convert import decode_frame
 from gausslite.wire.run_service import LogFormat, log_to_stderr, run_service
@@ -133,10 +134,7 @@ async def _serve(settings: ServerSettings) -> None:
 def _page(settings: ServerSettings) -> AbstractContextManager[None]:
     if settings.view is None:
         return nullcontext()
-    page: AbstractContextManager[None] = sibling(Sibling.PAGES).service_page(
-        settings.view, settings.listen, is_agent=False, tls=settings.tls
-    )
-    return page
+    return load_pages("--view").service_page(settings.view, settings.listen, is_agent=False, tls=settings.tls)
 
 
 async def _serve_mission(settings: ServerSettings, engine: FusionEngine, servicer: FusionServicer) -> None:

@@ -18,7 +18,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.process import print_message
-from gausslite.render.choose import BACKENDS
+from gausslite.render.choose import backends
 from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port, require_callable
 from gausslite.wire.run_service import LogFormat
 from gausslite.wire.security import CallLimits, Tls, TlsFiles
@@ -89,7 +89,7 @@ class ServerSettings:
         FrameUse.CORRECT, "correct the misfit of agents' frames and quarantine gross ones, or trust them"
     )
     refine: RefineSettings = field(default_factory=RefineSettings)
-    rasterizer: str = option("auto", "backend of the refinement", choices=BACKENDS)
+    rasterizer: str = option("auto", "backend of the refinement", choices=backends())
     tls: Tls | None = None
     limits: CallLimits = field(default_factory=CallLimits)
     log_format: LogFormat = option(LogFormat.TEXT, "lines of the log")

@@ -14,7 +14,7 @@ from typing import Final, cast
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.program import parse_options
 from gausslite.domain.errors import GaussLiteError, MissingPluginError
-from gausslite.plugins import Command, Group, load, names
+from gausslite.plugins import Command, Group, absent_package, load, names
 from gausslite.process import Terminated, print_message, raise_interrupts
 
 _SUMMARIES: Final = {
@@ -95,6 +95,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except GaussLiteError as error:
         return _fail(str(error))
+    except ModuleNotFoundError as error:
+        # packages beside the core import each other
+        if (package := absent_package(error)) is None:
+            raise
+        return _fail(f"needs the package {package}, which is not installed")
     except BrokenPipeError:
         # the reader has read enough, as `head` does; what is still buffered goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

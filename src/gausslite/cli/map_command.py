@@ -27,7 +27,7 @@ from gausslite.config.program import Program
 from gausslite.datasets.open import open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
-from gausslite.domain.errors import DatasetError, InvalidInputError, PoseError, StorageError
+from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError, StorageError
 from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import found_text
@@ -37,6 +37,7 @@ from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.mission.build import EstimatorFactory, build_task_mapper
 from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
+from gausslite.mission.evaluation import Evaluator, TrainingFit
 from gausslite.mission.prior_map import PriorMap, open_prior_map, require_other_folder
 from gausslite.mission.results import (
     MAP,
@@ -62,19 +63,20 @@ from gausslite.mission.settings import (
     TaskSettings,
 )
 from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome, TaskMapper
-from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, Sibling, import_extra, print_message, sibling
+from gausslite.pages import load_pages
+from gausslite.plugins import Group, load
+from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, print_message
 from gausslite.render.choose import choose_rasterizer
+from gausslite.render.map_viewer import view_map
 from gausslite.wire.channel import MAX_PORT
-from gausslite_evaluation.compare import TrainingFit, score_training_views
-from gausslite_evaluation.metrics import trajectory_error
-from gausslite_evaluation.pictures import render_preview
-from gausslite_evaluation.views import view_map
 
 
-def trajectory_report(settings: SourceSettings, source: Source, mapper: TaskMapper) -> dict[str, object]:
+def trajectory_report(
+    settings: SourceSettings, source: Source, mapper: TaskMapper, evaluator: Evaluator | None
+) -> dict[str, object]:
     """Return the ATE of the map's trajectory and of the given one, if true poses exist, and the tracking counts.
 
-    source: the sequence as it was mapped.
+    source: the sequence as it was mapped. evaluator: None leaves out the ATE.
     """
     errors: dict[str, object] = {"ate": None, "given_ate": None, "tracking": dict(mapper.tracking_counts)}
     try:
@@ -83,9 +85,9 @@ def trajectory_report(settings: SourceSettings, source: Source, mapper: TaskMapp
         given = source.trajectory()
     except (DatasetError, PoseError):  # a frame's damaged pose, reported when the frame was read
         return errors
-    if true is not None and len(mapper.poses) > 0:
+    if true is not None and len(mapper.poses) > 0 and evaluator is not None:
         for name, estimated in (("ate", mapper.poses.trajectory()), ("given_ate", given)):
-            error = trajectory_error(estimated, true)
+            error = evaluator.trajectory_error(estimated, true)
             errors[name] = None if error is None else asdict(error)
     return errors
 
@@ -167,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results. Errors in the options are raised before the work starts."""
     require_name("world-frame", options.world_frame or "")
     if options.view is not None:
-        import_extra("viser", "view", "--view")
+        load_pages("--view").require_usable("--view")
     if options.prior is not None and options.resume is not None:
         raise InvalidInputError("--prior: expected it without resume; a saved run knows the map that it continues")
     require_other_folder(options.prior, options.out)
@@ -273,7 +275,9 @@ class _Run:
     def write_results(self, result: MissionResult) -> None:
         """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
         options, mission, graph = self._options, self._inputs.mission, self._scheduled.graph
+        evaluator, missing = _evaluator()
         self._notes = (
+            *missing,
             *self._inputs.notes,
             *self._mapper.notes,
             *_unseen_notes(options, result),
@@ -286,7 +290,7 @@ class _Run:
             **self._inputs.report(),
             "resumed_from": None if options.resume is None else str(options.resume),
             **result.summary(),
-            **trajectory_report(self._inputs.source, self._inputs.stream.source, self._mapper),
+            **trajectory_report(self._inputs.source, self._inputs.stream.source, self._mapper, evaluator),
             "targets": [] if graph is None else list(graph.targets),
             "loops": asdict(self._mapper.loops),
             "frames_corrupt": self._corrupt.count,
@@ -301,22 +305,22 @@ class _Run:
         }
         prepare_folder(options.out)
         keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
-        viewer = view_map(self._gaussians, mission.backend, mission.threads) if keyframes else None
-        if viewer is not None:
-            self._training_scores = score_training_views(viewer, keyframes)
+        viewer = view_map(self._gaussians, mission.backend, mission.threads)
+        if evaluator is not None and keyframes:
+            self._training_scores = evaluator.training_fit(viewer, keyframes)
             self._report["training_views"] = asdict(self._training_scores)
         write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
         write_poses(options.out, self._mapper.poses, self._prior.motion)
         self._timeline.write(options.out)
         self._recorder.write(options.out)
         write_keyframes(options.out, self._mapper.keyframes())
-        if viewer is not None:
-            write_png(options.out / PREVIEW, render_preview(viewer, keyframes))
+        if evaluator is not None and keyframes:
+            write_png(options.out / PREVIEW, evaluator.preview(viewer, keyframes))
 
     def raise_if_failed(self, result: MissionResult) -> None:
         """Raise the error that ended the run early, the interrupt with a text on what is kept, or that of saving."""
         if isinstance(result.stopped_by, KeyboardInterrupt):
-            raise type(result.stopped_by)(_interrupted_text(self._options, result))
+            raise type(result.stopped_by)(_interrupted_text(self._options, result, self._training_scores is not None))
         result.raise_if_stopped()
         if self._save_error is not None:
             raise self._save_error
@@ -335,10 +339,10 @@ class _Run:
         skipped = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
         active = report["active_gaussians"]
         in_region = f" ({active:,} in the task's region)" if active or self._inputs.schedule.graphs() else ""
+        shown = "" if self._training_scores is None else f"; {PREVIEW} in the same folder shows it"
         print(
             f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
-            f"{len(self._gaussians):,} Gaussians{in_region} → {self._options.out / 'map.ply'}; {PREVIEW} in the same "
-            "folder shows it"
+            f"{len(self._gaussians):,} Gaussians{in_region} → {self._options.out / 'map.ply'}{shown}"
         )
         if totals.late:
             print(f"  {totals.late} of {totals.frames} frames missed the deadline of --rate {self._options.rate:g}")
@@ -400,19 +404,27 @@ def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextMana
     """Return the page of a run, whose context gives what to call after each frame; no page without a port."""
     if port is None:
         return nullcontext(lambda _outcome: None)
-    page: AbstractContextManager[Callable[[FrameOutcome], None]]
-    page = sibling(Sibling.MISSION_PAGE).mission_view(port, mission)
-    return page
+    return load_pages("--view").mission_view(port, mission)
 
 
-def _interrupted_text(options: argparse.Namespace, result: MissionResult) -> str:
+def _interrupted_text(options: argparse.Namespace, result: MissionResult, has_preview: bool) -> str:
     """Return how many frames an interrupted run has mapped, where its files are, and how to resume it."""
     if result.processed == 0:
         return "no frame was mapped, and no file was written"
-    text = f"{result.totals.frames} frames are mapped; map.ply, report.json and {PREVIEW} are in {options.out}"
+    files = f"map.ply, report.json and {PREVIEW}" if has_preview else "map.ply and report.json"
+    text = f"{result.totals.frames} frames are mapped; {files} are in {options.out}"
     if options.save_state is None:
         return f"{text}; only a run with save-state can be resumed"
     return f"{text}; continue with --set resume={options.save_state}"
+
+
+def _evaluator() -> tuple[Evaluator | None, tuple[str, ...]]:
+    """Return what scores the run; None and a note without its package."""
+    try:
+        evaluator: Evaluator = load(Group.EVALUATORS, purpose=f"no scores and no {PREVIEW}")
+    except MissingPluginError as error:
+        return None, (str(error),)
+    return evaluator, ()
 
 
 def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from gausslite.domain.pose import inverse, transform_points
 
 _MAX_COORDINATE_M = 1e6
 _NEAR_M = 1e-3
+MIN_ROI_PIXELS = 64
+"""A view with fewer region pixels does not show the region: it is not scored there, and pictures avoid it."""
 
 
 @runtime_checkable
@@ -271,3 +273,13 @@ class RelevanceMap:
     def roi_share(self) -> float:
         """Fraction of pixels in the task's region."""
         return float(np.count_nonzero(self.pixel_weights) / self.pixel_weights.size)
+
+
+def largest_roi_per_segment(roi_pixels: Sequence[int], count: int) -> set[int]:
+    """Return the place of the largest region in each of `count` segments; of small ones only if all are small."""
+    if count < 1:
+        return set()
+    pixels = np.array(roi_pixels)
+    segments = [part for part in np.array_split(np.arange(len(pixels)), count) if len(part)]
+    best = {int(part[np.argmax(pixels[part])]) for part in segments}
+    return {i for i in best if pixels[i] >= MIN_ROI_PIXELS} or best

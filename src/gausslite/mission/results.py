@@ -28,9 +28,9 @@ from gausslite.datasets.folder import format_pose_rows, read_pose_rows
 from gausslite.domain.errors import InvalidInputError, MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import CorrectionTrack, UpAxis, pose_at, unit_up_axis
+from gausslite.domain.relevance import largest_roi_per_segment
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseHistory
-from gausslite_evaluation.views import largest_roi_per_segment
 
 _PHOTOGRAPHS = 4
 

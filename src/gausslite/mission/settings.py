@@ -34,7 +34,7 @@ from gausslite.mission.frame_scheduler import SchedulerSettings
 from gausslite.nouns import meant_by
 from gausslite.perception.detector import DEFAULT_TILES_PER_SIDE, MAX_TILES_PER_SIDE
 from gausslite.perception.settings import RelevanceTrackerSettings
-from gausslite.render.choose import BACKENDS
+from gausslite.render.choose import backends
 from gausslite.render.cpu import MAX_THREADS, choose_threads
 
 DEFAULT_MAX_GAUSSIANS = 150_000
@@ -307,7 +307,7 @@ class MissionSettings:
         metadata=MAY_CHANGE,
     )
     backend: str = option(
-        "auto", "backend that renders and trains", key="rasterizer", choices=BACKENDS, metadata=MAY_CHANGE
+        "auto", "backend that renders and trains", key="rasterizer", choices=backends(), metadata=MAY_CHANGE
     )
     pose_prior: PoseExposurePrior = option(
         PoseExposurePrior(),

@@ -61,6 +61,7 @@ MAX_UPDATE_COUNT = 20_000
 
 TILE_PX = 16
 NEAR_M, DILATION_PX2 = 0.05, 0.3
+MIN_ALPHA = 1.0 / 255.0
 TANGENT_MARGIN = 1.3
 """Limit of the tangents in the Jacobian, as a factor of half the field of view."""
 MAX_READOUT_SHARE, MIN_ROW_RATE = 0.65, 0.5
@@ -234,7 +235,7 @@ class Rasterizer(Protocol):
 
     @property
     def name(self) -> str:
-        """`reference`, `cpu` or `cuda`."""
+        """The value of the option `rasterizer`, such as `cpu`."""
         ...
 
     def forward(

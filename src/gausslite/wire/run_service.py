@@ -12,6 +12,7 @@ from enum import StrEnum
 from typing import Any
 
 from gausslite.domain.errors import GaussLiteError
+from gausslite.plugins import absent_package
 from gausslite.process import print_message, printable
 
 
@@ -67,4 +68,9 @@ def run_service(program: str, serve: Callable[[], Coroutine[Any, Any, int]]) -> 
         return asyncio.run(serve())
     except GaussLiteError as error:
         print_message(f"{program}: {error}")
+        return 2
+    except ModuleNotFoundError as error:
+        if (package := absent_package(error)) is None:
+            raise
+        print_message(f"{program}: needs the package {package}, which is not installed")
         return 2

@@ -30,7 +30,7 @@ def configure_gpu(parser: argparse.ArgumentParser) -> None:
 def run_gpu(options: argparse.Namespace) -> int:
     """Run the benchmark and print a table or one JSON object. Raises KernelError without a usable GPU."""
     rasterizer = choose_rasterizer("cuda")
-    from gausslite_gpu import CudaRasterizer
+    from gausslite_gpu.rasterizer import CudaRasterizer
 
     if not isinstance(rasterizer, CudaRasterizer):
         raise KernelError(f"bench gpu: expected the cuda backend, got {rasterizer.name}")

@@ -22,8 +22,8 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import rotation_angle_deg, transform_of, translation_m
 from gausslite.mission.results import as_text
 from gausslite.mission.settings import SourceSettings
+from gausslite.render.map_viewer import view_map
 from gausslite_bench.loop_trials import LoopScore, LoopTrials
-from gausslite_evaluation.views import view_map
 from gausslite_places.localisation import PlaceMap
 from gausslite_places.prior_map import MAX_LOCALISED_FRAMES, SavedMap
 

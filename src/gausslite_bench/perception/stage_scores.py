@@ -14,7 +14,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import NounMatch
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.relevance import Detection, Region
+from gausslite.domain.relevance import MIN_ROI_PIXELS, Detection, Region
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.perception.detector import Detector
 from gausslite.perception.relevance import TaskRelevanceEstimator
@@ -22,7 +22,6 @@ from gausslite.perception.relevance_tracker import merge_detections
 from gausslite.perception.settings import EvidenceSettings, RelevanceTrackerSettings
 from gausslite_bench.perception.past_frames import PastFrames
 from gausslite_bench.perception.shared_detections import SharedDetections
-from gausslite_evaluation.views import MIN_ROI_PIXELS
 
 _MIN_FOUND_SHARE = 0.25
 

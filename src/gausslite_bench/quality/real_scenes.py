@@ -18,10 +18,11 @@ from gausslite.datasets.source import HeldOutSplit, Source
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
+from gausslite.domain.relevance import MIN_ROI_PIXELS
 from gausslite.mission.settings import SceneInfo
 from gausslite.nouns import head_of
 from gausslite_bench.quality.scenes import PosePolicy, Scene, UnseenRegionError, make_scene, require_count
-from gausslite_evaluation.views import MIN_ROI_PIXELS, HeldOutView
+from gausslite_evaluation.views import HeldOutView
 
 REAL_CAMERA = PosePolicy(PoseExposurePrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03), fit_views=True)
 """A handheld camera with automatic exposure, tracked to about a centimetre."""

@@ -25,11 +25,12 @@ from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.relevance import NoTaskEstimator, RelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
+from gausslite.render.map_viewer import MapViewer
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene, ScenePlan
 from gausslite_evaluation.compare import MapScores, average, score_view
 from gausslite_evaluation.lpips import Lpips
 from gausslite_evaluation.pictures import to_uint8
-from gausslite_evaluation.views import MapViewer, largest_roi_views, render_fitted, render_fitted_at_region
+from gausslite_evaluation.views import largest_roi_views, render_fitted, render_fitted_at_region
 
 SHEET_VIEWS = 2
 

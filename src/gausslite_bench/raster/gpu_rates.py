@@ -27,8 +27,8 @@ from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, ZERO_LE
 
 if TYPE_CHECKING:
     from gausslite_bench.raster.gsplat_baseline import Rasterization
-    from gausslite_gpu import CudaRasterizer
     from gausslite_gpu.loss import CudaView
+    from gausslite_gpu.rasterizer import CudaRasterizer
 
 GPU_GAUSSIANS = (100_000, 300_000, 1_000_000, 3_000_000)
 FRAME_GAUSSIANS = 1_000_000

@@ -19,11 +19,11 @@ from gausslite.fusion.store_values import MissionConfig
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome
 from gausslite.render.choose import choose_rasterizer
+from gausslite.render.map_viewer import MapViewer
 from gausslite_bench.team.frame_errors import FrameError
 from gausslite_bench.team.missions import AgentMap, map_agent
 from gausslite_bench.team.scenes import TeamPlan, TeamScene
 from gausslite_evaluation.compare import MapScores, score_team
-from gausslite_evaluation.views import MapViewer
 from gausslite_places.frame_aligner import MapAligner
 
 CONCATENATION, VOTE, REFINED, SHARED_VOTE = "concatenation", "vote", "refine", "vote of shared regions"

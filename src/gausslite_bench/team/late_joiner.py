@@ -17,10 +17,11 @@ from gausslite.mission.settings import MissionSettings, SceneInfo
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite.render.choose import choose_rasterizer
+from gausslite.render.map_viewer import MapViewer
 from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_bench.team.scenes import TeamPlan
 from gausslite_evaluation.metrics import psnr
-from gausslite_evaluation.views import HeldOutView, MapViewer
+from gausslite_evaluation.views import HeldOutView
 
 _CHECKED = (1, 2, 4, 8, 16, 32, 64, 128)
 

@@ -14,14 +14,14 @@ from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectReport, TeamObject
 from gausslite.domain.pose import transform_points
-from gausslite.domain.relevance import Region
+from gausslite.domain.relevance import MIN_ROI_PIXELS, Region
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.fusion.objects import find_objects, merge_objects
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.settings import PerceptionSettings
 from gausslite.nouns import same_kind
 from gausslite_bench.team.scenes import AgentScene, TeamScene
-from gausslite_evaluation.views import MIN_ROI_PIXELS, HeldOutView
+from gausslite_evaluation.views import HeldOutView
 from gausslite_language.rules import RuleParser
 
 _CELL_M = 0.02

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
+from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import CodecError, InvalidInputError, QuotaError
@@ -21,7 +22,6 @@ from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mapping.settings import ONLINE_RATES, DensitySettings
 from gausslite.render.cpu import CpuRasterizer
 from gausslite.render.rasterizer import AdamSettings
-from gausslite.render.reference import ReferenceRasterizer
 from gausslite.wire.convert import decode_frame
 
 CAMERA = Camera(30.0, 30.0, 12.0, 9.0, 24, 18)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mapping_scenes import middle_relevance, wall_frame
+from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.domain.camera import CameraMotion
 from gausslite.domain.frame import Frame
@@ -16,7 +17,6 @@ from gausslite.mapping.keyframes import frame_from_state, frame_state
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeder, SeedingContext
 from gausslite.mapping.settings import Components, MapperSettings, SeedingSettings
-from gausslite.render.reference import ReferenceRasterizer
 
 _APPROACH = CameraMotion(Twist(np.array([0.0, 0.0, 2.0]), np.zeros(3)), readout_s=0.05)
 

@@ -145,7 +145,7 @@ def test_all_options_that_differ_are_named(saved: Path) -> None:
     run = SavedRun.read(saved)
     run.require(*SETTINGS)
     # threads and backend may change
-    run.require(MissionSettings(threads=1, backend="reference"), SETTINGS[1])
+    run.require(MissionSettings(threads=1, backend="cpu"), SETTINGS[1])
     other = MissionSettings(policy="uniform", rate_hz=4.0, max_gaussians=9), TaskSettings("Find the chair")
     with pytest.raises(MismatchError) as caught:
         run.require(*other)

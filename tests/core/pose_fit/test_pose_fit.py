@@ -21,9 +21,10 @@ from gausslite.mapping.settings import KeyframeSettings, MapperSettings, Optimiz
 from gausslite.pose_fit.exposure import AffineExposure, fit_exposure
 from gausslite.pose_fit.photometric import fit_pose
 from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.map_viewer import MapViewer
 from gausslite.render.rasterizer import Rendering
 from gausslite_evaluation.metrics import psnr
-from gausslite_evaluation.views import MapViewer, render_fitted
+from gausslite_evaluation.views import render_fitted
 
 SIZE = (96, 72)
 LOOSE = PoseExposurePrior(translation_m=1.0, rotation_deg=20.0, gain=1.0, offset=1.0)

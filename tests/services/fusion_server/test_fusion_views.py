@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fusion_running import CAMERA, GRID, frame, fusion_server, make_subset
 from sample_gaussians import textured_corner
+from torch_oracle.rasterizer import ReferenceRasterizer
 from waiting import wait_until
 
 from gausslite.domain.camera import Camera
@@ -23,7 +24,6 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import MapRenderer
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
-from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
 from gausslite_fusion_server import servicer

@@ -8,6 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 from fusion_running import GRID, keys, make_subset
+from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
@@ -17,7 +18,6 @@ from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store_values import MissionConfig
-from gausslite.render.reference import ReferenceRasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.map_changes import EncodedPartCache

@@ -1,4 +1,4 @@
-"""The reference backend in torch: checks, projection, compositing, the loss of Eq. (1), Adam."""
+"""The oracle of all backends, in torch: checks, projection, compositing, the loss of Eq. (1), Adam."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from gausslite.render.rasterizer import (
     GRAD_2D_COUNT,
     GRAD_2D_SUM,
     MAX_UPDATE_COUNT,
+    MIN_ALPHA,
     TILE_PX,
     UPDATE_COUNT,
     AdamSettings,
@@ -39,7 +40,7 @@ from gausslite.render.rasterizer import (
     require_tables,
     require_view,
 )
-from gausslite.render.reference_projection import MIN_ALPHA, Ellipses, ImageModel, apply_twist, project, tile_grid
+from torch_oracle.projection import Ellipses, ImageModel, apply_twist, project, tile_grid
 
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
