@@ -51,7 +51,7 @@ def open_detector(path: Path, options: DetectorOptions) -> Detector:
         detector: Detector | None = reader.open(path, options)
         if detector is not None:
             return detector
-    detector = load(Group.DETECTORS).open(path, options)
+    detector = load(Group.DETECTORS, purpose="--detector").open(path, options)
     if detector is None:
         raise ModelFileError(f"model {path}: expected a file that an installed reader of detectors knows")
     return detector
@@ -59,4 +59,5 @@ def open_detector(path: Path, options: DetectorOptions) -> Detector:
 
 def detector_advice() -> str:
     """Return how a user gets a file, of each reader. Raises MissingPluginError if no reader is installed."""
-    return "; or ".join(reader.advice() for _, reader in installed(Group.DETECTORS)) or load(Group.DETECTORS).advice()
+    advice = "; or ".join(reader.advice() for _, reader in installed(Group.DETECTORS))
+    return advice or str(load(Group.DETECTORS, purpose="--detector").advice())
