@@ -234,13 +234,13 @@ def model_checks(folder: Path) -> Iterator[Check]:
     if find_spec("gausslite_detectors") is None:
         yield Check("models", "ok", "the package gausslite_detectors, which reads them, is not installed")
         return
-    from gausslite_detectors.models import CATALOGUE, detector_advice
+    from gausslite_detectors.models import CATALOGUE, READER
 
     present = [entry for entry in CATALOGUE if (folder / entry.file_name).exists()]
     for entry in present:
         yield _model(entry, folder / entry.file_name)
     if not present:
-        advice = f"For --detector, {detector_advice()}; `gausslite models list` lists others"
+        advice = f"For --detector, {READER.advice()}; `gausslite models list` lists others"
         yield Check("models", "ok", f"no model files in {folder}", advice)
 
 

@@ -107,13 +107,6 @@ def entry_named(name: str) -> ModelEntry:
     raise InvalidInputError(f"model {name!r}: expected one of {', '.join(entry.name for entry in CATALOGUE)}")
 
 
-def detector_advice() -> str:
-    """Return how to make the simplest file for --detector, in one line."""
-    entry = entry_named("yolo-seg")
-    commands = entry.export.replace("\n", " && ")
-    return f"make {entry.file_name} ({entry.licence}) with: {commands}"
-
-
 VOCABULARY: Final = "vocab.txt"
 OWN_MASKS, DEPTH = "yolo", "depth"
 
@@ -186,7 +179,9 @@ class OnnxReader:
 
     def advice(self) -> str:
         """Return how to make the simplest file, in one line."""
-        return detector_advice()
+        entry = entry_named("yolo-seg")
+        commands = entry.export.replace("\n", " && ")
+        return f"make {entry.file_name} ({entry.licence}) with: {commands}"
 
 
 READER: Final = OnnxReader()
