@@ -79,7 +79,7 @@ def _require_effect(options: argparse.Namespace, chosen: Format) -> None:
     """Raise InvalidInputError for an option that the chosen format does not use."""
     for option in ("voxel", "min_opacity", "seconds"):
         if getattr(options, option) is not None and option not in chosen.uses:
-            formats = " or ".join(name for name, each in installed(Group.EXPORTERS) if option in each.uses)
+            formats = " or ".join(name for name, other in installed(Group.EXPORTERS) if option in other.uses)
             flag = "--" + option.replace("_", "-")
             raise InvalidInputError(f"{flag}: expected with --to {formats}, got --to {options.to}")
 
