@@ -326,8 +326,9 @@ def add_flags(parser: argparse._ActionsContainer, settings_class: type, *keys: s
     """Add these options of a settings class, or all, as flags of a command that reads no file and no variables."""
     for key, declared in options_of(settings_class).items():
         if not keys or key in keys:
-            convert = partial(_convert_text, declared)
-            parser.add_argument(f"--{key}", type=convert, default=declared.default, **_argument(declared))
+            convert, needed = partial(_convert_text, declared), declared.default is MISSING
+            default = None if needed else declared.default
+            parser.add_argument(f"--{key}", type=convert, default=default, required=needed, **_argument(declared))
 
 
 def _convert_text(declared: OptionField, text: str) -> Any:
