@@ -25,7 +25,7 @@ from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import chosen_detector
 from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
 from gausslite.mission.runner import CorruptFrames
-from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
+from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.pages import Pages, load_pages
 from gausslite.process import print_message, size_text
 from gausslite.render.choose import choose_rasterizer
@@ -164,7 +164,6 @@ def configure(parser: CommandParser) -> None:
     Program.of(
         *(DemoOptions, RecordingOptions, PerceptionSettings, MissionSettings),
         flags="source task-a task-b objects size detector max-gaussians iterations seed out overwrite",
-        removed=REMOVED,
     ).add_to(parser)
     parser.set_defaults(run=run)
 

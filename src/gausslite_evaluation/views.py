@@ -54,7 +54,6 @@ def largest_roi_views(views: Sequence[HeldOutView], count: int) -> set[int]:
 
 
 _ROUNDS = 4
-"""A fit at the region uses the region's pixels and this margin: the outline also fixes the pose."""
 
 
 def render_fitted(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior = HANDHELD_PRIOR) -> Rendering:

@@ -19,7 +19,7 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.task import require_task_text
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings, PoseMode, SourceSettings
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SourceSettings
 from gausslite.process import print_message
 from gausslite.wire.channel import AGENT_ADDRESS, MAX_PORT, require_callable
 from gausslite.wire.security import Tls, TlsFiles
@@ -198,11 +198,6 @@ PROGRAM = Program.of(
     "iterations rate exit-when-done frame prior",
     defaults={"source": None, "keyframes": None, "idle-iterations": None, "save-interval": 60.0},
     computed={"idle-iterations": _idle_iterations_unless_set},
-    removed={
-        **REMOVED,
-        "traces": "the package opentelemetry-instrumentation-grpc traces calls",
-        "free-space": "the server compares surfaces only",
-    },
 )
 
 
