@@ -48,10 +48,7 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str]] = {
     "perception": (configure_perception, "accuracy of a detector's masks against ground truth, stage by stage"),
     "parser": (configure_parser, "accuracy and speed of a task parser on known sentences"),
     "loop": (configure_loop, "frame rate, time of each stage and memory of one agent's mapping loop"),
-    "raster": (
-        _Measurement(RasterSettings, run_raster),
-        "time of the CPU rasterizer's operations on a room",
-    ),
+    "raster": (_Measurement(RasterSettings, run_raster), "time of the CPU rasterizer's operations on a room"),
     "gpu": (_Measurement(GpuSettings, run_gpu), "time of the CUDA backend's operations on a room"),
     "server": (
         _Measurement(ServerBenchSettings, run_server),
@@ -61,10 +58,7 @@ _BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str]] = {
         _Measurement(ChaosSettings, run_chaos),
         "a fusion server and its agents under kills, partitions and a full disk",
     ),
-    "fuzz": (
-        _Measurement(FuzzSettings, run_fuzz),
-        "mutated messages for the codec and every method of the services",
-    ),
+    "fuzz": (_Measurement(FuzzSettings, run_fuzz), "mutated messages for the codec and every method of the services"),
 }
 
 

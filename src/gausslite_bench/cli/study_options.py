@@ -9,12 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 
-from gausslite.cli.source_options import (
-    RecordingOptions,
-    calibrate_with_messages,
-    open_recorded,
-    stated_values,
-)
+from gausslite.cli.source_options import RecordingOptions, calibrate_with_messages, open_recorded, stated_values
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.option import build, option
 from gausslite.config.program import add_flags

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gausslite.config.option import option
-from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.splat_table import SplatTable
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.cpu import CpuRasterizer, usable_simd
 from gausslite.render.rasterizer import FULL_FRAME, TILE_PX, AdamSettings, LossWeights, Rasterizer, Subset
+from gausslite_bench.cli.study_options import read_image_size
 from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
 from gausslite_bench.report import Report
 
@@ -33,10 +33,7 @@ _WARM_UP = 3
 
 def read_image_sizes(texts: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
     """Return the sizes of "WxH". Raises InvalidInputError."""
-    sizes = [tuple(int(side) if side.isdecimal() else 0 for side in text.lower().split("x")) for text in texts]
-    if not sizes or not all(len(size) == 2 and min(size) > 0 for size in sizes):
-        raise InvalidInputError(f"expected sizes such as 320x240,640x480, got {','.join(texts)!r}")
-    return tuple((size[0], size[1]) for size in sizes)
+    return tuple(map(read_image_size, texts))
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,5 +161,5 @@ def _texture(p_world: Float64[ndarray, "n 3"], shape: Int64[ndarray, " n"]) -> F
         waves += strength * np.sin(2.0 * np.pi * per_metre * (p_world @ rng.normal(size=3)))
     # offset from the walls, where rounding would decide the result of floor
     squares = np.floor(4.0 * p_world + 0.37).sum(axis=1) % 2.0
-    textured: Float64[ndarray, "n 3"] = colours[shape] * (0.7 + waves + 0.2 * squares)[:, None]
-    return np.clip(textured, 0.0, 1.0)
+    textured: Float64[ndarray, "n 3"] = np.clip(colours[shape] * (0.7 + waves + 0.2 * squares)[:, None], 0.0, 1.0)
+    return textured

@@ -31,6 +31,7 @@ TEXTS = {
     "fused-from-agent": "1,2,3,0,0,0,1",
     "disable": "mvo,sb",
     "task-at": "3:Find the mug",
+    "parser": "localhost:1",
     "fusion": "localhost:2",
     "health": "localhost:3",
     "peer-address": "localhost:4",
