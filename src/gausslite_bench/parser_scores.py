@@ -12,7 +12,6 @@ from pathlib import Path
 
 from gausslite.codec.json import graph_from_json
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import option
 from gausslite.config.program import Program
 from gausslite.config.task_parser import chosen_parser, parser_options
 from gausslite.domain.errors import InvalidInputError, TaskError
@@ -20,16 +19,6 @@ from gausslite.domain.task import TargetRole, TaskGraph, TaskParser
 from gausslite_bench.report import Report
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")
-
-
-@dataclass(frozen=True, slots=True)
-class ParserSettings:
-    """The options of `bench parser` beside those of the parser."""
-
-    sentences: Path = option(
-        SENTENCES, "sentences with their expected graphs (default: the set in the package)", metavar="FILE.json"
-    )
-    json: bool = option(False, "print JSON for scripts")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +47,10 @@ class ParserScore:
 
 def configure_parser(parser: CommandParser) -> None:
     """Add the options of `bench parser`."""
-    flags = "sentences json backend llm-model llm-url"
-    Program.of(ParserSettings, *parser_options(), flags=flags).add_to(parser)
+    sentences_help = "sentences with their expected graphs (default: the set in the package)"
+    parser.add_argument("--sentences", type=Path, default=SENTENCES, metavar="FILE.json", help=sentences_help)
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+    Program.of(*parser_options(), flags="backend llm-model llm-url").add_to(parser)
     parser.set_defaults(run=_run_parser)
 
 

@@ -134,8 +134,11 @@ class DemoOptions:
     )
     task_a: str = option("Pick up the mug on the table", "task of agent-a")
     task_b: str = option("Identify the chair closest to the table", "task of agent-b")
-    frames_a: str | None = option(None, "frames of agent-a (default: the first half)", metavar="START:STOP:STEP")
-    frames_b: str | None = option(None, "frames of agent-b (default: the second half)", metavar="START:STOP:STEP")
+    frames: str | None = option(
+        None,
+        "frames of each agent (default: all of its path in the home; of a sequence, one half each)",
+        metavar="START:STOP:STEP",
+    )
     objects: tuple[str, ...] = option(
         (), "objects whose region of interest (ROI) is scored (default: the tasks' targets)", metavar="A,B"
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from gausslite.cli.map_inputs import mission_settings, parse_task
 from gausslite.cli.progress import MappingBar
@@ -16,7 +15,7 @@ from gausslite.cli.source_options import (
     stated_values,
 )
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import build, option
+from gausslite.config.option import build
 from gausslite.config.program import Program
 from gausslite.datasets.source import Source, frame_size, select_frames
 from gausslite.domain.voxels import VoxelGrid
@@ -42,18 +41,12 @@ _HOME = "sim:home?seed=0&trajectory=0"
 _HOME_TASK = "Pick up the mug on the table"
 
 
-@dataclass(frozen=True, slots=True)
-class LoopOptions:
-    """The options of `bench loop` beside those of `gausslite map`."""
-
-    json: bool = option(False, "print JSON for scripts")
-
-
 def configure_loop(parser: CommandParser) -> None:
     """Add the options of `bench loop`."""
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     Program.of(
-        *(LoopOptions, RecordingOptions, SourceSettings, TaskSettings, PerceptionSettings, MissionSettings),
-        flags="frames size task detector roi objects policy max-gaussians iterations rate seed json",
+        *(RecordingOptions, SourceSettings, TaskSettings, PerceptionSettings, MissionSettings),
+        flags="frames size task detector roi objects policy max-gaussians iterations rate seed",
         positional="source",
         omit=("test-every",),
         defaults={"source": _HOME},

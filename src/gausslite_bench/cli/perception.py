@@ -43,14 +43,14 @@ class PerceptionBenchOptions:
         repeats=True,
     )
     threads: int | None = option(None, "the detector's threads (default: the runtime's choice)", low=1)
-    json: bool = option(False, "print JSON for scripts")
 
 
 def configure_perception(parser: CommandParser) -> None:
     """Add the options of `bench perception`."""
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     Program.of(
         *(PerceptionBenchOptions, RecordingOptions, SourceSettings, PerceptionSettings),
-        flags="detector frames size roi task json",
+        flags="detector frames size roi task",
         positional="source",
         omit=("test-every", "camera-correction", "pose-prior"),
     ).add_to(parser)
