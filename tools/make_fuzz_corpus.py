@@ -33,7 +33,7 @@ from gausslite.v1 import fusion_service_pb2 as fusion
 from gausslite.v1 import parser_service_pb2 as parser
 from gausslite.wire import convert
 from gausslite.wire.convert_task import graph_to_message, report_to_message
-from gausslite_bench.fuzz.corpus import AGENT_ID, CORPUS, SESSION_ID
+from gausslite_bench.fuzz.decoders import AGENT_ID, CORPUS, SESSION_ID
 from gausslite_bench.server.synthetic_updates import GRID, voxels_batch
 from gausslite_language.rules import RuleParser
 

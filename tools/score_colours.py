@@ -18,7 +18,6 @@ import numpy as np
 
 import gausslite as gl
 from gausslite.perception.colours import ColourMatch, basic_terms, match_colour, no_colours
-from gausslite.perception.settings import ColourSettings, SurfaceSettings
 from gausslite.perception.surface import mask_colours
 
 _LABELS = Path(__file__).with_name("home_colours.txt")
@@ -54,7 +53,7 @@ def object_colours(home: int, frames: int, size: str, gains: tuple[float, ...]) 
         for name, region in source.regions().items():
             mask = region.mask(frame)
             if np.count_nonzero(mask) >= _MIN_PIXELS:
-                sums[name] = sums.get(name, no_colours()) + mask_colours(mask, frame, SurfaceSettings())
+                sums[name] = sums.get(name, no_colours()) + mask_colours(mask, frame)
     yield from sums.items()
 
 
@@ -66,7 +65,7 @@ def score(homes: list[int], frames: int, size: str, gains: tuple[float, ...]) ->
             right, possible = labels.get((home, name), (set(), set(basic_terms())))
             for term in set(basic_terms()) - possible:
                 outcome = scores[term].right if term in right else scores[term].wrong
-                outcome[match_colour(term, colours, ColourSettings())] += 1
+                outcome[match_colour(term, colours)] += 1
     return scores
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import AsyncIterator, Sequence
+from typing import Self
 
 import grpc
 
@@ -30,19 +30,26 @@ def service_methods() -> dict[str, dict[str, bool]]:
     }
 
 
-class RawCalls:
-    """Owns a connection to one service; an asynchronous context manager. Raises InvalidInputError for its address."""
+class _Connection:
+    """Owns a channel; an asynchronous context manager. Raises InvalidInputError for a malformed address."""
 
-    def __init__(self, address: str, service: str) -> None:
-        require_callable("RawCalls address", address)
-        self._service = service
+    def __init__(self, address: str) -> None:
+        require_callable("address", address)
         self._channel = grpc.aio.insecure_channel(address, options=proxy_options(address))
 
-    async def __aenter__(self) -> RawCalls:
+    async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(self, *exception: object) -> None:
         await self._channel.close(None)
+
+
+class RawCalls(_Connection):
+    """The connection to one service."""
+
+    def __init__(self, address: str, service: str) -> None:
+        super().__init__(address)
+        self._service = service
 
     async def call(self, method: str, messages: Sequence[bytes], timeout_s: float) -> str:
         """Send the messages; returns OK after the first answer or a good end, else the name of the status code.
@@ -74,13 +81,10 @@ def is_stored(outcome: pb.SubsetOutcome) -> bool:
 
 
 class UpdateStream:
-    """One agent's stream. The methods raise grpc.aio.AioRpcError if the server ends it.
-
-    owner: of the latest subset, as in SubsetOutcome.
-    """
+    """One agent's stream. The methods raise grpc.aio.AioRpcError if the server ends it."""
 
     def __init__(self, stub: pb_grpc.FusionServiceAsyncStub, session_id: str) -> None:
-        self._stub, self.session_id, self.owner = stub, session_id, ""
+        self._stub, self._session_id = stub, session_id
         # without an iterator, the caller writes
         self._call = stub.ContributeSubsets()  # type: ignore[call-arg]
         self._sequence = 0
@@ -94,20 +98,6 @@ class UpdateStream:
             raise CodecError(f"subset {self._sequence}: expected an acknowledgement, got the end of the stream")
         if response.outcomes[0].status != pb.SUBSET_STATUS_ACCEPTED:
             raise CodecError(f"subset {self._sequence}: {response.outcomes[0].message or 'not accepted'}")
-        self.owner = response.outcomes[0].owner
-
-    async def resend(self, subsets: Sequence[bytes]) -> int:
-        """Send messages of the past again, in this order; returns how many got an outcome before the stream ended."""
-        count = 0
-        with contextlib.suppress(grpc.RpcError):
-            for subset in subsets:
-                self._sequence += 1
-                await self._call.write(self._request(subset, self._sequence))
-                if not isinstance(await self._call.read(), pb.ContributeSubsetsResponse):
-                    break
-                count += 1
-            await self.close()
-        return count
 
     async def close(self) -> None:
         """End the stream."""
@@ -125,22 +115,15 @@ class UpdateStream:
             pass
 
     def _request(self, subset: bytes, sequence: int) -> pb.ContributeSubsetsRequest:
-        return pb.ContributeSubsetsRequest(session_id=self.session_id, sequence=sequence, subset=subset)
+        return pb.ContributeSubsetsRequest(session_id=self._session_id, sequence=sequence, subset=subset)
 
 
-class UpdateStreams:
-    """Owns the connection; an asynchronous context manager. Raises InvalidInputError for a malformed address."""
+class UpdateStreams(_Connection):
+    """The connection to a fusion server."""
 
     def __init__(self, address: str) -> None:
-        require_callable("UpdateStreams address", address)
-        self._channel = grpc.aio.insecure_channel(address, options=proxy_options(address))
+        super().__init__(address)
         self._stub = pb_grpc.FusionServiceStub(self._channel)
-
-    async def __aenter__(self) -> UpdateStreams:
-        return self
-
-    async def __aexit__(self, *exception: object) -> None:
-        await self._channel.close(None)
 
     def open(self, session_id: str) -> UpdateStream:
         """Return a new stream of a session."""

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gausslite.codec.json import graph_from_json
+from gausslite.config.command_parser import CommandParser
+from gausslite.config.program import Program
+from gausslite.config.task_parser import chosen_parser, parser_options
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import TargetRole, TaskGraph, TaskParser
+from gausslite_bench.report import Report
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")
 
@@ -20,13 +25,11 @@ SENTENCES = Path(__file__).with_name("parser_sentences.json")
 class ParserScore:
     """Shares of correct sentences, milliseconds per sentence, and the texts whose graph is not exact.
 
-    A share per part of the graph: the set of its targets, their roles, the anchors, the relations with negation and
-    distances, the attributes, and the excluded objects. exact: all of them. opposites: the sentences without a warning
-    whose graph states the opposite: a relation with the wrong negation, an object to leave alone that is handled or
-    locates something, or an object to handle that is left alone.
+    A share for each part of the graph as a set; relations with negation and distances. exact: all of them. opposites:
+    the sentences without a warning whose graph states the opposite: a relation with the wrong negation, an object to
+    leave alone that is handled or locates something, or an object to handle that is left alone.
     """
 
-    backend: str
     sentences: int
     exact: float
     target_set: float
@@ -40,6 +43,21 @@ class ParserScore:
     slowest_ms: float
     by_fallback: int
     wrong: tuple[str, ...]
+
+
+def configure_parser(parser: CommandParser) -> None:
+    """Add the options of `bench parser`."""
+    sentences_help = "sentences with their expected graphs (default: the set in the package)"
+    parser.add_argument("--sentences", type=Path, default=SENTENCES, metavar="FILE.json", help=sentences_help)
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+    Program.of(*parser_options(), flags="backend llm-model llm-url").add_to(parser)
+    parser.set_defaults(run=_run_parser)
+
+
+def _run_parser(options: argparse.Namespace) -> int:
+    score = score_parser(chosen_parser(options).open(), load_sentences(options.sentences))
+    print(Report({"backend": options.backend, **asdict(score)}).text(options.json))
+    return 0
 
 
 def load_sentences(path: Path = SENTENCES) -> list[TaskGraph]:
@@ -59,7 +77,7 @@ def load_sentences(path: Path = SENTENCES) -> list[TaskGraph]:
 
 
 def score_parser(
-    backend: str, parser: TaskParser, expected: Sequence[TaskGraph], clock_s: Callable[[], float] = time.perf_counter
+    parser: TaskParser, expected: Sequence[TaskGraph], clock_s: Callable[[], float] = time.perf_counter
 ) -> ParserScore:
     """Return the scores of parsing every sentence once; a sentence that raises TaskError counts as wrong."""
     matches: list[tuple[bool, ...]] = []
@@ -75,10 +93,9 @@ def score_parser(
             fallbacks += any(warning.startswith("backend ") for warning in parsed.warnings)
             if not parsed.warnings and _is_opposite(graph, parsed):
                 opposites.append(graph.text)
-    targets, roles, anchors, relations, attributes, excluded = map(statistics.fmean, zip(*matches, strict=True))
     exact = [all(parts) for parts in matches]
+    targets, roles, anchors, relations, attributes, excluded = map(statistics.fmean, zip(*matches, strict=True))
     return ParserScore(
-        backend=backend,
         sentences=len(matches),
         exact=statistics.fmean(exact),
         target_set=targets,

@@ -25,7 +25,7 @@ from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import chosen_detector
 from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
 from gausslite.mission.runner import CorruptFrames
-from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings
+from gausslite.mission.settings import MissionSettings, PerceptionSettings
 from gausslite.pages import Pages, load_pages
 from gausslite.process import print_message, size_text
 from gausslite.render.choose import choose_rasterizer
@@ -134,8 +134,11 @@ class DemoOptions:
     )
     task_a: str = option("Pick up the mug on the table", "task of agent-a")
     task_b: str = option("Identify the chair closest to the table", "task of agent-b")
-    frames_a: str | None = option(None, "frames of agent-a (default: the first half)", metavar="START:STOP:STEP")
-    frames_b: str | None = option(None, "frames of agent-b (default: the second half)", metavar="START:STOP:STEP")
+    frames: str | None = option(
+        None,
+        "frames of each agent (default: all of its path in the home; of a sequence, one half each)",
+        metavar="START:STOP:STEP",
+    )
     objects: tuple[str, ...] = option(
         (), "objects whose region of interest (ROI) is scored (default: the tasks' targets)", metavar="A,B"
     )
@@ -164,7 +167,6 @@ def configure(parser: CommandParser) -> None:
     Program.of(
         *(DemoOptions, RecordingOptions, PerceptionSettings, MissionSettings),
         flags="source task-a task-b objects size detector max-gaussians iterations seed out overwrite",
-        removed=REMOVED,
     ).add_to(parser)
     parser.set_defaults(run=run)
 

@@ -107,10 +107,10 @@ def simulated_scenario(options: argparse.Namespace) -> Scenario:
         _HOME.format(seed=options.seed, trajectory=number, frames=_HOME_VIEWS if number == 2 else _HOME_FRAMES)
         for number in range(3)
     ]
-    missions = [(specs[0], options.task_a, options.frames_a), (specs[1], options.task_b, options.frames_b)]
+    missions, frames = [(specs[0], options.task_a), (specs[1], options.task_b)], options.frames or ":"
     agents = tuple(
-        AgentPlan(f"agent-{letter}", task, spec, frames or ":", len(select_frames(open_source(spec), frames or ":")))
-        for letter, (spec, task, frames) in zip("ab", missions, strict=True)
+        AgentPlan(f"agent-{letter}", task, spec, frames, len(select_frames(open_source(spec), frames)))
+        for letter, (spec, task) in zip("ab", missions, strict=True)
     )
     held_out = open_source(specs[2])
     size = frame_size(options.size or HOME_SIZE, held_out)
@@ -131,7 +131,7 @@ def recorded_scenario(options: argparse.Namespace) -> Scenario:
     """Return the halves of one sequence; every eighth frame is held out. Raises DatasetError, InvalidInputError."""
     recorded = open_recorded(options.source, None)
     middle = recorded.indices()[len(recorded) // 2]
-    first, second = options.frames_a or f":{middle}", options.frames_b or f"{middle}:"
+    first, second = options.frames or f":{middle}", options.frames or f"{middle}:"
     size, regions = frame_size(options.size, recorded), _scored_regions(options, recorded.regions())
     report_region_file(options.source, recorded)
     agents, held_out_positions = [], []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from jaxtyping import Float64
@@ -61,7 +61,6 @@ _PICTURES = 8
 class EvalOptions:
     """The options of `gausslite eval` beside those of the source and the regions."""
 
-    map: Path = option(MISSING, "a PLY file, or the results folder of a run", metavar="MAP")
     strict: bool = option(False, "end at a frame that cannot be read (default: skip it)")
     test_every: int | None = option(
         None,
@@ -75,8 +74,6 @@ class EvalOptions:
         f"given: score views from the given poses; refine: fit each view first; track: also start from {TRAJECTORY} "
         "next to MAP, for tracked maps (default: as the report next to MAP states that the map was made, else given)",
     )
-    pictures: Path | None = option(None, "write side-by-side pictures of a few views", metavar="DIR")
-    save_scores: bool = option(False, f"write the scores to {EVALUATION} next to MAP, for `gausslite report`")
     lpips_weights: Path | None = option(None, LPIPS_HELP)
     threads: int | None = option(
         None,
@@ -85,15 +82,19 @@ class EvalOptions:
         high=MAX_THREADS,
         computed=lambda _: choose_threads(None),
     )
-    json: bool = option(False, "print JSON for scripts")
 
 
 def configure(parser: CommandParser) -> None:
-    """Add the options of `gausslite eval`."""
+    """Add the options of `gausslite eval`; those of one call are no settings."""
+    parser.add_argument("map", type=Path, metavar="MAP", help="a PLY file, or the results folder of a run")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write side-by-side pictures of a few views")
+    scores_help = f"write the scores to {EVALUATION} next to MAP, for `gausslite report`"
+    parser.add_argument("--save-scores", action="store_true", help=scores_help)
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     Program.of(
         *(EvalOptions, RecordingOptions, SourceSettings, TaskSettings),
-        flags="frames size roi objects test-every poses pictures save-scores strict json",
-        positional="map source",
+        flags="frames size roi objects test-every poses strict",
+        positional="source",
         omit=("task", "pose-prior"),
     ).add_to(parser)
     parser.set_defaults(run=run)

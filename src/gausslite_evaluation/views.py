@@ -7,9 +7,8 @@ slightly wrong pose scores below a blurred map. The raw score includes pose erro
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
@@ -55,8 +54,6 @@ def largest_roi_views(views: Sequence[HeldOutView], count: int) -> set[int]:
 
 
 _ROUNDS = 4
-_REGION_MARGIN_PX = 8
-"""A fit at the region uses the region's pixels and this margin: the outline also fixes the pose."""
 
 
 def render_fitted(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior = HANDHELD_PRIOR) -> Rendering:
@@ -67,22 +64,6 @@ def render_fitted(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior = HA
     return _fit_to_image(viewer, frame, prior).rendering
 
 
-def render_fitted_at_region(
-    viewer: MapViewer, view: HeldOutView, prior: PoseExposurePrior = HANDHELD_PRIOR
-) -> Rendering:
-    """Return the rendering with the lowest squared colour error in the region, fitted at the region alone.
-
-    The fit starts at the pose of `render_fitted`, whose rendering is a candidate. It measures the region's sharpness
-    without the pose error that the rest of the map causes.
-    """
-    frame, best = view.frame, _fit_to_image(viewer, view.frame, prior)
-    near = cv2.dilate(view.roi.astype(np.uint8), np.ones((2 * _REGION_MARGIN_PX + 1,) * 2, np.uint8)) > 0
-    # the fits compare pixels with a measured depth
-    near_frame = replace(frame, depth_m=np.where(near, frame.depth_m, np.float32(0.0)))
-    candidates = [best, *_fit(viewer, near_frame, best.T_world_camera, prior)]
-    return min(candidates, key=lambda candidate: candidate.squared_error(frame, view.roi)).rendering
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
     """A rendering and the pose it was rendered from."""
@@ -90,10 +71,9 @@ class _Candidate:
     T_world_camera: Float64[ndarray, "4 4"]
     rendering: Rendering
 
-    def squared_error(self, frame: Frame, mask: Bool[ndarray, "h w"] | None = None) -> float:
-        """Return the mean squared colour error, inside the mask or over the whole image."""
-        squared = np.square(self.rendering.rgb - frame.rgb / np.float32(255.0))
-        return float(np.mean(squared if mask is None else squared[mask]))
+    def squared_error(self, frame: Frame) -> float:
+        """Return the mean squared colour error."""
+        return float(np.mean(np.square(self.rendering.rgb - frame.rgb / np.float32(255.0))))
 
 
 def _fit_to_image(viewer: MapViewer, frame: Frame, prior: PoseExposurePrior) -> _Candidate:

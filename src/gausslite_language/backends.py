@@ -27,7 +27,11 @@ class RuleBackend:
 
 @dataclass(frozen=True, slots=True)
 class ModelSettings:
-    """A language model. key_variable: the environment variable that has the key, which no setting and no file has."""
+    """A language model.
+
+    timeout_s: longest wait for the model; rules parse the task after that. key_variable: the environment variable that
+    has the server's key, which no setting and no file has.
+    """
 
     model: str | None = option(
         None,
@@ -50,20 +54,8 @@ class ModelSettings:
         choices=_RESPONSE_FORMATS,
         needs="backend=http",
     )
-    timeout_s: float = option(
-        10.0,
-        "longest wait for the model; rules parse the task after that",
-        key="llm-timeout",
-        unit="s",
-        low=0.001,
-        high=600,
-    )
-    key_variable: str = option(
-        "GAUSSLITE_LLM_API_KEY",
-        "environment variable that holds the API key of the server",
-        key="llm-key-variable",
-        metavar="NAME",
-    )
+    timeout_s: float = 10.0
+    key_variable: str = "GAUSSLITE_LLM_API_KEY"
 
     def __post_init__(self) -> None:
         check_options(self)

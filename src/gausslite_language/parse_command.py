@@ -4,28 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import MISSING, dataclass
 
 from gausslite.codec.json import graph_as_json
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import option
 from gausslite.config.program import Program
 from gausslite.config.task_parser import chosen_parser, parser_options
 from gausslite.domain.task import TargetRole, TaskGraph
 
 
-@dataclass(frozen=True, slots=True)
-class ParseOptions:
-    """The options of `gausslite parse` beside those of the parser."""
-
-    text: str = option(MISSING, 'for example "Pick up the mug on the table"', metavar="TEXT")
-    json: bool = option(False, "print JSON for scripts")
-
-
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite parse`."""
-    flags = "json backend llm-model llm-url"
-    Program.of(ParseOptions, *parser_options(), flags=flags, positional="text").add_to(parser)
+    parser.add_argument("text", metavar="TEXT", help='for example "Pick up the mug on the table"')
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+    Program.of(*parser_options(), flags="backend llm-model llm-url").add_to(parser)
     parser.set_defaults(run=run)
 
 

@@ -4,28 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import MISSING, dataclass
 from pathlib import Path
 
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import option
-from gausslite.config.program import Program
 from gausslite_places.map_diff import Change
 from gausslite_places.prior_map import SavedMap, compare_runs
 
 
-@dataclass(frozen=True, slots=True)
-class DiffOptions:
-    """The options of `gausslite diff`."""
-
-    before: Path = option(MISSING, "folder of the earlier run", metavar="RUN_A")
-    after: Path = option(MISSING, "folder of the later run", metavar="RUN_B")
-    json: bool = option(False, "print JSON for scripts")
-
-
 def configure(parser: CommandParser) -> None:
     """Add the options of `gausslite diff`."""
-    Program.of(DiffOptions, flags="json", positional="before after").add_to(parser)
+    parser.add_argument("before", type=Path, metavar="RUN_A", help="folder of the earlier run")
+    parser.add_argument("after", type=Path, metavar="RUN_B", help="folder of the later run")
+    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
     parser.set_defaults(run=run)
 
 

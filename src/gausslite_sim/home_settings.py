@@ -15,8 +15,7 @@ _SIDES_PX = (16, 4096)
 _NUMBER = r"-?[0-9]{1,2}(?:\.[0-9]{1,3})?"
 _CHANGES = re.compile(rf"(\w+):(?:gone|({_NUMBER}):({_NUMBER})(?::({_NUMBER}))?)")
 _NUMBERS = ("seed", "trajectory", "frames", "laps", "movers")
-_STRENGTHS = {"noise": "noise", "holes": "holes", "flying": "flying_pixels", "exposure": "exposure", "gloss": "gloss"}
-"""Fields of HomeSettings by the names in a spec."""
+_STRENGTHS = ("noise", "exposure")
 _TIMES = {"shutter": "readout_ms", "blur": "exposure_ms"}
 
 
@@ -24,13 +23,12 @@ _TIMES = {"shutter": "readout_ms", "blur": "exposure_ms"}
 class HomeSettings:
     """One trajectory through one home.
 
-    noise: scale of the sensor model; 0 disables it, and depth is exact. holes and flying_pixels: scales of missing
-    depth and of flying pixels. exposure: scale of the gain drift. gloss: scale of reflections. readout_ms: readout time
-    of a rolling shutter. exposure_ms: exposure time of a row. lens: distortion of both images. speed_deg_s: mean
-    angular speed, which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose poses the frames
-    have, in percent of the distance moved and of the angle turned; 0 for exact poses. laps: how often the path is
-    walked, every second time backwards. changes: the objects that are not where the home has them, with their shift in
-    metres, or None if they are gone. movers: boxes that move.
+    noise: scale of the sensor model; 0 disables it, and depth is exact. exposure: scale of the gain drift. readout_ms:
+    readout time of a rolling shutter. exposure_ms: exposure time of a row. lens: distortion of both images.
+    speed_deg_s: mean angular speed, which sets the frame rate; 0 for 30 Hz. drift_percent: error of the odometry whose
+    poses the frames have, in percent of the distance moved and of the angle turned; 0 for exact poses. laps: how often
+    the path is walked, every second time backwards. changes: the objects that are not where the home has them, with
+    their shift in metres, or None if they are gone. movers: boxes that move.
     """
 
     home: int = 0
@@ -39,10 +37,7 @@ class HomeSettings:
     frames: int = 120
     size_px: tuple[int, int] = (320, 240)
     noise: float = 1.0
-    holes: float = 1.0
-    flying_pixels: float = 1.0
     exposure: float = 1.0
-    gloss: float = 1.0
     readout_ms: float = 0.0
     exposure_ms: float = 0.0
     lens: Lens | None = None
@@ -65,10 +60,7 @@ class HomeSettings:
             ("blur", self.exposure_ms, "0ms to 100ms", 0.0 <= self.exposure_ms <= 100.0),
             ("drift", self.drift_percent, "0% to 20%", 0.0 <= self.drift_percent <= 20.0),
             ("speed", self.speed_deg_s, "0 to 1000 degrees per second", 0.0 <= self.speed_deg_s <= 1000.0),
-            *(
-                (key, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0)
-                for key, name in _STRENGTHS.items()
-            ),
+            *((name, getattr(self, name), "0 to 10", 0.0 <= getattr(self, name) <= 10.0) for name in _STRENGTHS),
         ):
             if not valid:
                 raise DatasetError(f"{self.home_name}: {name}: expected {expected}, got {value}")
@@ -86,7 +78,7 @@ class HomeSettings:
             if key in _NUMBERS and re.fullmatch(r"[0-9]{1,10}", value):
                 settings[key] = int(value)
             elif key in _STRENGTHS and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,9})?", value):
-                settings[_STRENGTHS[key]] = float(value)
+                settings[key] = float(value)
             elif key == "size" and (match := re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", value)):
                 settings["size_px"] = (int(match.group(1)), int(match.group(2)))
             elif key in _TIMES and (match := re.fullmatch(r"([0-9]{1,3}(?:\.[0-9]{1,3})?)ms", value)):

@@ -47,7 +47,6 @@ def _solids(colours: Palette) -> dict[str, Painter]:
         return lambda rng: textures.brushed(rng, colour).with_gloss(gloss)
 
     return {
-        "oak": lambda rng: textures.wood(rng, colours.light_wood, 0.9),
         "walnut": lambda rng: textures.wood(rng, colours.dark_wood, 0.6),
         "cherry": lambda rng: textures.wood(rng, (0.62, 0.33, 0.20), 0.5),
         "light_wood": lambda rng: textures.wood(rng, colours.light_wood, 0.7).with_gloss(0.06),
@@ -85,7 +84,6 @@ def _solids(colours: Palette) -> dict[str, Painter]:
         "lemon": mottled((0.93, 0.84, 0.22), 0.35),
         "pear": mottled((0.62, 0.68, 0.24), 0.5),
         "marble": fabric_textures.marble,
-        "concrete": fabric_textures.concrete,
         "leaf": printed_textures.leaf_veins,
         "striped_leaf": fabric_textures.striped_leaf,
     }

@@ -46,17 +46,15 @@ class RecordingCamera:
         return self.readout_s * ((np.arange(height) + 0.5) / height - 0.5)
 
 
-def render_recorded_view(scene: HomeScene, camera: RecordingCamera, poses_at: PosesAt, mirror: float = 1.0) -> View:
+def render_recorded_view(scene: HomeScene, camera: RecordingCamera, poses_at: PosesAt) -> View:
     """Return one view. Colour is the mean over the exposure, the rest is that of the middle of each row's exposure.
 
-    mirror: as in `render_view`. Raises InvalidInputError for a lens that cannot be inverted over the image.
+    Raises InvalidInputError for a lens that cannot be inverted over the image.
     """
     row_times_s, samples = camera.row_times_s(), _exposure_samples(camera, poses_at)
     shares = (np.arange(samples) + 0.5) / samples - 0.5
     views = [
-        render_view(
-            scene, RayCamera(camera.camera, poses_at(row_times_s + share * camera.exposure_s), camera.lens), mirror
-        )
+        render_view(scene, RayCamera(camera.camera, poses_at(row_times_s + share * camera.exposure_s), camera.lens))
         for share in shares
     ]
     rgb: Float32[ndarray, "h w 3"] = np.stack([view.rgb for view in views]).mean(axis=0, dtype=np.float32)

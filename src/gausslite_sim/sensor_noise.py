@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,15 +31,3 @@ class SensorNoise:
     gloss_loss: float = 0.0
     colour_read: float = 1.6
     colour_shot: float = 0.16
-
-    def scaled(self, holes: float, flying_pixels: float) -> SensorNoise:
-        """Return the noise with the frequency of holes and flying pixels scaled; 0 disables them."""
-        return replace(
-            self,
-            edge_loss=holes * self.edge_loss,
-            speckle_loss=holes * self.speckle_loss,
-            dark_loss=holes * self.dark_loss,
-            gloss_loss=holes * self.gloss_loss,
-            grazing_cosine=self.grazing_cosine if holes > 0 else 0.0,
-            edge_flight=flying_pixels * self.edge_flight,
-        )

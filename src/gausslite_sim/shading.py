@@ -42,7 +42,6 @@ def add_reflections(
     hits: Hits,
     directions: Float32[ndarray, "n 3"],
     origins_m: Float32[ndarray, "n 3"],
-    mirror: float,
 ) -> None:
     """Add the reflections of the home and its lamps to the colours of glossy hits, in place."""
     triangle = hits.triangle
@@ -54,7 +53,7 @@ def add_reflections(
     cosine = -np.einsum("nc,nc->n", incoming, normals)
     reflected = incoming + 2 * cosine[:, None] * normals
     points = origins_m[glossy] + hits.distance[glossy, None] * directions[glossy] + np.float32(_LIFT_M) * normals
-    strength = np.float32(mirror) * scene.triangles.gloss[triangle[glossy]]
+    strength = scene.triangles.gloss[triangle[glossy]]
     share = strength * (_HEAD_ON + (1 - _HEAD_ON) * (1 - np.clip(cosine, 0, 1)) ** 5)
     second_hits = scene.cast(np.ascontiguousarray(points, np.float32), np.ascontiguousarray(reflected, np.float32))
     reflection = diffuse_colour(scene, second_hits, np.float32(_BLUR_PER_M) * np.minimum(second_hits.distance, 10.0))

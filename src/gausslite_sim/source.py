@@ -129,9 +129,8 @@ class SimulatedHome(Source):
         view = self._apply_exposure(self._render(i), i)
         if settings.noise > 0:
             rng = np.random.default_rng([settings.seed, settings.trajectory, i])
-            sensor_noise = home.plan.sensor.scaled(settings.holes, settings.flying_pixels)
-            rgb = noisy_colour(view, sensor_noise, settings.noise, rng)
-            depth_m = noisy_depth(view, sensor_noise, settings.noise, rng)
+            rgb = noisy_colour(view, home.plan.sensor, settings.noise, rng)
+            depth_m = noisy_depth(view, home.plan.sensor, settings.noise, rng)
         else:
             rgb, depth_m = colour_image(view.rgb), view.depth_m
         image = resize_rgbd(RgbdImage(rgb, depth_m, self._camera), size)
@@ -200,7 +199,7 @@ class SimulatedHome(Source):
         settings, scene = self._settings, self._home.scene
         if settings.readout_ms == 0 and settings.exposure_ms == 0:
             ray_camera = RayCamera(self._camera, self._poses[i], settings.lens)
-            view = render_view(scene, ray_camera, settings.gloss)
+            view = render_view(scene, ray_camera)
             return with_box(view, ray_camera, box_centre_m(self._poses, i)) if settings.movers else view
         camera = RecordingCamera(self._camera, settings.lens, settings.readout_ms / 1e3, settings.exposure_ms / 1e3)
         path = self._path
@@ -208,7 +207,7 @@ class SimulatedHome(Source):
         def poses_at(seconds: Float64[ndarray, " n"]) -> Float64[ndarray, "n 4 4"]:
             return path(settings.frames, i + seconds / self._interval_s)
 
-        return render_recorded_view(scene, camera, poses_at, settings.gloss)
+        return render_recorded_view(scene, camera, poses_at)
 
     def _apply_exposure(self, view: View, i: int) -> View:
         """Return the view with the simulated exposure."""

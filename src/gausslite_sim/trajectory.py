@@ -13,7 +13,6 @@ from gausslite_sim.mesh import Vector
 
 
 @runtime_checkable
-@runtime_checkable
 class TrajectorySampler(Protocol):
     """Returns poses T_world_camera along a path (z up; OpenCV camera axes, no roll)."""
 

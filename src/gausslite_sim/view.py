@@ -35,17 +35,14 @@ class View:
     gloss: Float32[ndarray, "h w"]
 
 
-def render_view(scene: HomeScene, camera: RayCamera, mirror: float = 1.0) -> View:
-    """Return one view; depth is that of the ray through the pixel's centre, along the optical axis of its row.
-
-    mirror: scale of reflections; 0 renders all surfaces matt.
-    """
+def render_view(scene: HomeScene, camera: RayCamera) -> View:
+    """Return one view; depth is that of the ray through the pixel's centre, along the optical axis of its row."""
     shape = camera.shape
     pixels = camera.pixels()
     rays = camera.rays(pixels, *camera.centres(pixels))
     hits = scene.cast(rays.origins_m, rays.directions)
     depth_m = _depth(hits)
-    rgb, facing = _shade(scene, hits, rays, camera, mirror)
+    rgb, facing = _shade(scene, hits, rays, camera)
     item = np.where(hits.triangle == NO_HIT, NO_HIT, scene.triangles.item[hits.triangle])
     texture = scene.triangles.texture[hits.triangle]
     edge = np.flatnonzero(_edges(*(image.reshape(shape) for image in (item, texture, depth_m, facing))))
@@ -54,9 +51,9 @@ def render_view(scene: HomeScene, camera: RayCamera, mirror: float = 1.0) -> Vie
         fine_columns = (columns[:, None] + _SUBSAMPLES[:, 0]).ravel()
         fine_rows = (rows[:, None] + _SUBSAMPLES[:, 1]).ravel()
         fine = camera.rays(np.repeat(edge, len(_SUBSAMPLES)), fine_columns, fine_rows)
-        fine_rgb, _ = _shade(scene, scene.cast(fine.origins_m, fine.directions), fine, camera, mirror)
+        fine_rgb, _ = _shade(scene, scene.cast(fine.origins_m, fine.directions), fine, camera)
         rgb[edge] = fine_rgb.reshape(-1, len(_SUBSAMPLES), 3).mean(axis=1)
-    gloss = mirror * np.where(hits.triangle == NO_HIT, np.float32(0), scene.triangles.gloss[hits.triangle])
+    gloss = np.where(hits.triangle == NO_HIT, np.float32(0), scene.triangles.gloss[hits.triangle])
     return View(rgb.reshape(*shape, 3), *(image.reshape(shape) for image in (depth_m, item, facing, gloss)))
 
 
@@ -80,15 +77,14 @@ def _depth(hits: Hits) -> Float32[ndarray, " n"]:
 
 
 def _shade(
-    scene: HomeScene, hits: Hits, rays: Rays, camera: RayCamera, mirror: float
+    scene: HomeScene, hits: Hits, rays: Rays, camera: RayCamera
 ) -> tuple[Float32[ndarray, "n 3"], Float32[ndarray, " n"]]:
     """Return the shaded colour of each hit, black without a hit, and |cos| of the incidence."""
     facing = facing_of(scene, hits, rays.directions)
     # geometric mean of the pixel's footprints across and along the slope
     pixel_m = camera.camera.length_m(1.0, hits.distance) / np.sqrt(np.maximum(facing, 0.05))
     rgb = diffuse_colour(scene, hits, pixel_m)
-    if mirror > 0:
-        add_reflections(scene, rgb, hits, rays.directions, rays.origins_m, mirror)
+    add_reflections(scene, rgb, hits, rays.directions, rays.origins_m)
     return rgb, facing
 
 

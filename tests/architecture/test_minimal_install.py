@@ -18,11 +18,11 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "tests" / "support"
 NEED_AN_EXTRA = {
-    "torch": ("gausslite_gpu", "gausslite_bench.raster.gsplat_baseline"),
+    "torch": ("gausslite_gpu",),
     "psycopg": tuple(f"gausslite_cluster.{name}" for name in ("peers", "postgres_", "region_", "shared_")),
     "rclpy": ("gausslite_ros.node",),
     "rospy": ("gausslite_ros.node_ros1",),
-    "viser": ("gausslite_view", "gausslite_bench.view_rates"),
+    "viser": ("gausslite_view",),
 }
 """Modules that are imported where an option chooses them, by the package that they need."""
 

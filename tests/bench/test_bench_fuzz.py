@@ -12,15 +12,14 @@ from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import ChecksumError
 from gausslite_bench.async_calls import service_methods
 from gausslite_bench.fuzz.checksummed_messages import change_body, with_checksum
-from gausslite_bench.fuzz.corpus import CORPUS, read_corpus
-from gausslite_bench.fuzz.decoders import DECODERS, Outcomes, decode_one
+from gausslite_bench.fuzz.decoders import CORPUS, DECODERS, Outcomes, decode_one, read_corpus
 from gausslite_bench.fuzz.mutations import Mutator
 from gausslite_bench.fuzz.protobuf_fields import change_field, encode_fields, parse_fields
 
 
 def test_no_mutated_message_crashes_or_blocks_a_program(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "fuzz", "--messages", "1000", "--seed", "5", "--json"]) == 0
-    results = json.loads(capsys.readouterr().out)
+    results = json.loads(capsys.readouterr().out)["targets"]
     assert [each["target"] for each in results] == ["codec", "FusionService", "AgentService", "ParserService"]
     assert sum(each["messages"] for each in results) == 1000
     assert all(each["crashes"] == each["hangs"] == 0 for each in results)

@@ -27,7 +27,7 @@ GRAPHS = [graph_from_json(row) for row in ROWS]
 
 def test_scores_of_known_answers():
     clock = itertools.count()
-    score = score_parser("rules", RuleParser(), GRAPHS, lambda: float(next(clock)))
+    score = score_parser(RuleParser(), GRAPHS, lambda: float(next(clock)))
     assert (score.sentences, score.exact, score.target_set, score.anchor_set) == (4, 0.25, 0.5, 0.5)
     assert (score.median_ms, score.slowest_ms, score.by_fallback) == (1000.0, 1000.0, 0)
     assert score.wrong == tuple(row["text"] for row in ROWS[1:])
@@ -40,7 +40,7 @@ def test_answers_by_fallback_are_counted():
                 raise TaskError("names nothing")
             return TaskGraph("id", text, ("mug",), (), (), ("backend http failed (late): read by rules",))
 
-    score = score_parser("http", Failing(), GRAPHS)
+    score = score_parser(Failing(), GRAPHS)
     assert score.by_fallback == 3
 
 
@@ -51,7 +51,7 @@ def test_the_command_prints_its_figures(tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert (printed["backend"], printed["exact"], len(printed["wrong"])) == ("rules", 0.25, 3)
     assert main(["bench", "parser", "--sentences", str(path)]) == 0
-    assert "exact graphs 25.0%, targets 50.0%, anchors 50.0%" in capsys.readouterr().out
+    assert "exact: 0.25\ntarget_set: 0.5\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "[1]", '[{"text": "x"}]'])

@@ -18,22 +18,28 @@ from gausslite.cli.main import main
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.nouns import same_kind
-from gausslite_bench.quality.ablation import cumulative_variants
 from gausslite_bench.quality.home_scenes import HomeScenePlan
-from gausslite_bench.quality.home_tasks import HOME_TASKS, WHOLE_HOMES, TaskKind, choose_home_tasks
+from gausslite_bench.quality.home_tasks import HOME_TASKS, TaskKind, choose_home_tasks
 from gausslite_bench.quality.real_scenes import RealScenePlan
-from gausslite_bench.quality.scenes import PosePolicy, UnseenRegionError
 from gausslite_bench.quality.study import FinishedTrial, Study, run_study
-from gausslite_bench.quality.tables import FULL_METRICS, ROI_METRICS, StudyResults, ablation_table, quality_table
+from gausslite_bench.quality.tables import FULL_PSNR, ROI_PSNR, StudyResults, ablation_table, quality_table
 from gausslite_bench.quality.trial_cache import TrialCache
-from gausslite_bench.quality.trials import BudgetMode, Conditions, Trial, TrialBudget, Variant
+from gausslite_bench.quality.trials import (
+    BudgetMode,
+    Conditions,
+    Trial,
+    TrialBudget,
+    Variant,
+    build_map,
+    cumulative_variants,
+)
 from gausslite_language.rules import RuleParser
 from gausslite_sim.home_catalogue import HOME_COUNT, HOMES
 
 
 def test_each_home_has_one_task_of_each_kind() -> None:
-    kinds = set(TaskKind) - {TaskKind.FULL_FRAME}
-    assert {(pair.home, pair.kind) for pair in HOME_TASKS} == {(h, k) for h in range(1, HOME_COUNT + 1) for k in kinds}
+    kinds = {(home, kind) for home in range(1, HOME_COUNT + 1) for kind in TaskKind}
+    assert {(pair.home, pair.kind) for pair in HOME_TASKS} == kinds
     assert len({pair.task for pair in HOME_TASKS}) == len(HOME_TASKS) == 24
 
 
@@ -59,7 +65,6 @@ def test_tasks_are_selected_by_name_or_home() -> None:
         "home-2-navigation",
         "home-5-search",
     ]
-    assert choose_home_tasks(["home-7-everything"]) == (WHOLE_HOMES[6],)
     with pytest.raises(InvalidInputError, match=r"pairs: expected names such as home-3 .*, got home-9"):
         choose_home_tasks(["home-1", "home-9"])
 
@@ -85,7 +90,6 @@ def test_a_trials_key_changes_with_each_of_its_settings() -> None:
         replace(trial, budget=TrialBudget(iterations=9)),
         replace(trial, budget=TrialBudget(equal=BudgetMode.TIME)),
         replace(trial, plan=replace(PLAN, frames=5)),
-        replace(trial, plan=replace(PLAN, pose_policy=PosePolicy(fit_views=True))),
         replace(trial, plan=HomeScenePlan(choose_home_tasks(["home-8-search"])[0], 4, 3)),
     ]
     assert len({each.key for each in (trial, *others)}) == 1 + len(others)
@@ -102,7 +106,6 @@ def test_a_map_without_a_task_is_shared_by_all_tasks_of_a_home() -> None:
     for other in (
         replace(trial, seed=1),
         replace(trial, budget=TrialBudget(iterations=9)),
-        replace(trial, plan=replace(PLAN, pose_policy=PosePolicy(PoseExposurePrior(0.01)))),
         replace(trial, plan=replace(PLAN, frames=5)),
         replace(trial, plan=HomeScenePlan(choose_home_tasks(["home-7-search"])[0], 4, 3)),
         replace(trial, variant=Variant("monogs", "monogs")),
@@ -115,20 +118,17 @@ def test_a_map_without_a_task_is_shared_by_all_tasks_of_a_home() -> None:
 
 
 def test_homes_have_exact_poses_and_real_sequences_a_pose_prior(tmp_path: Path) -> None:
-    assert PosePolicy() == PLAN.pose_policy
     assert not Trial(PLAN, TASK, TrialBudget(), 0, CONDITIONS).mission.pose_prior.has_pose_error
     real = RealScenePlan(tmp_path, tmp_path / "roi.npz", "mug", ("mug_1",))
     mission = Trial(real, UNIFORM, TrialBudget(), 0, CONDITIONS).mission
     assert PoseExposurePrior.parse(str(mission.pose_prior)) == PoseExposurePrior(0.01, 0.5, 0.1, 0.03)
-    assert real.pose_policy.fit_views
 
 
 def test_a_trials_key_is_the_same_in_every_process() -> None:
     program = (
-        "from gausslite_bench.quality.ablation import cumulative_variants\n"
         "from gausslite_bench.quality.home_tasks import HOME_TASKS\n"
         "from gausslite_bench.quality.home_scenes import HomeScenePlan\n"
-        "from gausslite_bench.quality.trials import TrialBudget, Conditions, Trial\n"
+        "from gausslite_bench.quality.trials import TrialBudget, Conditions, Trial, cumulative_variants\n"
         "for variant in cumulative_variants():\n"
         "    print(Trial(HomeScenePlan(HOME_TASKS[0]), variant, TrialBudget(), 0, Conditions((96, 72))).key)\n"
     )
@@ -145,96 +145,71 @@ def test_results_have_means_spreads_and_margins() -> None:
     results = StudyResults(
         [finished(*each, budget) for each in ((TASK, 0, 26.0), (TASK, 1, 28.0), (UNIFORM, 0, 24.5), (UNIFORM, 1, 24.5))]
     )
-    figure = results.figure(PLAN.name, "task", ROI_METRICS[0], budget)
-    assert figure is not None
-    assert (figure.mean, figure.spread) == (27.0, 1.0)
-    assert results.margin(PLAN.name, ROI_METRICS[0], budget) == pytest.approx(2.5)
-    assert results.figure(PLAN.name, "task", FULL_METRICS[2], budget) is None
+    assert results.values(PLAN.name, "task", ROI_PSNR, budget) == [26.0, 28.0]
+    assert results.mean([PLAN.name], "task", FULL_PSNR, budget) == 20.0
+    assert results.margin(PLAN.name, ROI_PSNR, budget) == pytest.approx(2.5)
     table = quality_table(results)
-    assert "|  | covered [%]↑ | 93.8 | 93.8 |" in table
     for text in (
-        "27.00 ± 1.00",
-        "+2.50",
-        "not computed",
-        "exceeds the best other policy in 1 of 1",
-        "| 1.1% in 2 of 3 views |",
-        "| 28.00 |",
-        "| SSIM↑, views fitted | 0.800 |",
-        "`task`: 8.0 iterations and 12 ms per frame, 900 Gaussians, 8 kB.",
+        "| task | 27.00 | 0.800 | – | 2.00 | 93.8 | 20.00 | 0.700 | – | 8.0 | 12 | 900 | 8 |",
+        "| task | 28.00 | 0.800 |",
+        "| 1.1% in 2 of 3 views | 27.00 ± 1.00 | 24.50 ± 0.00 | +2.50 | +0.00 |",
+        "| 28.00 ± 1.00 | 25.50 ± 0.00 | +2.50 | +0.00 |",
+        "`task` exceeds the best other policy in 1 of 1, by +2.50 dB in the mean.",
     ):
         assert text in table
-    assert "by +2.50 dB inside the mask on average and by +0.00 dB over the full image with views fitted." in table
-    assert "| 28.00 ± 1.00 | 25.50 ± 0.00 | +2.50 | +0.00 |" in table
-    (summary,) = results.as_json()["summary"]
-    assert (summary["ahead_in"], summary["scenes"]) == (1, 1)
+    assert [trial["seed"] for trial in results.trials_as_json()] == [0, 1, 0, 1]
 
 
 def test_the_ablation_table_has_one_row_per_component_and_both_budgets() -> None:
     budgets = [TrialBudget(equal=equal) for equal in BudgetMode]
     results = StudyResults([finished(v, 0, 20.0 + i, b) for b in budgets for i, v in enumerate(cumulative_variants())])
     table = ablation_table(results)
-    one = "25.00 ± 0.00 | 20.00 ± 0.00 | 26.00 ± 0.00 | 20.00 ± 0.00"
+    one = "25.00 | 20.00 | 26.00 | 20.00"
     assert f"| +GFD | {one} | {one} |" in table
-    assert "ROI PSNR, views fitted, equal time" in table
-    assert "Mean over" not in table
+    assert "ROI PSNR↑, fitted, equal time" in table
 
 
 def test_the_command_computes_caches_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     options = ["--pairs", "home-8-manipulation", "--size", "96x72", "--frames", "4", "--views", "3"]
-    budget = ["--max-gaussians", "1500", "--iterations", "2", "--threads", "1", "--fit-views"]
+    budget = ["--max-gaussians", "1500", "--iterations", "2", "--threads", "1"]
     command = ["bench", "quality", "--out", str(tmp_path), "--policies", "task,uniform", *options, *budget]
     assert main(command) == 0
     first = capsys.readouterr()
     assert "`task` exceeds" in first.out
     report = json.loads((tmp_path / "quality.json").read_text())
-    (scene,) = report["scenes"]
-    assert scene["task"] == "Prepare to pick up the drill on the workbench"
-    assert [each["variant"] for each in scene["results"]] == ["task", "uniform"]
-    assert all(trial["gaussians"] <= 1500 for each in scene["results"] for trial in each["trials"])
-    assert list((tmp_path / "sheets").glob("home-8-manipulation-view-*.png"))
+    assert [each["variant"] for each in report["trials"]] == ["task", "uniform"]
+    assert {each["task"] for each in report["trials"]} == {"Prepare to pick up the drill on the workbench"}
+    assert all(each["cost"]["gaussians"] <= 1500 for each in report["trials"])
     assert main(command) == 0
     again = capsys.readouterr()
     assert again.err.count("(cached)") == 2
-    assert json.loads((tmp_path / "quality.json").read_text())["scenes"] == report["scenes"]
-    next((tmp_path / "trials").glob("home-8-manipulation-task-*.png")).unlink()
+    assert json.loads((tmp_path / "quality.json").read_text())["trials"] == report["trials"]
+    next((tmp_path / "trials").glob("home-8-manipulation-task-*.json")).unlink()
     assert main([*command, "--seeds", "0,1"]) == 0
     assert capsys.readouterr().err.count("(cached)") == 1
 
 
-def test_a_task_independent_map_is_built_once_for_all_tasks(tmp_path: Path) -> None:
+def test_a_task_independent_map_is_built_once_for_all_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
+    built = []
+    monkeypatch.setattr(
+        "gausslite_bench.quality.study.build_map", lambda trial, scene: built.append(trial) or build_map(trial, scene)
+    )
     plans = [HomeScenePlan(pair, frames=4, views=3) for pair in choose_home_tasks(["home-8"])]
     conditions = Conditions((96, 72), threads=1)
     together = Study(plans, [TASK, UNIFORM], [TrialBudget(max_gaussians=1500, iterations=1)], [0], conditions)
-    seen = Frames()
-    results = run_study(together, TrialCache(tmp_path / "together"), None, seen)
-    training = plans[0].load((96, 72)).training
-    assert [frame.index for frame in training] == [0, 1, 2, 3]
-    assert seen.count == (3 + 1) * len(training)
+    results = list(run_study(together, TrialCache(tmp_path / "together"), None))
+    assert [frame.index for frame in plans[0].load((96, 72)).training] == [0, 1, 2, 3]
+    assert len(built) == 3 + 1
     alone = replace(together, plans=plans[2:], variants=[UNIFORM])
-    [last] = run_study(alone, TrialCache(tmp_path / "alone"), None, seen)
+    [last] = run_study(alone, TrialCache(tmp_path / "alone"), None)
+    assert isinstance(last, FinishedTrial)
+    assert isinstance(results[-1], FinishedTrial)
     assert results[-1].trial.key == last.trial.key
     assert results[-1].result.scores == last.result.scores
-
-
-class Frames:
-    """Counts the mapped frames of a study."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def on_frame(self, gaussians: int) -> None:
-        del gaussians
-        self.count += 1
-
-    def on_finished(self, trial: FinishedTrial) -> None:
-        del trial
-
-    def on_skipped(self, trials: int, reason: UnseenRegionError) -> None:
-        del trials, reason
 
 
 def test_the_ablation_uses_the_requested_budget(tmp_path: Path) -> None:
@@ -244,5 +219,6 @@ def test_the_ablation_uses_the_requested_budget(tmp_path: Path) -> None:
     budget = ["--equal", "time", "--rate", "200", "--max-gaussians", "500", "--threads", "1"]
     assert main(["bench", "ablation", "--out", str(tmp_path), *options, *budget]) == 0
     report = json.loads((tmp_path / "ablation.json").read_text())
-    assert [(each["equal"], each["rate_hz"]) for each in report["budgets"]] == [("time", 200.0)]
-    assert len(report["scenes"][0]["results"]) == len(cumulative_variants())
+    budgets = {(each["budget"]["equal"], each["budget"]["rate_hz"]) for each in report["trials"]}
+    assert budgets == {("time", 200.0)}
+    assert len(report["trials"]) == len(cumulative_variants())

@@ -9,8 +9,7 @@ import pytest
 from quality_results import CONDITIONS, PLAN, TASK
 
 from gausslite.cli.main import main
-from gausslite.domain.errors import InvalidInputError
-from gausslite_bench.quality.equal_time import load_rate, rate_trials
+from gausslite_bench.quality.equal_time import stored_rate, with_measured_rate
 from gausslite_bench.quality.study import Study
 from gausslite_bench.quality.trials import BudgetMode, TrialBudget
 
@@ -21,27 +20,16 @@ def study(*budgets: TrialBudget) -> Study:
     return Study([PLAN], [TASK], budgets, [0], CONDITIONS)
 
 
-def test_only_equal_time_without_a_rate_needs_a_measurement() -> None:
+def test_only_equal_time_without_a_rate_needs_a_measurement(tmp_path: Path) -> None:
     given = TrialBudget(equal=BudgetMode.TIME, rate_hz=7.0)
-    assert rate_trials(study(TrialBudget(), given)) == []
-    [trial] = rate_trials(study(TrialBudget(), TIMED))
-    assert trial.variant.policy == "uniform"
-    assert trial.budget.equal is BudgetMode.ITERATIONS
+    assert with_measured_rate(study(TrialBudget(), given), tmp_path) == study(TrialBudget(), given)
     assert [budget.rate_hz for budget in study(TrialBudget(), given, TIMED).with_rate(5.0).budgets] == [None, 7.0, 5.0]
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"trial": "another", "rate_hz": 5}', '{"trial": 1}'])
 def test_a_rate_of_another_trial_is_not_used(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "rate.json"
-    path.write_text(content)
-    assert load_rate(path, rate_trials(study(TIMED))) is None
-
-
-def test_an_invalid_stored_rate_is_an_error(tmp_path: Path) -> None:
-    path, trials = tmp_path / "rate.json", rate_trials(study(TIMED))
-    path.write_text(json.dumps({"trial": trials[0].key, "rate_hz": -1.0}))
-    with pytest.raises(InvalidInputError, match=r"rate: expected 0\.01 to 1000 Hz, got -1"):
-        load_rate(path, trials)
+    (tmp_path / "rate.json").write_text(content)
+    assert stored_rate(tmp_path, study(TIMED).trials(PLAN)) is None
 
 
 def test_the_rate_of_uniform_mapping_is_measured_and_reused_on_resume(
@@ -63,10 +51,10 @@ def test_the_rate_of_uniform_mapping_is_measured_and_reused_on_resume(
     ]
     command = ["bench", "quality", "--out", str(tmp_path), *options, "--max-gaussians", "1500", "--threads", "1"]
     assert main([*command, "--equal", "time"]) == 0
-    assert "the time of uniform mapping with 8 iterations per frame" in capsys.readouterr().err
+    assert "equal time" in capsys.readouterr().err
     rate_hz = json.loads((tmp_path / "rate.json").read_text())["rate_hz"]
     report = json.loads((tmp_path / "quality.json").read_text())
-    assert [(each["equal"], each["rate_hz"]) for each in report["budgets"]] == [("time", rate_hz)]
+    assert {each["budget"]["rate_hz"] for each in report["trials"]} == {rate_hz}
     assert (
         f"## Equal time ({1e3 / rate_hz:.3g} ms per frame), at most 1500 Gaussians"
         in (tmp_path / "quality.md").read_text()

@@ -102,7 +102,7 @@ def test_the_demo_maps_fuses_scores_and_ends_its_processes_on_a_recording_with_a
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc to see processes")
 def test_an_ended_session_ends_every_process_of_the_demo(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    frames = ("--set", "frames-a=0:10", "--set", "frames-b=0:10")
+    frames = ("--set", "frames=0:10")
     command = [sys.executable, "-m", "gausslite", "demo", *SMALL, *frames, "--out", str(out)]
     demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     try:

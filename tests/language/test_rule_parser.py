@@ -28,7 +28,7 @@ def test_the_papers_tasks(expected):
 
 
 def test_graphs_of_ordinary_sentences_are_exact():
-    score = score_parser("rules", RuleParser(), SENTENCES)
+    score = score_parser(RuleParser(), SENTENCES)
     print(f"exact graphs: {score.exact:.1%} of {score.sentences}; wrong: {score.wrong}")
     assert score.sentences >= 600
     assert score.exact >= 0.95, score.wrong
@@ -37,7 +37,7 @@ def test_graphs_of_ordinary_sentences_are_exact():
 
 @pytest.mark.parametrize("path", sorted(FIRST_SIGHT.glob("*.json")), ids=lambda path: path.stem)
 def test_no_sentence_of_a_foreign_set_is_read_as_its_opposite(path):
-    score = score_parser("rules", RuleParser(), load_sentences(path))
+    score = score_parser(RuleParser(), load_sentences(path))
     print(f"exact graphs: {score.exact:.1%} of {score.sentences}; wrong: {score.wrong}")
     assert score.opposites == ()
     assert score.exact >= 0.6

@@ -30,7 +30,7 @@ UNKNOWN = "expected sim:home, or one of sim:home-1 to"
         *((f"home?blur={blur}", "sim:home: blur") for blur in ("10", "101ms", "-1ms")),
         *((f"home?lens={lens}", "sim:home: lens") for lens in ("radtan", "wide:1,2,3,4", "")),
         *((f"home-{number}", f"sim:home-{number}: {UNKNOWN}") for number in (0, HOME_COUNT + 1, 12, "x")),
-        ("home-2?gloss=11", "sim:home-2: gloss: expected 0 to 10, got 11"),
+        ("home-2?exposure=11", "sim:home-2: exposure: expected 0 to 10, got 11"),
     ],
 )
 def test_a_wrong_home_is_named(name: str, message: str) -> None:

@@ -38,10 +38,10 @@ def poses_at(seconds: np.ndarray) -> np.ndarray:
 
 def test_each_row_shows_the_scene_from_the_pose_at_its_time(scene: HomeScene) -> None:
     camera = RecordingCamera(CAMERA, readout_s=0.03)
-    recorded = render_recorded_view(scene, camera, poses_at, mirror=0.0)
+    recorded = render_recorded_view(scene, camera, poses_at)
     for row in (0, 30, 59):
         time_s = camera.row_times_s()[row]
-        at_its_time = render_view(scene, RayCamera(CAMERA, poses_at(np.array([time_s]))[0]), mirror=0.0)
+        at_its_time = render_view(scene, RayCamera(CAMERA, poses_at(np.array([time_s]))[0]))
         np.testing.assert_allclose(recorded.depth_m[row], at_its_time.depth_m[row], rtol=1e-5)
         assert (recorded.item[row] == at_its_time.item[row]).all()
     assert camera.row_times_s()[0] == pytest.approx(-camera.row_times_s()[-1])
@@ -56,11 +56,11 @@ def test_the_middle_row_of_a_frame_has_the_trajectorys_pose() -> None:
 
 
 def test_blur_is_the_mean_over_the_exposure_and_depth_that_of_its_middle(scene: HomeScene) -> None:
-    blurred = render_recorded_view(scene, RecordingCamera(CAMERA, exposure_s=0.02), poses_at, mirror=0.0)
+    blurred = render_recorded_view(scene, RecordingCamera(CAMERA, exposure_s=0.02), poses_at)
     times_s = 0.02 * ((np.arange(32) + 0.5) / 32 - 0.5)
-    views = [render_view(scene, RayCamera(CAMERA, pose), mirror=0.0) for pose in poses_at(times_s)]
+    views = [render_view(scene, RayCamera(CAMERA, pose)) for pose in poses_at(times_s)]
     expected = np.mean([view.rgb for view in views], axis=0)
-    sharp = render_view(scene, RayCamera(CAMERA, poses_at(np.zeros(1))[0]), mirror=0.0)
+    sharp = render_view(scene, RayCamera(CAMERA, poses_at(np.zeros(1))[0]))
     np.testing.assert_allclose(blurred.depth_m, sharp.depth_m, rtol=1e-5)
     assert np.abs(blurred.rgb - expected).mean() < 0.15 * np.abs(sharp.rgb - expected).mean()
 
@@ -68,7 +68,7 @@ def test_blur_is_the_mean_over_the_exposure_and_depth_that_of_its_middle(scene: 
 @pytest.mark.parametrize("text", ["radtan:-0.2,0.05,0.002,-0.001", "fisheye:0.05,0.01,0,0"])
 def test_a_lens_moves_what_the_pinhole_shows_by_its_distortion(scene: HomeScene, text: str) -> None:
     lens, T_world_camera = Lens.parse(text), poses_at(np.zeros(1))[0]
-    distorted = render_view(scene, RayCamera(CAMERA, T_world_camera, lens), mirror=0.0)
+    distorted = render_view(scene, RayCamera(CAMERA, T_world_camera, lens))
     rows, columns = np.array([5, 30, 50, 55]), np.array([4, 41, 70, 12])
     x, y = lens.undistort((columns + 0.5 - CAMERA.cx_px) / CAMERA.fx_px, (rows + 0.5 - CAMERA.cy_px) / CAMERA.fy_px)
     directions = (np.stack([x, y, np.ones_like(x)], axis=1) @ T_world_camera[:3, :3].T).astype(np.float32)

@@ -63,7 +63,7 @@ def _main(program: str) -> Callable[[list[str]], object]:
 def default_paths(out: Path) -> list[dict[str, object]]:
     """Run what README and the help promise without any extra but `sim`."""
     run_folder, map_file = str(out / "map"), str(out / "map" / "map.ply")
-    halves = ("--set", "frames-a=0:6:3", "--set", "frames-b=0:6:3")
+    few = ("--set", "frames=0:6:3", "--set", "refine-iterations=5")
     commands = (
         ("map", SOURCE, "--task", TASK, *FRAMES, "--out", run_folder),
         ("map", SOURCE, *FRAMES, "--out", str(out / "uniform")),
@@ -76,7 +76,7 @@ def default_paths(out: Path) -> list[dict[str, object]]:
         ("calibrate", "sim:home?frames=12&size=160x120&drift=2%"),
         ("models", "list"),
         ("doctor", "--json"),
-        ("demo", *halves, "--size", "160x120", "--set", "refine-iterations=5", "--out", str(out / "demo")),
+        ("demo", *few, "--size", "160x120", "--out", str(out / "demo")),
         *((command, "--help") for command in importlib.import_module("gausslite.cli.main").commands()),
     )
     results = [run("gausslite", arguments) for arguments in commands]

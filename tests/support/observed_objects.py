@@ -24,11 +24,11 @@ class ObservedObjects:
     def __init__(self, graph: TaskGraph) -> None:
         settings = RelevanceTrackerSettings()
         up = np.array(unit_up_axis(settings.up_axis))
-        surfaces = SupportingSurfaces(graph, frozenset(), up, settings.heights)
+        surfaces = SupportingSurfaces(graph, frozenset(), up)
         self._evidence = Evidence(settings.evidence)
-        self._object_map = ObjectMap(settings.object_map)
-        objects = NamedObjects(self._object_map, self._evidence, ColourFilter(graph, settings.colours))
-        relations = RelationFilter(graph, up, settings.relations, objects, surfaces)
+        self._object_map = ObjectMap()
+        objects = NamedObjects(self._object_map, self._evidence, ColourFilter(graph))
+        relations = RelationFilter(graph, up, objects, surfaces)
         self._targets = TargetSelector(graph, objects, relations, surfaces)
 
     @property

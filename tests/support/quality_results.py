@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from gausslite_bench.quality.home_scenes import HomeScenePlan
 from gausslite_bench.quality.home_tasks import choose_home_tasks
-from gausslite_bench.quality.study import FinishedTrial, Origin
-from gausslite_bench.quality.trials import Conditions, Trial, TrialBudget, TrialResult, Variant
+from gausslite_bench.quality.study import FinishedTrial
+from gausslite_bench.quality.trials import Conditions, MapCost, Trial, TrialBudget, TrialResult, Variant
 from gausslite_evaluation.compare import MapScores
 
 PLAN = HomeScenePlan(choose_home_tasks(["home-8-manipulation"])[0], frames=4, views=3)
@@ -21,5 +21,5 @@ def finished(
     variant: Variant, seed: int, roi_psnr: float, budget: TrialBudget, plan: HomeScenePlan = PLAN
 ) -> FinishedTrial:
     trial = Trial(plan, variant, budget, seed, CONDITIONS)
-    result = TrialResult(scores(roi_psnr), scores(roi_psnr + 1), 0.011, 900, 8100, 8.0, 12.5)
-    return FinishedTrial(trial, result, Origin.COMPUTED)
+    result = TrialResult(scores(roi_psnr), scores(roi_psnr + 1), 0.011, MapCost(900, 8100, 8.0, 12.5))
+    return FinishedTrial(trial, result)

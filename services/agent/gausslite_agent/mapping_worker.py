@@ -39,7 +39,7 @@ from gausslite.perception.pointing import pointed_masks
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
 from gausslite_agent.background import IdleTraining, KeyframeUpload
-from gausslite_agent.settings import LoadSettings, QueuePolicy
+from gausslite_agent.settings import LoadSettings
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
 
 
@@ -62,19 +62,16 @@ class QueuedFrame:
 class FrameQueue:
     """Frames in order of arrival. Thread-safe."""
 
-    def __init__(self, max_frames: int, policy: QueuePolicy) -> None:
+    def __init__(self, max_frames: int) -> None:
         self._max_frames = max_frames
-        self._policy = policy
         self._frames: deque[QueuedFrame] = deque()
         self._lock = threading.Lock()
 
     def put(self, frame: QueuedFrame) -> QueuedFrame | None:
-        """Add a frame. Return the frame that is dropped if the queue was full."""
+        """Add a frame. Return the oldest, which is dropped, if the queue was full."""
         with self._lock:
             self._frames.append(frame)
-            if len(self._frames) <= self._max_frames:
-                return None
-            return self._frames.popleft() if self._policy is QueuePolicy.OLDEST else self._frames.pop()
+            return self._frames.popleft() if len(self._frames) > self._max_frames else None
 
     def get(self) -> QueuedFrame | None:
         """Remove and return the oldest frame; None if the queue is empty."""
@@ -126,7 +123,7 @@ class MappingWorker:
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
-        self._queue = FrameQueue(self._load.queue_frames, self._load.queue_policy)
+        self._queue = FrameQueue(self._load.queue_frames)
         self._worker = ThreadPoolExecutor(1, "mapper")
         self._idle = IdleTraining(
             self._load.idle_iterations,
@@ -185,8 +182,7 @@ class MappingWorker:
         queued = QueuedFrame(frame, self._clock())
         dropped = self._queue.put(queued)
         if dropped is not None:
-            policy = self._load.queue_policy
-            self._report_dropped(dropped, f"the queue of {self._load.queue_frames} frames dropped its {policy}")
+            self._report_dropped(dropped, f"the queue of {self._load.queue_frames} frames dropped its oldest")
         self._submit(self._map_next)
         return queued.report
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import build, check_options, option
+from gausslite.config.option import build, option
 from gausslite.config.program import Program, parse_options
 from gausslite.config.values import NONE, VOXEL_SIZE
 from gausslite.domain.checks import require_identifier, require_name
@@ -19,44 +18,28 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.task import require_task_text
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.mission.settings import REMOVED, MissionSettings, PerceptionSettings, PoseMode, SourceSettings
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SourceSettings
 from gausslite.process import print_message
 from gausslite.wire.channel import AGENT_ADDRESS, MAX_PORT, require_callable
 from gausslite.wire.security import Tls, TlsFiles
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite_agent.state import MAX_DRAIN_S
 
-
-class QueuePolicy(StrEnum):
-    """Which waiting frame a full queue drops."""
-
-    OLDEST = "oldest"
-    NEWEST = "newest"
+_KEYFRAMES = 64
+_MAX_KEYFRAMES = 10_000
+_IDLE_ITERATIONS = 64
+"""The most training iterations after each frame of an agent with a rate, while no other frame waits."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadSettings:
-    """Length and policy of the frame queue, and training while it is empty.
+    """Length of the frame queue, which drops its oldest frame when it is full, and training while it is empty.
 
     idle_iterations: the most iterations after each frame while no other frame waits. Maps then depend on the clock.
     """
 
     queue_frames: int = option(4, "length of the frame queue", key="queue", low=1, high=1000)
-    queue_policy: QueuePolicy = option(QueuePolicy.OLDEST, "frame that a full queue drops")
-    idle_iterations: int = option(
-        0,
-        "training iterations while the queue is empty (default: 64 at a rate, else 0)",
-        low=0,
-        high=10_000,
-    )
-
-    def __post_init__(self) -> None:
-        check_options(self)
-
-
-_KEYFRAMES = 64
-_MAX_KEYFRAMES = 10_000
-_IDLE_ITERATIONS = 64
+    idle_iterations: int = 0
 
 
 def _read_mission(text: str) -> str:
@@ -66,11 +49,6 @@ def _read_mission(text: str) -> str:
 def _keyframes_unless_set(options: argparse.Namespace) -> int:
     """Return 0 without a handover: then only the task's region leaves the robot."""
     return _KEYFRAMES if options.handover else 0
-
-
-def _idle_iterations_unless_set(options: argparse.Namespace) -> int:
-    """Return 0 without a rate, so that maps are reproducible."""
-    return 0 if options.rate is None else _IDLE_ITERATIONS
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,13 +174,7 @@ PROGRAM = Program.of(
     *(AgentSettings, TlsFiles),
     flags="listen agent-id task source frames size detector parser fusion out state policy poses max-gaussians "
     "iterations rate exit-when-done frame prior",
-    defaults={"source": None, "keyframes": None, "idle-iterations": None, "save-interval": 60.0},
-    computed={"idle-iterations": _idle_iterations_unless_set},
-    removed={
-        **REMOVED,
-        "traces": "the package opentelemetry-instrumentation-grpc traces calls",
-        "free-space": "the server compares surfaces only",
-    },
+    defaults={"source": None, "keyframes": None, "save-interval": 60.0},
 )
 
 
@@ -214,9 +186,6 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
     if options.task is not None:
         require_task_text(options.task)
     mission = build(MissionSettings, options)
-    idle_iterations = options.idle_iterations
-    if idle_iterations is None:
-        idle_iterations = _idle_iterations_unless_set(options)
     return build(
         AgentSettings,
         options,
@@ -225,7 +194,8 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> AgentSettings:
         source=_source(options, mission),
         link=_connections(options),
         mission=mission,
-        load=build(LoadSettings, options, idle_iterations=idle_iterations),
+        # none without a rate, so that maps are reproducible
+        load=build(LoadSettings, options, idle_iterations=0 if options.rate is None else _IDLE_ITERATIONS),
         tls=build(TlsFiles, options).read_for_server(),
     )
 

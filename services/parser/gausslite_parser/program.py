@@ -71,7 +71,6 @@ def build_parser() -> CommandParser:
     Program.of(
         *settings,
         flags=" ".join(key for of in settings for key in options_of(of)),
-        removed={"traces": "the package opentelemetry-instrumentation-grpc traces calls"},
     ).add_to(parser)
     return parser
 

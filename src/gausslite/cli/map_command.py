@@ -54,7 +54,6 @@ from gausslite.mission.results import (
 from gausslite.mission.runner import CorruptFrames, MissionResult, MissionRunner
 from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, TaskSchedule, Timeline
 from gausslite.mission.settings import (
-    REMOVED,
     MissionSettings,
     PerceptionSettings,
     PoseMode,
@@ -160,7 +159,6 @@ def configure(parser: CommandParser) -> None:
         positional="source",
         defaults={"policy": None},
         computed={"policy": policy_of},
-        removed=REMOVED,
     ).add_to(parser)
     parser.set_defaults(run=run)
 

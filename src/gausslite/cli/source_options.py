@@ -71,7 +71,6 @@ class RecordingOptions:
         plain_type=str,
         convert=read_prior_or_auto,
         to_plain=write_prior,
-        presets={"paper": NONE},
     )
 
 

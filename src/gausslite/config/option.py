@@ -24,8 +24,8 @@ class Option:
 
     key: its name in files; by default the field's, with dashes. low, high: bounds of a number, both included; unit: its
     unit. choices: the accepted texts. needs: the option without which this one has no effect, as "detector", or with
-    the value that it must have, as "backend=onnx|http". excludes: the option that this one replaces. presets: values
-    under the names of presets. computed: returns the value that is used if none is set. repeats: a list whose parts may
+    the value that it must have, as "backend=onnx|http". excludes: the option that this one replaces.
+    computed: returns the value that is used if none is set. repeats: a list whose parts may
     contain commas; its flag may be repeated.
 
     plain_type: the type in files and flags, if it is not the field's; convert returns the field's value from it, and
@@ -41,7 +41,6 @@ class Option:
     choices: tuple[str, ...] = ()
     needs: str = ""
     excludes: str = ""
-    presets: Mapping[str, Plain] = field(default_factory=dict)
     computed: Callable[[Namespace], Any] | None = None
     repeats: bool = False
     plain_type: Any = None

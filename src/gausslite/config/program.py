@@ -1,7 +1,7 @@
-"""The options of a program: declared by its settings classes, read from flags, environment, file and presets.
+"""The options of a program: declared by its settings classes, read from flags, environment and file.
 
-Flags override environment variables, those override the file, and the file overrides a preset. An option that excludes
-another one replaces it in lower layers.
+Flags override environment variables, and those override the file. An option that excludes another one replaces it in
+lower layers.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import os
 import tomllib
 from argparse import SUPPRESS, ArgumentTypeError, Namespace
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, replace
+from dataclasses import MISSING, dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gausslite.config.command_parser import PARSER, CommandParser
-from gausslite.config.option import Option, OptionField, as_plain, nearest, options_of, suggestion
+from gausslite.config.option import OptionField, as_plain, nearest, options_of, suggestion
 from gausslite.config.plain_values import Plain, describe_range, is_within, read_plain, to_toml, without_password
 from gausslite.domain.errors import GaussLiteError, InvalidInputError
 
@@ -28,7 +28,6 @@ _SIMD_VARIABLE = "GAUSSLITE_SIMD"
 """Chooses the instruction set of the kernels, which read it themselves."""
 PROGRAM = "_program"
 """Name of the chosen program among parsed arguments."""
-_PRESET = "preset"
 _CONFIG_HELP = (
     "read options from this file, and from variables such as GAUSSLITE_MAX_GAUSSIANS; variables override the file, "
     "flags override both"
@@ -51,14 +50,12 @@ _Layer = Mapping[str, _Given]
 class Program:
     """The options of a program or command, by key.
 
-    flags: keys of the options that are also flags, in the order of the help; positional: those without dashes. removed:
-    what replaces an option of earlier versions.
+    flags: keys of the options that are also flags, in the order of the help; positional: those without dashes.
     """
 
     options: Mapping[str, OptionField]
     flags: tuple[str, ...] = ()
     positional: tuple[str, ...] = ()
-    removed: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -69,7 +66,6 @@ class Program:
         omit: Collection[str] = (),
         defaults: Mapping[str, Any] | None = None,
         computed: Mapping[str, Callable[[Namespace], Any]] | None = None,
-        removed: Mapping[str, str] | None = None,
     ) -> Program:
         """Return the program of these settings classes; of two options with one key, the first counts.
 
@@ -83,11 +79,7 @@ class Program:
             options[key] = replace(options[key], default=value)
         for key, function in (computed or {}).items():
             options[key] = replace(options[key], option=replace(options[key].option, computed=function))
-        presets = sorted({name for declared in options.values() for name in declared.option.presets})
-        if presets:
-            declaration = Option(help="set of defaults for other options", choices=tuple(presets))
-            options[_PRESET] = OptionField(_PRESET, _PRESET, str, str, None, declaration)
-        return cls(options, tuple(flags.split()), tuple(positional.split()), removed or {})
+        return cls(options, tuple(flags.split()), tuple(positional.split()))
 
     def add_to(self, parser: CommandParser) -> None:
         """Add the flags to a parser, with --config, --set and --print-config."""
@@ -120,9 +112,6 @@ class Program:
         if path:
             layers.append(self._file(Path(path)))
         given = self._combined(layers)
-        if _PRESET in given:
-            name = _convert(self.options[_PRESET], given[_PRESET])
-            given = self._combined([given, self._preset(name)])
         others = {name: value for name, value in vars(parsed).items() if name not in _OWN_NAMES}
         options = Namespace(**others)
         for key, declared in self.options.items():
@@ -150,8 +139,6 @@ class Program:
         """End the process with code 2 and a line about unknown flags: what they have become, or what is similar."""
         flag = next((word.partition("=")[0] for word in unknown if word.startswith("--")), None)
         key = "" if flag is None else flag.removeprefix("--")
-        if key in self.removed:
-            parser.error(f"{flag}: was removed; {self.removed[key]}")
         if key.removeprefix("no-") in self.options:
             parser.error(f"{flag}: write --set {key.removeprefix('no-')}=false")
         parser.refuse_unknown(unknown)
@@ -212,16 +199,7 @@ class Program:
             given[key] = _Given([value] if repeated else value, f"{path}: {key}", is_toml=True)
         return self._without_contradiction(given, f"{path}: ")
 
-    def _preset(self, name: str) -> _Layer:
-        return {
-            key: _Given(declared.option.presets[name], f"preset {name}: {key}", is_toml=True)
-            for key, declared in self.options.items()
-            if name in declared.option.presets
-        }
-
     def _require_known(self, key: str, origin: str) -> None:
-        if key in self.removed:
-            raise InvalidInputError(f"{origin}: was removed; {self.removed[key]}")
         if key not in self.options:
             raise InvalidInputError(f"{origin}: unknown option{suggestion(key, self.options)}")
 
@@ -326,8 +304,9 @@ def add_flags(parser: argparse._ActionsContainer, settings_class: type, *keys: s
     """Add these options of a settings class, or all, as flags of a command that reads no file and no variables."""
     for key, declared in options_of(settings_class).items():
         if not keys or key in keys:
-            convert = partial(_convert_text, declared)
-            parser.add_argument(f"--{key}", type=convert, default=declared.default, **_argument(declared))
+            convert, needed = partial(_convert_text, declared), declared.default is MISSING
+            default = None if needed else declared.default
+            parser.add_argument(f"--{key}", type=convert, default=default, required=needed, **_argument(declared))
 
 
 def _convert_text(declared: OptionField, text: str) -> Any:

@@ -30,9 +30,7 @@ class Quotas:
     voxels_per_agent: int = option(500_000, "largest number of voxels per agent", key="quota-voxels", low=1)
     gaussians_per_agent: int = option(3_000_000, "largest number of Gaussians per agent", key="quota-gaussians", low=1)
     keyframes_per_agent: int = option(64, "largest number of keyframes per agent", key="quota-keyframes", low=1)
-    keyframe_pixels: int = option(
-        1920 * 1080, "largest number of pixels of a keyframe", key="quota-keyframe-pixels", low=1
-    )
+    keyframe_pixels: int = 1920 * 1080
     keyframe_bytes_per_agent: int = 64 << 20
     kappa_at_join: int = 120_000
     kappa_per_second: int = 200

@@ -48,13 +48,6 @@ MAY_CHANGE = {"may_change": True}
 FILE = {"is_file": True}
 """Metadata of a settings field that names a file: a resumed run compares the name and not the folder."""
 
-REMOVED = {
-    "roi-ball": "target-at=X,Y,Z,R maps the ball, and target-at=X,Y,Z the object at a point",
-    "track-motion": "the last velocity predicts the motion; odometry is refined with --poses refine",
-    **dict.fromkeys(("min-iterations", "skip-stages", "deadline-slack"), "--rate divides each frame's time by itself"),
-    "resegment": "masks between detections are cut by depth, which is as accurate in a third of the time",
-}
-"""Options of earlier versions, and what has replaced them."""
 REGISTRATION_HELP = (
     "shift each depth image onto the colour image (registration), for sensors with two cameras: the colour camera's "
     "intrinsics in pixels, then the depth camera's position (metres) and rotation vector (degrees) in its frame; none: "
@@ -274,12 +267,9 @@ class MissionSettings:
         "how the map is seeded and trained",
         metavar="NAME",
         choices=tuple(sorted(POLICIES)),
-        presets={"paper": "paper"},
     )
     disabled: frozenset[str] = option(frozenset(), _DISABLE_HELP, key="disable", metavar="A,B")
-    max_gaussians: int = option(
-        DEFAULT_MAX_GAUSSIANS, "upper limit of the map's size", low=1, presets={"paper": 1_000_000}
-    )
+    max_gaussians: int = option(DEFAULT_MAX_GAUSSIANS, "upper limit of the map's size", low=1)
     iterations: int | None = option(
         None,
         "iterations per frame (default: 8)",
@@ -316,7 +306,6 @@ class MissionSettings:
         plain_type=str,
         convert=read_prior,
         to_plain=write_prior,
-        presets={"paper": NONE},
     )
     poses: PoseMode = option(
         PoseMode.REFINE,

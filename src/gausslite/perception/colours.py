@@ -19,7 +19,11 @@ from numpy import ndarray
 from gausslite.domain.frame import linear_light
 from gausslite.domain.task import TaskGraph, noun_of
 from gausslite.nouns import words
-from gausslite.perception.settings import ColourSettings
+
+_MIN_NAMED_SHARE = 0.3
+"""From this share in ranges that a word names, the object is of the colour."""
+_MIN_POSSIBLE_SHARE = 0.12
+"""Below this share in ranges that a word could name, it is not."""
 
 _ANY: Final = (-np.inf, np.inf)
 
@@ -90,7 +94,7 @@ def is_evaluated(colour: str) -> bool:
     return all(_terms_of(word) for word in colour.split(" and "))
 
 
-def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"], settings: ColourSettings) -> ColourMatch:
+def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"]) -> ColourMatch:
     """Return whether an object with these sums of `colour_counts` has the colour.
 
     YES: ranges that the word names have 0.3 of the pixels, as the camera shows them. NO: ranges that it could name have
@@ -100,21 +104,19 @@ def match_colour(colour: str, counts: Float64[ndarray, "balances ranges"], setti
     total = float(counts[0].sum())
     if total == 0.0 or not is_evaluated(colour):
         return ColourMatch.DOUBTFUL
-    matches = [_match_terms(_terms_of(word), counts / total, settings) for word in colour.split(" and ")]
+    matches = [_match_terms(_terms_of(word), counts / total) for word in colour.split(" and ")]
     if ColourMatch.NO in matches:
         return ColourMatch.NO
     return ColourMatch.YES if all(match is ColourMatch.YES for match in matches) else ColourMatch.DOUBTFUL
 
 
-def _match_terms(
-    terms: frozenset[str], shares: Float64[ndarray, "balances ranges"], settings: ColourSettings
-) -> ColourMatch:
+def _match_terms(terms: frozenset[str], shares: Float64[ndarray, "balances ranges"]) -> ColourMatch:
     is_named = np.array([not terms.isdisjoint(colours.named) for colours in _ranges()])
-    if float(shares[0, is_named].sum()) >= settings.min_named_share:
+    if float(shares[0, is_named].sum()) >= _MIN_NAMED_SHARE:
         return ColourMatch.YES
     is_possible = np.array([not terms.isdisjoint(colours.possible) for colours in _ranges()])
     possible = float(shares[:, is_possible].sum(axis=1).max())
-    return ColourMatch.NO if possible < settings.min_possible_share else ColourMatch.DOUBTFUL
+    return ColourMatch.NO if possible < _MIN_POSSIBLE_SHARE else ColourMatch.DOUBTFUL
 
 
 def _terms_of(word: str) -> frozenset[str]:
@@ -151,8 +153,7 @@ def _oklab(
 class ColourFilter:
     """The colours of a task's names. An object whose colour clearly differs is not meant; a doubtful one is."""
 
-    def __init__(self, graph: TaskGraph, settings: ColourSettings) -> None:
-        self._settings = settings
+    def __init__(self, graph: TaskGraph) -> None:
         self._colours = {
             attributes.name: attributes.colour for attributes in graph.attributes if attributes.colour is not None
         }
@@ -165,7 +166,7 @@ class ColourFilter:
     def match(self, name: str, counts: Float64[ndarray, "balances ranges"]) -> ColourMatch:
         """Return whether an object with these counts has the colour of a name; YES for a name without a colour."""
         colour = self._colours.get(name)
-        return ColourMatch.YES if colour is None else match_colour(colour, counts, self._settings)
+        return ColourMatch.YES if colour is None else match_colour(colour, counts)
 
     def allows(self, name: str, counts: Float64[ndarray, "balances ranges"]) -> bool:
         """Return False if the colour of an object clearly differs from that of a name."""
@@ -174,8 +175,7 @@ class ColourFilter:
     def is_excluded(self, noun: str, counts: Float64[ndarray, "balances ranges"]) -> bool:
         """Return True if an object of a target's noun clearly has the colour of an excluded object of this noun."""
         return any(
-            noun == excluded and match_colour(colour, counts, self._settings) is ColourMatch.YES
-            for excluded, colour in self._excluded
+            noun == excluded and match_colour(colour, counts) is ColourMatch.YES for excluded, colour in self._excluded
         )
 
     def label(self, name: str) -> str:
@@ -186,7 +186,7 @@ class ColourFilter:
         """Return a line for each colour that was doubtful or left objects out; seen: their nouns and counts."""
         lines = [self._describe(name, seen) for name in self._names]
         for noun, colour in self._excluded:
-            matches = [match_colour(colour, counts, self._settings) for other, counts in seen if other == noun]
+            matches = [match_colour(colour, counts) for other, counts in seen if other == noun]
             doubtful = matches.count(ColourMatch.DOUBTFUL)
             if doubtful:
                 lines.append(f"excluded {colour} {noun!r}: {doubtful} of {len(matches)} objects may be one, and count")

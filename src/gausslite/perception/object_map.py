@@ -13,8 +13,27 @@ from gausslite.domain.objects import MAX_OBJECTS_PER_AGENT, ObjectLandmark, Obje
 from gausslite.domain.relevance import Rival
 from gausslite.domain.voxels import AxisAlignedBox, VoxelGrid
 from gausslite.perception.colours import no_colours
-from gausslite.perception.settings import ObjectMapSettings
 from gausslite.perception.surface import SurfaceVotes
+
+CELL_M = 0.05
+"""Edge of the cells that an object occupies."""
+_MIN_MATCH_DISTANCE_M = 0.15
+"""Distance of centroids below which even small objects are the same."""
+_MATCH_RADIUS_SHARE = 0.75
+"""Distance of centroids, relative to the smaller radius, below which objects are the same."""
+_MAX_SIZE_RATIO = 2.0
+"""Ratio of radii above which objects of two nouns differ: a bowl in the middle of a table is not the table."""
+_MIN_SHARED_SHARE = 0.3
+"""Share of the smaller object's cells that the same object has."""
+_MIN_COUNT_SHARE = 0.15
+"""Observations of a cell, relative to the often observed ones, above which it belongs to the footprint."""
+_MIN_FOOTPRINT_SHARE = 0.25
+"""Share of the cells that a footprint has; below, all cells count."""
+_MAX_CELLS = 4000
+MAX_OBJECTS = 500
+"""Objects of a task; the least observed one is dropped first."""
+MAX_LEVELS = 50
+"""Levels of planes under an object, of which the median counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +54,6 @@ class Observation:
     camera_m: Float64[ndarray, "3"] | None = None
     score: float = 1.0
     time_ns: int = 0
-    settings: ObjectMapSettings = field(default_factory=ObjectMapSettings)
     rival: Rival | None = None
     votes: SurfaceVotes = field(default_factory=SurfaceVotes.empty)
     colours: Float64[ndarray, "balances ranges"] = field(default_factory=no_colours)
@@ -50,19 +68,17 @@ class Observation:
         camera_m: Float64[ndarray, "3"] | None = None,
         score: float = 1.0,
         time_ns: int = 0,
-        settings: ObjectMapSettings | None = None,
     ) -> Observation:
         """Return the observation of a mask's points: their median is the centroid, outliers are dropped."""
-        settings = settings or ObjectMapSettings()
         centroid_m = np.median(points_m, axis=0)
         radius_m = 2.0 * float(np.median(np.linalg.norm(points_m - centroid_m, axis=1)))
-        inliers_m = points_m[_is_inlier(points_m, centroid_m, radius_m, settings)]
-        cells = np.unique(VoxelGrid(settings.cell_m).keys(inliers_m.astype(np.float32)))
-        return cls(phrase, centroid_m, radius_m, cells, camera_m, score=score, time_ns=time_ns, settings=settings)
+        inliers_m = points_m[_is_inlier(points_m, centroid_m, radius_m)]
+        cells = np.unique(VoxelGrid(CELL_M).keys(inliers_m.astype(np.float32)))
+        return cls(phrase, centroid_m, radius_m, cells, camera_m, score=score, time_ns=time_ns)
 
     def without_outliers(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
         """Return those of the mask's points that are near the centroid for the object's size."""
-        near: Float64[ndarray, "m 3"] = points_m[_is_inlier(points_m, self.centroid_m, self.radius_m, self.settings)]
+        near: Float64[ndarray, "m 3"] = points_m[_is_inlier(points_m, self.centroid_m, self.radius_m)]
         return near
 
     @property
@@ -72,10 +88,10 @@ class Observation:
 
 
 def _is_inlier(
-    points_m: Float64[ndarray, "n 3"], centroid_m: Float64[ndarray, "3"], radius_m: float, settings: ObjectMapSettings
+    points_m: Float64[ndarray, "n 3"], centroid_m: Float64[ndarray, "3"], radius_m: float
 ) -> Bool[ndarray, " n"]:
     distances_m = np.linalg.norm(points_m - centroid_m, axis=1)
-    is_inlier: Bool[ndarray, " n"] = distances_m <= 2.0 * max(radius_m, settings.min_match_distance_m)
+    is_inlier: Bool[ndarray, " n"] = distances_m <= 2.0 * max(radius_m, _MIN_MATCH_DISTANCE_M)
     return is_inlier
 
 
@@ -113,7 +129,6 @@ class Landmark:
     levels_m: Float64[ndarray, " s"] = field(default_factory=lambda: np.zeros(0))
     weak_count: int = 0
     is_given: bool = False
-    settings: ObjectMapSettings = field(default_factory=ObjectMapSettings)
 
     @classmethod
     def from_observation(cls, observation: Observation) -> Landmark:
@@ -135,25 +150,24 @@ class Landmark:
             votes=observation.votes,
             colours=observation.colours,
             levels_m=observation.levels_m,
-            settings=observation.settings,
         )
 
     def is_colocated_with(self, other: Observation | Landmark) -> bool:
         """Return True if the centroids are close for the size of the smaller object."""
         smaller_m = min(self.radius_m, other.radius_m)
-        max_distance_m = max(self.settings.min_match_distance_m, self.settings.match_radius_share * smaller_m)
+        max_distance_m = max(_MIN_MATCH_DISTANCE_M, _MATCH_RADIUS_SHARE * smaller_m)
         return float(np.linalg.norm(self.centroid_m - other.centroid_m)) < max_distance_m
 
     def may_equal(self, other: Observation | Landmark) -> bool:
         """Return True if an object of another phrase may be this one: the same place, and a similar size."""
         smaller_m, larger_m = sorted((self.radius_m, other.radius_m))
-        return larger_m <= self.settings.max_size_ratio * smaller_m and self.is_colocated_with(other)
+        return larger_m <= _MAX_SIZE_RATIO * smaller_m and self.is_colocated_with(other)
 
     def matches(self, other: Observation | Landmark) -> bool:
         """Return True if an observation or a double of the same phrase shows this object, in whole or in part."""
         shared = len(np.intersect1d(self.cells, other.cells, assume_unique=True))
         smaller = max(1, min(len(self.cells), len(other.cells)))
-        return self.is_colocated_with(other) or shared >= self.settings.min_shared_share * smaller
+        return self.is_colocated_with(other) or shared >= _MIN_SHARED_SHARE * smaller
 
     @property
     def confidence(self) -> float:
@@ -170,7 +184,6 @@ class Landmark:
             radius_m=self.radius_m,
             cells=self.cells,
             camera_m=camera_m,
-            settings=self.settings,
             votes=self.votes,
             colours=self.colours,
             levels_m=self.levels_m,
@@ -198,7 +211,7 @@ class Landmark:
         self.score_sum += other.score_sum
         self.votes = self.votes.add(other.votes)
         self.colours = self.colours + other.colours
-        self.levels_m = np.concatenate([self.levels_m, other.levels_m])[-self.settings.max_levels :]
+        self.levels_m = np.concatenate([self.levels_m, other.levels_m])[-MAX_LEVELS:]
         self.missed_in_a_row = min(self.missed_in_a_row, other.missed_in_a_row)
         self._add_rivals(other.rival_scores)
         self._add_cells(other)
@@ -210,8 +223,8 @@ class Landmark:
     def _add_cells(self, other: Landmark) -> None:
         merged, where = np.unique(np.concatenate([self.cells, other.cells]), return_inverse=True)
         total = np.bincount(where, weights=np.concatenate([self.counts, other.counts])).astype(np.int64)
-        if len(merged) > self.settings.max_cells:
-            most_observed = np.sort(np.argsort(-total, kind="stable")[: self.settings.max_cells])
+        if len(merged) > _MAX_CELLS:
+            most_observed = np.sort(np.argsort(-total, kind="stable")[:_MAX_CELLS])
             merged, total = merged[most_observed], total[most_observed]
         self.cells, self.counts = merged, total
         centres_m = self.footprint_m().astype(np.float64)
@@ -220,28 +233,27 @@ class Landmark:
 
     def contains(self, point_m: Float64[ndarray, "3"]) -> bool:
         """Return True if a point is in the box of the footprint, or within half a cell of it."""
-        box, slack_m = self.box_m(), 0.5 * self.settings.cell_m
+        box, slack_m = self.box_m(), 0.5 * CELL_M
         inside = (point_m >= np.array(box.min_m) - slack_m) & (point_m <= np.array(box.max_m) + slack_m)
         return bool(inside.all())
 
     def box_m(self) -> AxisAlignedBox:
         """Return the axis-aligned box of the footprint's cells."""
-        centres_m, half_m = self.footprint_m().astype(np.float64), 0.5 * self.settings.cell_m
+        centres_m, half_m = self.footprint_m().astype(np.float64), 0.5 * CELL_M
         return AxisAlignedBox.around(np.vstack([centres_m - half_m, centres_m + half_m]))
 
     def footprint_m(self) -> Float32[ndarray, "k 3"]:
         """Return the centres of the cells that are observed often, or of all cells if those are few."""
-        often = self.settings.min_count_share * float(np.percentile(self.counts, 90))
+        often = _MIN_COUNT_SHARE * float(np.percentile(self.counts, 90))
         reliable = self.cells[self.counts > max(1.0, often)]
-        has_enough = len(reliable) >= self.settings.min_footprint_share * len(self.cells)
-        return VoxelGrid(self.settings.cell_m).centres_m(reliable if has_enough else self.cells)
+        has_enough = len(reliable) >= _MIN_FOOTPRINT_SHARE * len(self.cells)
+        return VoxelGrid(CELL_M).centres_m(reliable if has_enough else self.cells)
 
 
 class ObjectMap:
     """The landmarks of a task; of too many, the least observed is dropped first."""
 
-    def __init__(self, settings: ObjectMapSettings | None = None) -> None:
-        self._settings = settings or ObjectMapSettings()
+    def __init__(self) -> None:
         self._objects: list[Landmark] = []
         self._next_number = 1
 
@@ -279,7 +291,7 @@ class ObjectMap:
                 if not any(landmark is other for other in observed) and is_visible(landmark):
                     landmark.missed_count += 1
                     landmark.missed_in_a_row += 1
-        while len(self._objects) > self._settings.max_objects:
+        while len(self._objects) > MAX_OBJECTS:
             self._objects.remove(min(self._objects, key=lambda landmark: (landmark.is_given, landmark.seen_count)))
 
     def _matches(self, observation: Observation) -> list[Landmark]:

@@ -18,7 +18,6 @@ from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.relevance import PointedObject, Region
 from gausslite.perception.depth_segmenter import DepthSegmenter
 from gausslite.perception.lifting import without_background_planes
-from gausslite.perception.settings import LiftingSettings, SurfaceSettings
 from gausslite.perception.surface import SurfaceVotes, mask_votes, surface_mask
 
 _NEAR_M: Final = 0.05
@@ -64,7 +63,7 @@ def region_on_image(
 
     Raises InvalidInputError for a point outside the image, or a point or box without depth.
     """
-    return SurfaceRegion(mask_votes(mask_on_image(frame, points_px, boxes_px), frame, SurfaceSettings()))
+    return SurfaceRegion(mask_votes(mask_on_image(frame, points_px, boxes_px), frame))
 
 
 def mask_on_image(
@@ -90,7 +89,7 @@ def region_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> R
     Of frames that measure the same place, this is the nearest. Raises InvalidInputError if none shows the point.
     """
     frame, mask = mask_at(point_m, frames)
-    return SurfaceRegion(mask_votes(mask, frame, SurfaceSettings()))
+    return SurfaceRegion(mask_votes(mask, frame))
 
 
 def mask_at(point_m: tuple[float, float, float], frames: Iterable[Frame]) -> tuple[Frame, Bool[ndarray, "h w"]]:
@@ -188,7 +187,7 @@ def _grown(frame: Frame, row: int, column: int, settings: PointingSettings) -> B
     distance_m = np.where(frame.depth_m > 0, np.linalg.norm(points_m - points_m[row, column], axis=2), np.inf)
     for radius_m in settings.radii_m:
         ball = distance_m <= radius_m
-        standing = without_background_planes(ball, frame.depth_m, frame.camera, LiftingSettings())
+        standing = without_background_planes(ball, frame.depth_m, frame.camera)
         seed = _nearest(standing, row, column, settings.seed_px)
         if seed is not None:
             surface = _connected(standing, seed, settings)

@@ -15,7 +15,6 @@ from gausslite.domain.task import Relation, Superlative, TaskGraph, noun_of
 from gausslite.nouns import meant_by
 from gausslite.perception.object_map import Landmark, Observation
 from gausslite.perception.relations import RelationFilter, select_extreme
-from gausslite.perception.settings import RelationSettings
 
 _BOX_STEP_M = 0.05
 _MAX_STEPS = 16
@@ -43,7 +42,7 @@ def answer(
     left_of, nearest and the like; without it, sides are evaluated as near.
     """
     mapped, up = _MappedObjects(objects), np.array(unit_up_axis(up_axis))
-    relations = RelationFilter(graph, up, RelationSettings(), mapped, _NoSurfaces())
+    relations = RelationFilter(graph, up, mapped, _NoSurfaces())
     notes = [f"the map has no {noun_of(name)!r}" for name in relations.unseen_anchors]
     if notes:
         return Answer((), tuple(notes))

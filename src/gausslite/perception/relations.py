@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Final, Protocol, runtime_checkable
 
@@ -16,8 +16,21 @@ from gausslite.domain.task import Predicate, Relation, Superlative, TaskGraph, n
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.perception.colours import ColourFilter
 from gausslite.perception.evidence import Evidence
-from gausslite.perception.object_map import Landmark, ObjectMap, Observation
-from gausslite.perception.settings import RelationSettings
+from gausslite.perception.object_map import CELL_M, Landmark, ObjectMap, Observation
+
+_NEAR_M = 0.75
+"""Between surfaces. Of 724 pairs of things in homes with centroids within a metre, 705 are near."""
+_BETWEEN_M = 1.0
+_ON_M = 0.5
+_SIDE_M = 2.0
+"""Reach of the four sides."""
+_FOOTPRINT_SLACK_M = 0.10
+"""Horizontal distance at which an object is still over a footprint."""
+_MIN_SIDE_SLOPE = 0.5
+"""An object diagonally behind counts as behind, an object beside does not."""
+_ABOUT_SHARE = 0.25
+"""Tolerated share of a distance that is stated as about so many metres."""
+_MAX_SAMPLED_CELLS = 400
 
 
 @runtime_checkable
@@ -81,7 +94,7 @@ class RelationFilter:
     """Decides whether an observed object satisfies the relations of a target, to objects in view or not."""
 
     def __init__(
-        self, graph: TaskGraph, up: Float64[ndarray, "3"], settings: RelationSettings, objects: TaskObjects,
+        self, graph: TaskGraph, up: Float64[ndarray, "3"], objects: TaskObjects,
         surfaces: Surfaces,
     ) -> None:  # fmt: skip
         """Objects and surfaces are shared with their owner, which observes frames."""
@@ -89,8 +102,7 @@ class RelationFilter:
             target: tuple(relation for relation in graph.relations if relation.target == target)
             for target in graph.targets
         }
-        self._settings = settings
-        self._geometry = RelationGeometry(up, settings)
+        self._geometry = RelationGeometry(up)
         self._objects = objects
         self._surfaces = surfaces
 
@@ -165,7 +177,7 @@ class RelationFilter:
         best, best_signed_m = None, np.inf
         for candidate in self._objects.candidates(relation.target):
             distances_m = [
-                surface_distance_m(candidate, anchor, self._settings.max_sampled_cells)
+                surface_distance_m(candidate, anchor, _MAX_SAMPLED_CELLS)
                 for anchor in anchors
                 if anchor is not candidate
             ]
@@ -183,9 +195,8 @@ class RelationGeometry:
     a side is evaluated as near.
     """
 
-    def __init__(self, up: Float64[ndarray, "3"], settings: RelationSettings) -> None:
-        self._up = up
-        self._settings = settings
+    def __init__(self, up: Float64[ndarray, "3"], side_m: float = _SIDE_M) -> None:
+        self._up, self._side_m = up, side_m
 
     def holds(self, predicate: Predicate, observation: Observation, anchor: Landmark) -> bool:
         """Return whether predicate(target, anchor) holds. Superlatives and `between` are evaluated elsewhere."""
@@ -197,7 +208,7 @@ class RelationGeometry:
             return self._is_inside(observation.centroid_m, anchor)
         if predicate in _SIDES and observation.camera_m is not None:
             return self._is_on_side(predicate, observation.centroid_m, observation.camera_m, anchor)
-        return self._gap_m(observation, anchor) < self._settings.near_m
+        return self._gap_m(observation, anchor) < _NEAR_M
 
     def is_at_distance(self, relation: Relation, observation: Observation, anchors: Sequence[Landmark]) -> bool:
         """Return True if the distance to the nearest anchor is within the relation's bounds; True without bounds.
@@ -206,7 +217,7 @@ class RelationGeometry:
         """
         low_m, high_m = relation.min_m or 0.0, np.inf if relation.max_m is None else relation.max_m
         if low_m == high_m:
-            low_m, high_m = (1.0 - self._settings.about_share) * low_m, (1.0 + self._settings.about_share) * high_m
+            low_m, high_m = (1.0 - _ABOUT_SHARE) * low_m, (1.0 + _ABOUT_SHARE) * high_m
         if not anchors or (low_m == 0.0 and np.isinf(high_m)):
             return bool(anchors)
         nearest_m = min(
@@ -217,15 +228,15 @@ class RelationGeometry:
 
     def _gap_m(self, observation: Observation, anchor: Landmark) -> float:
         """Return the distance between the nearest cells of an object and an anchor."""
-        cells_m = VoxelGrid(observation.settings.cell_m).centres_m(observation.cells)
-        cells = _sample(cells_m, self._settings.max_sampled_cells)
+        cells_m = VoxelGrid(CELL_M).centres_m(observation.cells)
+        cells = _sample(cells_m, _MAX_SAMPLED_CELLS)
         footprint = anchor.footprint_m().astype(np.float64)
         return min(float(np.linalg.norm(footprint - cell, axis=1).min()) for cell in cells)
 
     def with_reach(self, max_m: float | None) -> RelationGeometry:
         """Return these predicates, with sides that reach as far as a stated distance."""
-        side_m = max(self._settings.side_m, (1.0 + self._settings.about_share) * (max_m or 0.0))
-        return RelationGeometry(self._up, replace(self._settings, side_m=side_m))
+        side_m = max(self._side_m, (1.0 + _ABOUT_SHARE) * (max_m or 0.0))
+        return RelationGeometry(self._up, side_m)
 
     def between(self, observation: Observation, anchors: Sequence[Sequence[Landmark]]) -> bool | None:
         """Return True within between_m of the line between two anchors of different groups; None without two."""
@@ -244,23 +255,23 @@ class RelationGeometry:
         """
         height_m, horizontal_m = self._offset_m(centroid_m, anchor.centroid_m[None])
         is_beyond = sign * height_m[0] > 0.0
-        if is_beyond and horizontal_m[0] < self._settings.on_m:
+        if is_beyond and horizontal_m[0] < _ON_M:
             return True
         to_cell_m, to_footprint_m = self._offset_m(centroid_m, anchor.footprint_m().astype(np.float64))
-        is_near = to_footprint_m < self._settings.footprint_slack_m
+        is_near = to_footprint_m < _FOOTPRINT_SLACK_M
         return bool(is_near.any() and (is_beyond or (sign > 0 and to_cell_m[is_near].min() > 0.0)))
 
     def _is_inside(self, centroid_m: Float64[ndarray, "3"], anchor: Landmark) -> bool:
         """Return True between the anchor's lowest and highest cells, and within its extent on two horizontal axes."""
         cells = anchor.footprint_m().astype(np.float64)
         height_m, _ = self._offset_m(centroid_m, cells)
-        if height_m.max() < -self._settings.footprint_slack_m or height_m.min() > self._settings.footprint_slack_m:
+        if height_m.max() < -_FOOTPRINT_SLACK_M or height_m.min() > _FOOTPRINT_SLACK_M:
             return False
         across = self._horizontal(np.array((1.0, 0.0, 0.0)) if abs(self._up[0]) < 0.9 else np.array((0.0, 1.0, 0.0)))
         along = np.cross(self._up, across)
         for axis in (across, along):
             extent_m = (cells - centroid_m) @ axis / np.linalg.norm(axis)
-            if extent_m.min() > self._settings.footprint_slack_m or extent_m.max() < -self._settings.footprint_slack_m:
+            if extent_m.min() > _FOOTPRINT_SLACK_M or extent_m.max() < -_FOOTPRINT_SLACK_M:
                 return False
         return True
 
@@ -276,15 +287,14 @@ class RelationGeometry:
         _, horizontal_m = self._offset_m(point_m, cells)
         nearest = int(horizontal_m.argmin())
         offset = self._horizontal(
-            point_m
-            - (anchor.centroid_m if horizontal_m[nearest] < self._settings.footprint_slack_m else cells[nearest])
+            point_m - (anchor.centroid_m if horizontal_m[nearest] < _FOOTPRINT_SLACK_M else cells[nearest])
         )
         right = np.cross(ahead, self._up)
         behind_m, right_m = float(offset @ ahead) / length_m, float(offset @ right) / length_m
         sign, sideways = _SIDES[predicate]
         along_m, across_m = (right_m, behind_m) if sideways else (behind_m, right_m)
-        is_near = float(horizontal_m[nearest]) < self._settings.side_m
-        return is_near and sign * along_m > self._settings.min_side_slope * abs(across_m)
+        is_near = float(horizontal_m[nearest]) < self._side_m
+        return is_near and sign * along_m > _MIN_SIDE_SLOPE * abs(across_m)
 
     def _is_between(
         self, point_m: Float64[ndarray, "3"], a_m: Float64[ndarray, "3"], b_m: Float64[ndarray, "3"]
@@ -292,7 +302,7 @@ class RelationGeometry:
         line = b_m - a_m
         length2 = float(line @ line)
         share = float((point_m - a_m) @ line) / length2 if length2 > 0.0 else 0.0
-        return 0.0 < share < 1.0 and distance_m(point_m, a_m + share * line) < self._settings.between_m
+        return 0.0 < share < 1.0 and distance_m(point_m, a_m + share * line) < _BETWEEN_M
 
     def _horizontal(self, offset_m: Float64[ndarray, "3"]) -> Float64[ndarray, "3"]:
         horizontal: Float64[ndarray, "3"] = offset_m - (offset_m @ self._up) * self._up

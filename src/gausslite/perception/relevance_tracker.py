@@ -33,12 +33,17 @@ from gausslite.perception.colours import ColourFilter, no_colours
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.evidence import Evidence, LandmarkState, VisibilityCheck
 from gausslite.perception.lifting import lift_detections
-from gausslite.perception.object_map import Landmark, ObjectMap, describe_landmarks
+from gausslite.perception.object_map import MAX_LEVELS, MAX_OBJECTS, Landmark, ObjectMap, describe_landmarks
 from gausslite.perception.relations import NamedObjects, RelationFilter
-from gausslite.perception.settings import HeightSettings, RelevanceTrackerSettings
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.perception.supporting_surface import FloorLevel, SupportingSurfaces
-from gausslite.perception.surface import SurfaceVotes, refined_mask, surface_mask
+from gausslite.perception.surface import VOXEL_SIZES_M, SurfaceVotes, refined_mask, surface_mask
 from gausslite.perception.targets import TargetSelector
+
+_MIN_LEFT_SHARE = 0.3
+"""Share of a detection outside excluded objects, below which it shows one of them."""
+_MIN_SHOWN_SHARE = 0.5
+"""Share of a known object's surface in a frame's relevance, from which the frame needs no completion."""
 
 
 class RelevanceTracker:
@@ -55,11 +60,11 @@ class RelevanceTracker:
         self._graph = graph
         self._settings = settings
         self._evidence = Evidence(settings.evidence)
-        self._object_map = ObjectMap(settings.object_map)
-        up = np.array(unit_up_axis(settings.up_axis))
-        self._surfaces = SupportingSurfaces(graph, nouns_by_height, up, settings.heights)
-        objects = NamedObjects(self._object_map, self._evidence, ColourFilter(graph, settings.colours))
-        relations = RelationFilter(graph, up, settings.relations, objects, self._surfaces)
+        self._object_map = ObjectMap()
+        up = self._up = np.array(unit_up_axis(settings.up_axis))
+        self._surfaces = SupportingSurfaces(graph, nouns_by_height, up)
+        objects = NamedObjects(self._object_map, self._evidence, ColourFilter(graph))
+        relations = RelationFilter(graph, up, objects, self._surfaces)
         self._targets = TargetSelector(graph, objects, relations, self._surfaces)
         self._T_world_keyframe: Float64[ndarray, "4 4"] | None = None
         self._frames_since = 0
@@ -127,8 +132,8 @@ class RelevanceTracker:
             require_rigid("state T_world_keyframe", pose)
         saved_landmarks = [select_prefix(state, f"landmark-{i}") for i in range(landmarks)]
         self._targets.excluded_m = get_array(state, "excluded_m", (None, 3), np.float64).copy()
-        self._surfaces.floor = decode_floor(state, self._settings.heights)
-        self._object_map.restore([decode_landmark(saved, self._settings) for saved in saved_landmarks])
+        self._surfaces.floor = decode_floor(state)
+        self._object_map.restore([decode_landmark(saved) for saved in saved_landmarks])
         self._T_world_keyframe = poses[0].copy() if len(poses) else None
         self._frames_since, needs_observation = get_counts(state, "keyframe_age", 2)
         self._needs_observation = needs_observation > 0
@@ -140,7 +145,7 @@ class RelevanceTracker:
         Raises InvalidInputError for a mask with too little depth, or of a plane where the noun's kind is none.
         """
         detection = Detection(noun, 1.0, bounding_box(mask) or (0.0, 0.0, 0.0, 0.0), mask, is_exact=True)
-        lifted = lift_detections([detection], frame.depth_m, frame, self._settings)
+        lifted = lift_detections([detection], frame.depth_m, frame, self._up)
         if not lifted:
             raise InvalidInputError(f"pointed object: expected a {noun!r} with depth on frame {frame.index}, got none")
         ((_, observation),) = lifted
@@ -153,9 +158,8 @@ class RelevanceTracker:
 
     def exclude(self, point_m: PointM) -> None:
         """Leave out the object at a point, now and when it is detected again. Raises InvalidInputError for too many."""
-        max_points = self._settings.object_map.max_objects
-        if len(self._targets.excluded_m) == max_points:
-            raise InvalidInputError(f"excluded: expected at most {max_points} points, got more")
+        if len(self._targets.excluded_m) == MAX_OBJECTS:
+            raise InvalidInputError(f"excluded: expected at most {MAX_OBJECTS} points, got more")
         self._targets.excluded_m = np.vstack([self._targets.excluded_m, point_m])
 
     def update_keyframe(self, frame: Frame) -> bool:
@@ -199,7 +203,7 @@ class RelevanceTracker:
         missed = [
             (name, mask)
             for name, mask in masks
-            if np.count_nonzero(mask & relevance.roi) < self._settings.min_shown_share * np.count_nonzero(mask)
+            if np.count_nonzero(mask & relevance.roi) < _MIN_SHOWN_SHARE * np.count_nonzero(mask)
         ]
         added = merge_masks(missed, self._graph.targets, frame)
         is_new = added.roi & ~relevance.roi
@@ -235,10 +239,10 @@ class RelevanceTracker:
         depth_m = np.where(excluded, np.float32(0.0), depth_m)
         localised = [
             (detection, self._surfaces.with_level(observation, detection.mask, frame))
-            for detection, observation in lift_detections(kept, depth_m, frame, self._settings)
+            for detection, observation in lift_detections(kept, depth_m, frame, self._up)
         ]
         self._surfaces.observe(frame)
-        visibility = VisibilityCheck(frame, frame.depth_m, self._settings.evidence)
+        visibility = VisibilityCheck(frame, frame.depth_m)
         self._object_map.observe([observation for _, observation in localised], visibility.is_visible)
         shown = [
             (landmark, detection.mask, observation)
@@ -274,7 +278,7 @@ class RelevanceTracker:
         kept = []
         for detection in detections:
             left = detection.mask & ~excluded
-            is_other = np.count_nonzero(left) >= self._settings.min_left_share * np.count_nonzero(detection.mask)
+            is_other = np.count_nonzero(left) >= _MIN_LEFT_SHARE * np.count_nonzero(detection.mask)
             if detection.phrase not in self._graph.excluded_nouns and is_other:
                 kept.append(replace(detection, mask=left))
         return kept
@@ -316,7 +320,7 @@ def encode_landmark(landmark: Landmark) -> dict[str, NDArray[Any]]:
     }
 
 
-def decode_landmark(state: State, settings: RelevanceTrackerSettings) -> Landmark:
+def decode_landmark(state: State) -> Landmark:
     """Decode a landmark. Raises MapFileError, InvalidInputError."""
     x_m, y_m, z_m, radius_m = get_floats(state, "centroid_radius_m", 4)
     cells = get_array(state, "cells", (None,), np.int64).copy()
@@ -334,16 +338,14 @@ def decode_landmark(state: State, settings: RelevanceTrackerSettings) -> Landmar
     if (keys[1:] <= keys[:-1]).any() or (inside < 0).any() or (outside < 0).any():
         raise MapFileError("state landmark: expected ascending voxels with votes, got others")
     (voxel_m,) = get_floats(state, "vote_voxel_m", 1)
-    sizes_m = settings.surface.voxel_sizes_m
-    if voxel_m not in sizes_m:
-        raise MapFileError(f"state landmark: expected voxels of {', '.join(map(str, sizes_m))} m, got {voxel_m}")
+    if voxel_m not in VOXEL_SIZES_M:
+        raise MapFileError(f"state landmark: expected voxels of {', '.join(map(str, VOXEL_SIZES_M))} m, got {voxel_m}")
     colours = get_array(state, "colours", no_colours().shape, np.float64).copy()
     if not np.isfinite(colours).all() or (colours < 0).any():
         raise MapFileError("state landmark: expected colours of zero or more, got others")
     levels_m = get_array(state, "supports_m", (None,), np.float64).copy()
-    max_levels = settings.object_map.max_levels
-    if len(levels_m) > max_levels or not np.isfinite(levels_m).all():
-        raise MapFileError(f"state landmark: expected at most {max_levels} finite levels, got {len(levels_m)}")
+    if len(levels_m) > MAX_LEVELS or not np.isfinite(levels_m).all():
+        raise MapFileError(f"state landmark: expected at most {MAX_LEVELS} finite levels, got {len(levels_m)}")
     names = get_text(state, "rival_names").splitlines()
     score_sum, *rival_sums = get_floats(state, "score_sums", 1 + len(names))
     return Landmark(
@@ -361,21 +363,20 @@ def decode_landmark(state: State, settings: RelevanceTrackerSettings) -> Landmar
         number=number,
         score_sum=score_sum,
         rival_scores=dict(zip(names, rival_sums, strict=True)),
-        votes=SurfaceVotes(keys, inside, outside, voxel_m, settings.surface),
+        votes=SurfaceVotes(keys, inside, outside, voxel_m),
         missed_in_a_row=missed_in_a_row,
         colours=colours,
         levels_m=levels_m,
         weak_count=weak_count,
         is_given=is_given > 0,
-        settings=settings.object_map,
     )
 
 
-def decode_floor(state: State, settings: HeightSettings) -> FloorLevel:
+def decode_floor(state: State) -> FloorLevel:
     """Decode the observed heights. Raises MapFileError."""
-    empty = FloorLevel.before_frames(settings)
+    empty = FloorLevel.before_frames()
     counts = get_array(state, "floor_counts", empty.counts.shape, np.int64).copy()
     levels_m = get_array(state, "first_camera_m", (None,), np.float64)
     if (counts < 0).any() or len(levels_m) > 1 or not np.isfinite(levels_m).all():
         raise MapFileError("state floor: expected counts of zero or more and at most one finite level, got others")
-    return FloorLevel(float(levels_m[0]) if len(levels_m) else None, counts, settings)
+    return FloorLevel(float(levels_m[0]) if len(levels_m) else None, counts)

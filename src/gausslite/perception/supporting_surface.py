@@ -19,16 +19,37 @@ from gausslite.domain.task import Predicate, Relation, TaskGraph, noun_of
 from gausslite.nouns import head_of, words
 from gausslite.perception.detector import bounding_box
 from gausslite.perception.object_map import Landmark, Observation
-from gausslite.perception.settings import HeightSettings
 from gausslite.perception.surface import window_points_m
+
+_LEVEL_BIN_M = 0.025
+_LEVEL_REACH_M = 4.0
+"""Levels below and above the first camera that are counted."""
+_MIN_CAMERA_HEIGHT_M = 1.0
+_MAX_CAMERA_HEIGHT_M = 2.2
+"""Height of a camera carried by a person or a tall robot; other levels are rather a table than the floor."""
+_MIN_FLOOR_SHARE = 0.02
+_MIN_FLOOR_POINTS = 40
+_POINTS_ACROSS = 40
+"""Points of a frame's width that are counted."""
+_MAX_SLOPE = 0.25
+"""Rise between two of them, relative to their distance, up to which they are on a horizontal surface."""
+_MAX_DEPTH_M = 4.0
+_BOTTOM_PERCENTILE = 5.0
+_PLANE_SLACK_M = 0.04
+"""Distance from an object's bottom within which points are on the plane under it."""
+_PLANE_REACH_M = 0.20
+_MIN_PLANE_POINTS = 30
+_MIN_PLANE_EXTENT_M = 0.15
+_MAX_STANDING_M = 0.06
+"""Height of an object's lowest point up to which it stands on the floor."""
+_LOWEST_PERCENTILE = 0.5
+"""Share of a surface's voxels, in percent, below its lowest point."""
 
 
 class SupportingSurfaces:
     """The surfaces of a task that no detection shows, and the floor below them. Heights decide what stands on them."""
 
-    def __init__(
-        self, graph: TaskGraph, nouns_by_height: frozenset[str], up: Float64[ndarray, "3"], settings: HeightSettings
-    ) -> None:
+    def __init__(self, graph: TaskGraph, nouns_by_height: frozenset[str], up: Float64[ndarray, "3"]) -> None:
         """nouns_by_height: of `nouns_known_by_height`."""
         coloured = {attributes.name for attributes in graph.attributes if attributes.colour is not None}
         self._anchors = frozenset(
@@ -39,8 +60,7 @@ class SupportingSurfaces:
             and noun_of(relation.anchor) in nouns_by_height
         )
         self.up = up
-        self._settings = settings
-        self.floor = FloorLevel.before_frames(settings)
+        self.floor = FloorLevel.before_frames()
 
     def is_by_height(self, relation: Relation) -> bool:
         """Return True if heights decide the relation: on a surface without a colour that no detection shows."""
@@ -55,20 +75,18 @@ class SupportingSurfaces:
         """Return the observation with the level of the plane under it, if a relation needs it."""
         if not self._anchors:
             return observation
-        level_m = level_under_m(mask, frame, self.up, self._settings)
+        level_m = level_under_m(mask, frame, self.up)
         return replace(observation, levels_m=np.array([level_m])) if np.isfinite(level_m) else observation
 
     def stands_on(self, relation: Relation, seen: Landmark | Observation) -> bool | None:
         """Return whether an object stands on the relation's anchor by its height; None if heights do not decide."""
         if not self.is_by_height(relation):
             return None
-        bottom_m = seen.votes.lowest_m(self.up, self._settings.lowest_percentile)
-        return stands_on(noun_of(relation.anchor), seen.levels_m, self.floor.level_m, bottom_m, self._settings)
+        bottom_m = seen.votes.lowest_m(self.up, _LOWEST_PERCENTILE)
+        return stands_on(noun_of(relation.anchor), seen.levels_m, self.floor.level_m, bottom_m)
 
 
-def level_under_m(
-    mask: Bool[ndarray, "h w"], frame: Frame, up: Float64[ndarray, "3"], settings: HeightSettings
-) -> float:
+def level_under_m(mask: Bool[ndarray, "h w"], frame: Frame, up: Float64[ndarray, "3"]) -> float:
     """Return the level, along up in the world, of the plane that the frame shows around an object's bottom.
 
     NaN if none is seen. A plane has 30 points beside the object within 4 cm of its bottom, over 15 cm or more.
@@ -88,17 +106,17 @@ def level_under_m(
     if not is_object.any():
         return np.nan
     levels_m = points_m @ up
-    bottom_m = float(np.percentile(levels_m[is_object], settings.bottom_percentile))
+    bottom_m = float(np.percentile(levels_m[is_object], _BOTTOM_PERCENTILE))
     flat = points_m - levels_m[:, None] * up
     middle, reach_m = (
         np.median(flat[is_object], axis=0),
-        np.ptp(flat[is_object], axis=0).max() / 2 + settings.plane_reach_m,
+        np.ptp(flat[is_object], axis=0).max() / 2 + _PLANE_REACH_M,
     )
-    is_plane = ~is_object & (np.abs(levels_m - bottom_m) < settings.plane_slack_m)
+    is_plane = ~is_object & (np.abs(levels_m - bottom_m) < _PLANE_SLACK_M)
     is_plane &= np.linalg.norm(flat - middle, axis=1) < reach_m
-    if np.count_nonzero(is_plane) < settings.min_plane_points:
+    if np.count_nonzero(is_plane) < _MIN_PLANE_POINTS:
         return np.nan
-    if np.ptp(flat[is_plane], axis=0).max() < settings.min_plane_extent_m:
+    if np.ptp(flat[is_plane], axis=0).max() < _MIN_PLANE_EXTENT_M:
         return np.nan
     return float(np.median(levels_m[is_plane]))
 
@@ -112,49 +130,48 @@ class FloorLevel:
 
     first_camera_m: float | None
     counts: Int64[ndarray, " bins"]
-    settings: HeightSettings
 
     @classmethod
-    def before_frames(cls, settings: HeightSettings) -> FloorLevel:
+    def before_frames(cls) -> FloorLevel:
         """Return no points."""
-        return cls(None, np.zeros(round(2 * settings.level_reach_m / settings.level_bin_m), np.int64), settings)
+        return cls(None, np.zeros(round(2 * _LEVEL_REACH_M / _LEVEL_BIN_M), np.int64))
 
     def add(self, frame: Frame, up: Float64[ndarray, "3"]) -> FloorLevel:
         """Return the counts with some points of another frame."""
         camera_m = float(frame.T_world_camera[:3, 3] @ up)
         first_m = camera_m if self.first_camera_m is None else self.first_camera_m
-        from_lowest_m = _horizontal_levels_m(frame, up, self.settings) - first_m + self.settings.level_reach_m
-        bins = np.floor(from_lowest_m / self.settings.level_bin_m).astype(np.int64)
+        from_lowest_m = _horizontal_levels_m(frame, up) - first_m + _LEVEL_REACH_M
+        bins = np.floor(from_lowest_m / _LEVEL_BIN_M).astype(np.int64)
         inside = bins[(bins >= 0) & (bins < len(self.counts))]
-        return FloorLevel(first_m, self.counts + np.bincount(inside, minlength=len(self.counts)), self.settings)
+        return FloorLevel(first_m, self.counts + np.bincount(inside, minlength=len(self.counts)))
 
     @property
     def level_m(self) -> float:
         """The lowest level, 1.0 to 2.2 m below the first camera, with a fiftieth of all points; NaN without one."""
         pairs = (self.counts[:-1] + self.counts[1:]).astype(np.float64)
-        below_m = self.settings.level_reach_m - (np.arange(len(pairs)) + 1) * self.settings.level_bin_m
-        enough = max(self.settings.min_floor_points, self.settings.min_floor_share * float(self.counts.sum()))
-        is_floor = (pairs >= enough) & (below_m >= self.settings.min_camera_height_m)
-        is_floor &= below_m <= self.settings.max_camera_height_m
+        below_m = _LEVEL_REACH_M - (np.arange(len(pairs)) + 1) * _LEVEL_BIN_M
+        enough = max(_MIN_FLOOR_POINTS, _MIN_FLOOR_SHARE * float(self.counts.sum()))
+        is_floor = (pairs >= enough) & (below_m >= _MIN_CAMERA_HEIGHT_M)
+        is_floor &= below_m <= _MAX_CAMERA_HEIGHT_M
         if self.first_camera_m is None or not is_floor.any():
             return np.nan
         low = int(np.flatnonzero(is_floor)[0])
         return self.first_camera_m - float(below_m[low + int(pairs[low : low + 4].argmax())])
 
 
-def _horizontal_levels_m(frame: Frame, up: Float64[ndarray, "3"], settings: HeightSettings) -> Float64[ndarray, " n"]:
+def _horizontal_levels_m(frame: Frame, up: Float64[ndarray, "3"]) -> Float64[ndarray, " n"]:
     """Return the levels of some points of a frame whose neighbours are at the same level."""
-    step = max(1, frame.camera.width_px // settings.points_across)
+    step = max(1, frame.camera.width_px // _POINTS_ACROSS)
     window = slice(0, frame.camera.height_px), slice(0, frame.camera.width_px)
     points_m, is_known = window_points_m(frame, window, step)
     grid_m = np.full((*is_known.shape, 3), np.nan)
     grid_m[is_known] = points_m
     grid_m = grid_m[::step, ::step]
-    is_near = frame.depth_m[::step, ::step] < settings.max_depth_m
+    is_near = frame.depth_m[::step, ::step] < _MAX_DEPTH_M
     is_flat = is_near[1:, 1:]
     for other in (grid_m[:-1, 1:], grid_m[1:, :-1]):
         offset_m = grid_m[1:, 1:] - other
-        is_flat = is_flat & (np.abs(offset_m @ up) < settings.max_slope * np.linalg.norm(offset_m, axis=-1))
+        is_flat = is_flat & (np.abs(offset_m @ up) < _MAX_SLOPE * np.linalg.norm(offset_m, axis=-1))
     levels_m: Float64[ndarray, " n"] = grid_m[1:, 1:][is_flat] @ up
     return levels_m
 
@@ -174,15 +191,13 @@ def nouns_known_by_height(matches: Sequence[NounMatch]) -> frozenset[str]:
     return frozenset(by_height)
 
 
-def stands_on(
-    noun: str, levels_m: Float64[ndarray, " n"], floor_m: float, bottom_m: float, settings: HeightSettings
-) -> bool | None:
+def stands_on(noun: str, levels_m: Float64[ndarray, " n"], floor_m: float, bottom_m: float) -> bool | None:
     """Return whether an object on planes of these levels stands on such a surface; None if this is not sure.
 
     bottom_m: the object's lowest level. It decides alone for furniture of any height, such as shelves.
     """
     if _is_of_any_height(head_of(noun)):
-        return False if bottom_m - floor_m <= settings.max_standing_m else None
+        return False if bottom_m - floor_m <= _MAX_STANDING_M else None
     if len(levels_m) == 0 or not np.isfinite(floor_m):
         return None
     height_m = float(np.median(levels_m)) - floor_m

@@ -18,22 +18,47 @@ from gausslite.domain.pose import inverse, transform_points
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.perception.colours import colour_counts
 from gausslite.perception.detector import bounding_box
-from gausslite.perception.settings import SurfaceSettings
+
+VOXEL_SIZES_M: tuple[float, ...] = (0.00625, 0.0125, 0.025)
+"""Edges of the voxels, finest first; each voxel consists of eight of the next finer size."""
+_EXTENT_VOXELS = 12
+"""Voxels across an object. Finer ones change no precision by more than 0.03."""
+MAX_VOXELS = 60_000
+MAX_INSIDE_VOXELS = 15_000
+"""Voxels inside a surface from which it is coarsened, if it has more than max_voxels in all."""
+_PART_CELL_M = 0.05
+"""Cells that touch connect the parts of a surface."""
+_MIN_PART_SHARE = 0.2
+"""Votes of a separate part relative to the largest. Without the cut, laptop and mugs have a precision of 0.48
+instead of 0.71."""
+_VOTE_MARGIN_SHARE = 1.0
+"""Margin around a mask whose pixels vote outside, relative to its box; a later mask that spills over is cut."""
+_MIN_MARGIN_PX = 8
+_MAX_VOTING_PIXELS = 40_000
+_MAX_PROJECTED_POINTS = 4000
+_MIN_DEPTH_M = 0.05
+_GAP_PX = 5
+"""Pixels without depth that are filled between pixels of the surface."""
+_EDGE_RADIUS_PX = 2
+"""Pixels by which an outline moves to a colour edge: bottles' precision 0.75 to 0.77, a mug's 0.84 to 0.88."""
+_EDGE_EPSILON = 1e-4
+"""Variance of colour, in squared shares of the Lab range, below which an edge is noise."""
+_MIN_INNER_PIXELS = 20
+"""Pixels inside the outline from which they alone give an object's colours."""
+_MAX_COLOUR_PIXELS = 500
 
 
-def is_in_large_part(
-    points_m: Float32[ndarray, "n 3"], weights: Int64[ndarray, " n"], settings: SurfaceSettings
-) -> Bool[ndarray, " n"]:
+def is_in_large_part(points_m: Float32[ndarray, "n 3"], weights: Int64[ndarray, " n"]) -> Bool[ndarray, " n"]:
     """Return True for the points of the part with the largest weight, and of parts with a fifth of that weight.
 
     Points are connected if their cells touch. Masks that spill over leave small parts apart from the object.
     """
     if len(points_m) == 0:
         return np.zeros(0, np.bool_)
-    keys, cell = np.unique(VoxelGrid(settings.part_cell_m).keys(points_m), return_inverse=True)
+    keys, cell = np.unique(VoxelGrid(_PART_CELL_M).keys(points_m), return_inverse=True)
     part = _parts(keys)
     totals = np.bincount(part, weights=np.bincount(cell, weights=weights))
-    is_large: Bool[ndarray, " n"] = (totals >= settings.min_part_share * totals.max())[part[cell]]
+    is_large: Bool[ndarray, " n"] = (totals >= _MIN_PART_SHARE * totals.max())[part[cell]]
     return is_large
 
 
@@ -73,7 +98,7 @@ _DISC_DIAMETERS: Final = 2.8
 class SurfaceVotes:
     """Votes of voxels: in how many frames their visible pixels were inside the object's mask, or outside.
 
-    keys: ascending, without duplicates, in a grid of voxel_m, one of the settings: the finest whose votes fit the
+    keys: ascending, without duplicates, in a grid of voxel_m, one of VOXEL_SIZES_M: the finest whose votes fit the
     memory. An object's surface consists of the voxels with at least as many votes inside as outside, and of their
     neighbours without votes, because depth is inexact. A mask that once spills over to a wall is outvoted by the frames
     that show the wall outside the mask; small parts that are apart from the object are left out.
@@ -83,24 +108,21 @@ class SurfaceVotes:
     inside: Int64[ndarray, " n"]
     outside: Int64[ndarray, " n"]
     voxel_m: float
-    settings: SurfaceSettings
 
     @classmethod
-    def empty(cls, settings: SurfaceSettings | None = None) -> SurfaceVotes:
+    def empty(cls) -> SurfaceVotes:
         """Return no votes."""
-        none, settings = np.zeros(0, np.int64), settings or SurfaceSettings()
-        return cls(none, none, none, settings.voxel_sizes_m[0], settings)
+        none = np.zeros(0, np.int64)
+        return cls(none, none, none, VOXEL_SIZES_M[0])
 
     @classmethod
-    def from_points(
-        cls, points_m: Float64[ndarray, "n 3"], is_inside: Bool[ndarray, " n"], settings: SurfaceSettings
-    ) -> SurfaceVotes:
+    def from_points(cls, points_m: Float64[ndarray, "n 3"], is_inside: Bool[ndarray, " n"]) -> SurfaceVotes:
         """Return one frame's votes: one for each voxel, by the majority of its points in the world."""
-        voxel_m = settings.voxel_sizes_m[0]
+        voxel_m = VOXEL_SIZES_M[0]
         keys, voxel = np.unique(VoxelGrid(voxel_m).keys(points_m.astype(np.float32)), return_inverse=True)
         total = np.bincount(voxel, minlength=len(keys))
         inside = (2 * np.bincount(voxel, weights=is_inside, minlength=len(keys)) > total).astype(np.int64)
-        return cls(keys, inside, 1 - inside, voxel_m, settings)._limited()
+        return cls(keys, inside, 1 - inside, voxel_m)._limited()
 
     def add(self, other: SurfaceVotes) -> SurfaceVotes:
         """Return the sums of both votes, in the coarser grid of both."""
@@ -112,7 +134,7 @@ class SurfaceVotes:
         return self._summed(keys, inside, outside, voxel_m)._limited()
 
     def coarsened(self, voxel_m: float) -> SurfaceVotes:
-        """Return the sums of the votes in voxels of at least voxel_m, one of the settings."""
+        """Return the sums of the votes in voxels of at least voxel_m, one of VOXEL_SIZES_M."""
         if voxel_m <= self.voxel_m:
             return self
         if voxel_m not in self._coarsened:
@@ -126,7 +148,7 @@ class SurfaceVotes:
         unique, voxel = np.unique(keys, return_inverse=True)
         inside_sums = np.bincount(voxel, weights=inside, minlength=len(unique)).astype(np.int64)
         outside_sums = np.bincount(voxel, weights=outside, minlength=len(unique)).astype(np.int64)
-        return SurfaceVotes(unique, inside_sums, outside_sums, voxel_m, self.settings)
+        return SurfaceVotes(unique, inside_sums, outside_sums, voxel_m)
 
     @cached_property
     def extent_m(self) -> float:
@@ -144,9 +166,9 @@ class SurfaceVotes:
 
     def resolved(self, min_voxel_m: float) -> SurfaceVotes:
         """Return the votes in voxels of a twelfth of the extent, and of at least min_voxel_m."""
-        wanted_m = max(min_voxel_m, self.extent_m / self.settings.extent_voxels)
-        sizes = [size for size in self.settings.voxel_sizes_m if size <= 2**0.5 * wanted_m]
-        return self.coarsened(max(sizes, default=self.settings.voxel_sizes_m[0]))
+        wanted_m = max(min_voxel_m, self.extent_m / _EXTENT_VOXELS)
+        sizes = [size for size in VOXEL_SIZES_M if size <= 2**0.5 * wanted_m]
+        return self.coarsened(max(sizes, default=VOXEL_SIZES_M[0]))
 
     @cached_property
     def _coarsened(self) -> dict[float, SurfaceVotes]:
@@ -155,12 +177,12 @@ class SurfaceVotes:
 
     def _limited(self) -> SurfaceVotes:
         """Return the votes in a coarser grid if the surface is too large for memory, without the least voted voxels."""
-        if len(self.keys) <= self.settings.max_voxels:
+        if len(self.keys) <= MAX_VOXELS:
             return self
-        sizes_m = self.settings.voxel_sizes_m
-        if np.count_nonzero(self.inside) > self.settings.max_inside_voxels and self.voxel_m < sizes_m[-1]:
+        sizes_m = VOXEL_SIZES_M
+        if np.count_nonzero(self.inside) > MAX_INSIDE_VOXELS and self.voxel_m < sizes_m[-1]:
             return self.coarsened(next(size for size in sizes_m if size > self.voxel_m))._limited()
-        kept = np.sort(np.lexsort((-self.outside, -self.inside))[: self.settings.max_voxels])
+        kept = np.sort(np.lexsort((-self.outside, -self.inside))[:MAX_VOXELS])
         return replace(self, keys=self.keys[kept], inside=self.inside[kept], outside=self.outside[kept])
 
     def is_on_surface(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
@@ -174,9 +196,7 @@ class SurfaceVotes:
     @cached_property
     def _is_inside(self) -> Bool[ndarray, " n"]:
         is_inside = self.inside >= self.outside
-        is_inside[is_inside] = is_in_large_part(
-            self._grid.centres_m(self.keys[is_inside]), self.inside[is_inside], self.settings
-        )
+        is_inside[is_inside] = is_in_large_part(self._grid.centres_m(self.keys[is_inside]), self.inside[is_inside])
         return is_inside
 
     @cached_property
@@ -230,38 +250,35 @@ def _is_member(keys: Int64[ndarray, " n"], ascending: Int64[ndarray, " m"]) -> B
     return result
 
 
-def snapped_to_edges(
-    mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"], settings: SurfaceSettings
-) -> Bool[ndarray, "h w"]:
+def snapped_to_edges(mask: Bool[ndarray, "h w"], rgb: UInt8[ndarray, "h w 3"]) -> Bool[ndarray, "h w"]:
     """Return the mask with pixels at its outline on the side of their colour (guided filter, He et al., 2013)."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if len(rows) == 0:
         return mask
     # a filtered pixel depends on pixels up to twice the radius away, and a changed pixel is one radius outside
-    margin_px = 3 * settings.edge_radius_px
+    margin_px = 3 * _EDGE_RADIUS_PX
     window = tuple(slice(max(0, int(at[0]) - margin_px), int(at[-1]) + margin_px + 1) for at in (rows, columns))
     part = mask[window]
     lab = cv2.cvtColor(np.ascontiguousarray(rgb[window]), cv2.COLOR_RGB2LAB).astype(np.float32) / np.float32(255)
-    kernel = np.ones(_edge_window(settings), np.uint8)
+    kernel = np.ones(_edge_window(), np.uint8)
     near_outline = cv2.dilate(part.astype(np.uint8), kernel) > cv2.erode(part.astype(np.uint8), kernel)
-    share = _guided_filter(lab, part.astype(np.float32), near_outline, settings)
+    share = _guided_filter(lab, part.astype(np.float32), near_outline)
     snapped = mask.copy()
     snapped[window] = np.where(near_outline, share > 0.5, part)
     return snapped
 
 
-def _edge_window(settings: SurfaceSettings) -> tuple[int, int]:
-    return 2 * settings.edge_radius_px + 1, 2 * settings.edge_radius_px + 1
+def _edge_window() -> tuple[int, int]:
+    return 2 * _EDGE_RADIUS_PX + 1, 2 * _EDGE_RADIUS_PX + 1
 
 
 def _guided_filter(
     guide: Float32[ndarray, "h w 3"],
     values: Float32[ndarray, "h w"],
     wanted: Bool[ndarray, "h w"],
-    settings: SurfaceSettings,
 ) -> Float32[ndarray, "h w"]:
     """Return the wanted pixels' values as linear functions, fitted in each window, of the guide's three channels."""
-    window = _edge_window(settings)
+    window = _edge_window()
     guide_mean, value_mean = cv2.blur(guide, window), cv2.blur(values, window)
     products = cv2.blur(guide * values[..., None], window) - guide_mean * value_mean[..., None]
     # the wanted pixels depend on the fits in the windows around them
@@ -272,7 +289,7 @@ def _guided_filter(
         variance[:, i, j] = variance[:, j, i] = mean - guide_mean[fitted, i] * guide_mean[fitted, j]
     slope = np.zeros_like(guide)
     slope[fitted] = np.linalg.solve(
-        variance + np.float32(settings.edge_epsilon) * np.eye(3, dtype=np.float32), products[fitted][..., None]
+        variance + np.float32(_EDGE_EPSILON) * np.eye(3, dtype=np.float32), products[fitted][..., None]
     )[..., 0]
     offset = value_mean - (slope * guide_mean).sum(axis=-1)
     slope_mean = cv2.blur(slope, window)
@@ -286,7 +303,6 @@ Window = tuple[slice, slice]
 def mask_votes(
     mask: Bool[ndarray, "h w"],
     frame: Frame,
-    settings: SurfaceSettings,
     siblings: Bool[ndarray, "h w"] | None = None,
 ) -> SurfaceVotes:
     """Return the votes of a detected mask: inside for its pixels, outside for the other pixels around it.
@@ -296,27 +312,25 @@ def mask_votes(
     """
     box_px = bounding_box(mask)
     if box_px is None:
-        return SurfaceVotes.empty(settings)
+        return SurfaceVotes.empty()
     left, top, right, bottom = box_px
-    margin_px = max(settings.min_margin_px, round(settings.vote_margin_share * max(right - left, bottom - top)))
+    margin_px = max(_MIN_MARGIN_PX, round(_VOTE_MARGIN_SHARE * max(right - left, bottom - top)))
     low, high = np.array((top, left)) - margin_px, np.array((bottom, right)) + margin_px
     window = _clipped(low.astype(np.int64), high.astype(np.int64), frame)
     pixels = frame.depth_m[window].size
-    points_m, is_known = window_points_m(frame, window, math.ceil(math.sqrt(pixels / settings.max_voting_pixels)))
+    points_m, is_known = window_points_m(frame, window, math.ceil(math.sqrt(pixels / _MAX_VOTING_PIXELS)))
     is_inside = mask[window][is_known]
     if siblings is not None:
         has_vote = is_inside | ~siblings[window][is_known]
         points_m, is_inside = points_m[has_vote], is_inside[has_vote]
-    return SurfaceVotes.from_points(points_m, is_inside, settings)
+    return SurfaceVotes.from_points(points_m, is_inside)
 
 
-def mask_colours(
-    mask: Bool[ndarray, "h w"], frame: Frame, settings: SurfaceSettings
-) -> Float64[ndarray, "balances ranges"]:
+def mask_colours(mask: Bool[ndarray, "h w"], frame: Frame) -> Float64[ndarray, "balances ranges"]:
     """Return the `colour_counts` of a mask's pixels, without its outline, which mixes with what is behind."""
     inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    pixels = frame.rgb[inner if np.count_nonzero(inner) >= settings.min_inner_pixels else mask]
-    return colour_counts(pixels[:: max(1, len(pixels) // settings.max_colour_pixels)])
+    pixels = frame.rgb[inner if np.count_nonzero(inner) >= _MIN_INNER_PIXELS else mask]
+    return colour_counts(pixels[:: max(1, len(pixels) // _MAX_COLOUR_PIXELS)])
 
 
 def surface_mask(votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
@@ -332,11 +346,11 @@ def surface_mask(votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
     votes = _resolved(votes, frame)
     points_m, is_known = window_points_m(frame, window)
     shown = np.zeros(is_known.shape, np.bool_)
-    closing = np.ones((votes.settings.gap_px, votes.settings.gap_px), np.uint8)
+    closing = np.ones((_GAP_PX, _GAP_PX), np.uint8)
     shown[is_known] = votes.is_on_surface(points_m)
     closed = cv2.morphologyEx(shown.astype(np.uint8), cv2.MORPH_CLOSE, closing) > 0
     mask[window] = shown | (closed & ~is_known)
-    return snapped_to_edges(mask, frame.rgb, votes.settings)
+    return snapped_to_edges(mask, frame.rgb)
 
 
 def refined_mask(detected: Bool[ndarray, "h w"], votes: SurfaceVotes, frame: Frame) -> Bool[ndarray, "h w"]:
@@ -360,7 +374,7 @@ def refined_mask(detected: Bool[ndarray, "h w"], votes: SurfaceVotes, frame: Fra
 def _resolved(votes: SurfaceVotes, frame: Frame) -> SurfaceVotes:
     """Return the votes in voxels that the frame resolves: of a pixel's width, and of twice its depth's deviation."""
     z_m = transform_points(inverse(frame.T_world_camera), votes.surface_m.astype(np.float64))[:, 2]
-    nearest_m = votes.settings.min_depth_m
+    nearest_m = _MIN_DEPTH_M
     middle_m = max(nearest_m, float(np.median(z_m))) if len(z_m) else nearest_m
     return votes.resolved(max(frame.camera.length_m(1.0, middle_m), 2.0 * depth_deviation_m(middle_m)))
 
@@ -391,14 +405,14 @@ def window_points_m(
 
 def _projected_window(votes: SurfaceVotes, frame: Frame) -> Window | None:
     """Return the window of a frame that contains the surface; None if it is out of view."""
-    step = -(-len(votes.surface_m) // votes.settings.max_projected_points) or 1
+    step = -(-len(votes.surface_m) // _MAX_PROJECTED_POINTS) or 1
     surface_m = votes.surface_m[::step].astype(np.float64)
     points = transform_points(inverse(frame.T_world_camera), surface_m)
-    points = points[points[:, 2] > votes.settings.min_depth_m].astype(np.float32)
+    points = points[points[:, 2] > _MIN_DEPTH_M].astype(np.float32)
     if len(points) == 0:
         return None
     pixels = np.floor(project(points, frame.camera)[:, ::-1]).astype(np.int64)
-    margin_px = votes.settings.min_margin_px
+    margin_px = _MIN_MARGIN_PX
     window = _clipped(pixels.min(axis=0) - margin_px, pixels.max(axis=0) + margin_px, frame)
     is_empty = any(side.stop <= side.start for side in window)
     return None if is_empty else window

@@ -54,12 +54,6 @@ def usable_simd() -> tuple[str, ...]:
     return tuple(load_kernels().usable_simd())
 
 
-def core_clock_ghz() -> float:
-    """Measure the clock of the current core, in 1 to 2 ms. Raises KernelError."""
-    clock_ghz: float = load_kernels().core_clock_ghz()
-    return clock_ghz
-
-
 def load_kernels() -> Any:
     """Return the extension module. Raises KernelError if it is not built for this Python."""
     try:
@@ -410,18 +404,6 @@ class CpuRasterizer:
         """
         with self._binding.bind((rows, first_moment, second_moment)):
             yield
-
-    def stage_times_ms(self) -> dict[str, float]:
-        """Return the milliseconds of each stage of the latest call: project, raster, loss, backward, update."""
-        with self._lock:
-            return self._engine.stage_times_ms()
-
-    def steps_s(self, masked: bool | None = None) -> float:
-        """Return the kernels' total time in seconds of all steps, of the masked (True) or the other steps (False)."""
-        with self._lock:
-            all_ms, masked_ms = self._engine.steps_ms, self._engine.masked_steps_ms
-        total_ms = all_ms if masked is None else masked_ms if masked else all_ms - masked_ms
-        return total_ms / 1e3
 
     def block_evaluations(self) -> int:
         """Return how many pairs of a splat and a 4x4 pixel block the latest forward or step composited."""

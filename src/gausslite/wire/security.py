@@ -341,10 +341,10 @@ class CallLimits:
     call is closed.
     """
 
-    calls: int = option(64, "largest number of open calls of one caller", key="limit-calls", low=1)
-    kbps: int = option(200_000, "largest bandwidth of one caller's requests", key="limit-kbps", unit="kbit/s", low=1)
+    calls: int = 64
+    kbps: int = 200_000
     connections: int = option(1000, "largest number of connections", key="limit-connections", low=1)
-    idle_s: int = option(60, "longest time of a connection without a call", key="limit-idle", unit="s", low=1)
+    idle_s: int = 60
 
     def __post_init__(self) -> None:
         check_options(self)

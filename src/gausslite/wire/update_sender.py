@@ -48,7 +48,7 @@ class UplinkSettings:
     kbps: float | None = option(
         None, "bandwidth limit in kilobits per second (default: none)", key="uplink-kbps", unit="kbit/s", low=0.001
     )
-    interval_s: float = option(1.0, "time between two transmissions", key="uplink-interval", unit="s", low=0)
+    interval_s: float = 1.0
     resend_threshold: float = 0.5
     round_bytes: int = 4 << 20
     deadline_s: float = 30.0

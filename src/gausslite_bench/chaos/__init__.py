@@ -1,1 +1,1 @@
-"""Chaos run of a fusion server: faults of processes, network, clock and disk while agents send, checked bit for bit."""
+"""Chaos run of a fusion server: kills, partitions and a full disk while agents send, checked bit for bit."""

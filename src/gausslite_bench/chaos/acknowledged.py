@@ -4,28 +4,20 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections import deque
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64
-from numpy import ndarray
 
 from gausslite.codec.stored import from_bytes
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import Scores
 from gausslite.fusion.vote import FusedMap, fuse
 from gausslite_bench.chaos.journal import JournalReader, RecordKind
-
-_KEPT_MESSAGES = 500
-"""The messages per agent that may be sent again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +46,8 @@ class StoreComparison:
 class AgentAcknowledgements:
     """What one agent has sent, and the latest acknowledged content of each voxel."""
 
-    readers: list[JournalReader] = field(default_factory=list)
+    reader: JournalReader | None = None
     voxels: dict[int, StoredVoxel] = field(default_factory=dict)
-    sent: deque[bytes] = field(default_factory=lambda: deque(maxlen=_KEPT_MESSAGES))
-    session_id: str = ""
     messages: int = 0
     updates: int = 0
     _waiting: dict[int, bytes] = field(default_factory=dict)
@@ -66,22 +56,19 @@ class AgentAcknowledgements:
         """Follow the journal of a new process of this agent."""
         self.read()
         self._waiting.clear()
-        self.readers = [JournalReader(path)]
+        self.reader = JournalReader(path)
 
     def read(self) -> None:
         """Read the new records of the journal."""
-        for reader in self.readers:
-            for record in reader.new_records():
-                match record.kind:
-                    case RecordKind.SENT:
-                        self._waiting[record.sequence] = record.subset
-                        self.sent.append(record.subset)
-                        self.session_id = record.session_id
-                    case RecordKind.STORED:
-                        self._acknowledge(self._waiting.pop(record.sequence))
-                    case RecordKind.REFUSED:
-                        # the agent sends its content again, in a new message
-                        self._waiting.pop(record.sequence)
+        for record in () if self.reader is None else self.reader.new_records():
+            match record.kind:
+                case RecordKind.SENT:
+                    self._waiting[record.sequence] = record.subset
+                case RecordKind.STORED:
+                    self._acknowledge(self._waiting.pop(record.sequence))
+                case RecordKind.REFUSED:
+                    # the agent sends its content again, in a new message
+                    self._waiting.pop(record.sequence)
 
     def batch(self) -> VoxelBatch:
         """Return the latest acknowledged content, with tombstones."""
@@ -119,34 +106,11 @@ def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> S
             if path.exists():
                 shutil.copy(path, folder)
         with closing(SqliteStore(Path(folder) / store.name)) as opened:
-            return compare_opened(agents, opened)
+            parts = [_compare_agent(agent_id, agent, opened) for agent_id, agent in agents.items()]
+    return StoreComparison(*(sum(counts) for counts in zip(*map(astuple, parts), strict=True)))
 
 
-@runtime_checkable
-class StoredUpdates(Protocol):
-    """What a comparison reads, as FusionStore has it."""
-
-    def batch(self, agent_id: str) -> VoxelBatch:
-        """Return an agent's updates."""
-        ...
-
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
-        """Return the agent's totals on these voxels."""
-        ...
-
-
-def compare_opened(agents: Mapping[str, AgentAcknowledgements], store: StoredUpdates) -> StoreComparison:
-    """Compare an open store with what was acknowledged before it was opened."""
-    results = [_compare_agent(agent_id, agent, store) for agent_id, agent in agents.items()]
-    return StoreComparison(
-        sum(result.voxels for result in results),
-        sum(result.lost for result in results),
-        sum(result.wrong for result in results),
-        sum(result.extra for result in results),
-    )
-
-
-def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: StoredUpdates) -> StoreComparison:
+def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: SqliteStore) -> StoreComparison:
     batch = store.batch(agent_id)
     seqs = store.stored(agent_id, batch.keys)["update_seqs"].tolist()
     held = {

@@ -1,7 +1,7 @@
 """The process of one agent: a map that changes at random, and the agent's own spool and uplink.
 
-`python -m gausslite_bench.chaos.agent_process SETTINGS`, with ChaosAgentSettings as JSON. The process sends until its
-standard input ends. Then it drains the uplink and prints one line of JSON.
+`python -m gausslite_bench.chaos.agent_process ARGUMENTS`, those of `run` as JSON. The process sends until its standard
+input ends. Then it drains the uplink and prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import sys
 import threading
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -29,17 +29,6 @@ DRAIN_S = 240.0
 _UPLINK = UplinkSettings(interval_s=0.05, deadline_s=20.0, first_backoff_s=0.05, check_interval_s=1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class ChaosAgentSettings:
-    """What one process needs; seed: of its changes, another one after each restart."""
-
-    agent_id: str
-    address: str
-    spool: str
-    journal: str
-    seed: int
-
-
 def changed_voxels(rng: np.random.Generator) -> VoxelBatch:
     """Return new content of some neighbouring voxels of the area that all agents share; some of them are empty now."""
     first = int(rng.integers(_AREA_VOXELS - _STEP_VOXELS))
@@ -48,14 +37,14 @@ def changed_voxels(rng: np.random.Generator) -> VoxelBatch:
     return merge_batches(select_voxels(batch, ~removed), tombstones(batch.keys[removed]))
 
 
-def run(settings: ChaosAgentSettings) -> dict[str, object]:
-    """Send changes until the standard input ends; returns whether everything was acknowledged, and the counters."""
-    spool = Spool(Path(settings.spool), settings.agent_id, GRID)
-    client = JournalingClient(settings.address, spool.token, Journal(Path(settings.journal)))
-    uplink = Uplink(client, settings.agent_id, spool, GRID, _UPLINK)
+def run(agent_id: str, address: str, spool_file: str, journal: str, seed: int) -> dict[str, object]:
+    """Send changes of this seed until the standard input ends; returns whether everything was acknowledged."""
+    spool = Spool(Path(spool_file), agent_id, GRID)
+    client = JournalingClient(address, spool.token, Journal(Path(journal)))
+    uplink = Uplink(client, agent_id, spool, GRID, _UPLINK)
     stopping = threading.Event()
-    threading.Thread(target=_set_at_end_of_input, args=(stopping,), daemon=True).start()
-    rng = np.random.default_rng(settings.seed)
+    threading.Thread(target=_set_at_end, args=(sys.stdin, stopping), daemon=True).start()
+    rng = np.random.default_rng(seed)
     while not stopping.wait(_PERIOD_S):
         uplink.enqueue(changed_voxels(rng))
     drained = uplink.drain(DRAIN_S)
@@ -64,10 +53,10 @@ def run(settings: ChaosAgentSettings) -> dict[str, object]:
     return {"drained": drained, "stopped_because": counters.stopped_because}
 
 
-def _set_at_end_of_input(stopping: threading.Event) -> None:
-    sys.stdin.read()
+def _set_at_end(stream: TextIO, stopping: threading.Event) -> None:
+    stream.read()
     stopping.set()
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(run(ChaosAgentSettings(**json.loads(sys.argv[1])))) + "\n")
+    sys.stdout.write(json.dumps(run(*json.loads(sys.argv[1]))) + "\n")

@@ -7,12 +7,11 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from gausslite.domain.errors import UnavailableError
 from gausslite_bench.chaos.acknowledged import AgentAcknowledgements
-from gausslite_bench.chaos.agent_process import DRAIN_S, ChaosAgentSettings
+from gausslite_bench.chaos.agent_process import DRAIN_S
 
 _END_S = DRAIN_S + 60.0
 
@@ -37,14 +36,13 @@ class AgentTeam:
         for journal in self.acknowledged.values():
             journal.read()
 
-    def start(self, agent_id: str, seed: int, clock_offset_s: float) -> None:
+    def start(self, agent_id: str, seed: int) -> None:
         """Start an agent on its spool."""
         journal = self._folder / f"{agent_id}-{next(self._lives[agent_id])}.journal"
         spool = self._folder / f"{agent_id}.spool"
-        settings = ChaosAgentSettings(agent_id, self._address_of(agent_id), str(spool), str(journal), seed)
+        settings = agent_id, self._address_of(agent_id), str(spool), str(journal), seed
         self.acknowledged[agent_id].add_journal(journal)
-        command = [sys.executable, "-m", "gausslite_bench.chaos.shifted_clock", str(clock_offset_s)]
-        command += ["gausslite_bench.chaos.agent_process", json.dumps(asdict(settings))]
+        command = [sys.executable, "-m", "gausslite_bench.chaos.agent_process", json.dumps(settings)]
         with (self._folder / "agents.log").open("ab") as log:
             self._processes[agent_id] = subprocess.Popen(  # noqa: S603 - this program
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True

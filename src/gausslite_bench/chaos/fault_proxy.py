@@ -1,11 +1,11 @@
-"""Forward the agents' connections to the server, and partition or delay them on request."""
+"""Forward the agents' connections to the server, and partition them on request."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import threading
-from collections.abc import Coroutine, Mapping
+from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,13 +19,12 @@ class _Link:
     def __init__(self, path: Path, target: Path) -> None:
         self.path, self._target = path, target
         self._is_cut = False
-        self._delay_s = 0.0
         self._flows = asyncio.Event()
         self._flows.set()
         self._writers: set[asyncio.StreamWriter] = set()
 
-    def set_fault(self, is_cut: bool, is_stalled: bool, delay_s: float) -> None:
-        self._is_cut, self._delay_s = is_cut, delay_s
+    def set_fault(self, is_cut: bool, is_stalled: bool) -> None:
+        self._is_cut = is_cut
         if is_stalled:
             self._flows.clear()
         else:
@@ -54,8 +53,6 @@ class _Link:
         with contextlib.suppress(OSError):
             while data := await reader.read(_CHUNK_BYTES):
                 await self._flows.wait()
-                if self._delay_s:
-                    await asyncio.sleep(self._delay_s)
                 writer.write(data)
                 await writer.drain()
         writer.close()
@@ -64,9 +61,9 @@ class _Link:
 class FaultProxy:
     """Owns one listening socket per name, and a thread. The methods are thread-safe."""
 
-    def __init__(self, folder: Path, targets: Mapping[str, Path]) -> None:
-        """targets: the socket of the server behind each name."""
-        self._links = {name: _Link(folder / f"{name}.sock", target) for name, target in targets.items()}
+    def __init__(self, folder: Path, names: Sequence[str], target: Path) -> None:
+        """target: the socket of the server behind all of them."""
+        self._links = {name: _Link(folder / f"{name}.sock", target) for name in names}
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="fault-proxy", daemon=True)
         self._thread.start()
@@ -84,10 +81,6 @@ class FaultProxy:
         """Stop forwarding without closing a connection, as when packets are lost."""
         self._set(agent_id, is_stalled=True)
 
-    def delay(self, agent_id: str, delay_s: float) -> None:
-        """Forward every chunk late."""
-        self._set(agent_id, delay_s=delay_s)
-
     def clear_faults(self, agent_id: str) -> None:
         """End all faults of the agent's connections."""
         self._set(agent_id)
@@ -103,15 +96,15 @@ class FaultProxy:
         for server in self._servers:
             server.close()
         for link in self._links.values():
-            link.set_fault(is_cut=True, is_stalled=False, delay_s=0.0)
+            link.set_fault(is_cut=True, is_stalled=False)
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _set(self, agent_id: str, is_cut: bool = False, is_stalled: bool = False, delay_s: float = 0.0) -> None:
+    def _set(self, agent_id: str, is_cut: bool = False, is_stalled: bool = False) -> None:
         async def apply() -> None:
-            self._links[agent_id].set_fault(is_cut, is_stalled, delay_s)
+            self._links[agent_id].set_fault(is_cut, is_stalled)
 
         self._run(apply())
 

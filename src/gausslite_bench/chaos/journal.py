@@ -1,31 +1,29 @@
 """Record what an agent sends and what the server answers, so that it survives the end of the agent's process.
 
-A record is one write to the file: u8 kind, u64 sequence, u32 session bytes, u32 subset bytes, session id, subset. Each
-process has a file of its own, because a killed one may leave a part of a record at its end.
+A record is one line, written at once: kind, sequence number, and the subset in base 64. Each process has a file of its
+own, because a killed one may leave a part of a record at its end.
 """
 
 from __future__ import annotations
 
+import base64
 import os
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from gausslite.wire.clients import FusionClient
 from gausslite_bench.async_calls import is_stored
 
-_RECORD = struct.Struct("<BQII")
 
-
-class RecordKind(IntEnum):
+class RecordKind(StrEnum):
     """SENT precedes the outcome, which is STORED or REFUSED."""
 
-    SENT = 1
-    STORED = 2
-    REFUSED = 3
+    SENT = "sent"
+    STORED = "stored"
+    REFUSED = "refused"
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,6 @@ class JournalRecord:
 
     kind: RecordKind
     sequence: int
-    session_id: str = ""
     subset: bytes = b""
 
 
@@ -46,13 +43,8 @@ class Journal:
 
     def write(self, record: JournalRecord) -> None:
         """Append a record."""
-        session = record.session_id.encode()
-        head = _RECORD.pack(record.kind, record.sequence, len(session), len(record.subset))
-        os.write(self._file, head + session + record.subset)
-
-    def close(self) -> None:
-        """Close the file."""
-        os.close(self._file)
+        subset = base64.b64encode(record.subset).decode()
+        os.write(self._file, f"{record.kind} {record.sequence} {subset}\n".encode())
 
 
 class JournalingClient(FusionClient):
@@ -65,7 +57,7 @@ class JournalingClient(FusionClient):
     def contribute(self, requests: Sequence[Any], deadline_s: float) -> Iterator[Any]:
         """Send these subsets, see FusionClient."""
         for request in requests:
-            self._journal.write(JournalRecord(RecordKind.SENT, request.sequence, request.session_id, request.subset))
+            self._journal.write(JournalRecord(RecordKind.SENT, request.sequence, request.subset))
         for response in super().contribute(requests, deadline_s):
             for outcome in response.outcomes:
                 kind = RecordKind.STORED if is_stored(outcome) else RecordKind.REFUSED
@@ -85,16 +77,9 @@ class JournalReader:
             return
         with self._path.open("rb") as file:
             file.seek(self._offset)
-            data = file.read()
-        start = 0
-        while start + _RECORD.size <= len(data):
-            kind, sequence, session_bytes, subset_bytes = _RECORD.unpack_from(data, start)
-            session_start = start + _RECORD.size
-            subset_start = session_start + session_bytes
-            end = subset_start + subset_bytes
-            if end > len(data):
-                break
-            session_id = data[session_start:subset_start].decode()
-            yield JournalRecord(RecordKind(kind), sequence, session_id, data[subset_start:end])
-            start = end
-            self._offset += end - session_start + _RECORD.size
+            for line in file:
+                if not line.endswith(b"\n"):
+                    break
+                self._offset += len(line)
+                kind, sequence, subset = line.rstrip(b"\n").split(b" ")
+                yield JournalRecord(RecordKind(kind.decode()), int(sequence), base64.b64decode(subset))

@@ -2,121 +2,82 @@
 
 from __future__ import annotations
 
-import asyncio
 import random
 import resource
-import shlex
 import shutil
-import sys
 import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
+from gausslite.cli.progress import progress_bar
 from gausslite.codec.ply import ply_bytes
+from gausslite.config.option import option
 from gausslite.domain.errors import UnavailableError
 from gausslite.wire.clients import Export, FusionClient
-from gausslite_bench.async_calls import UpdateStreams
 from gausslite_bench.chaos.acknowledged import StoreComparison, compare_store, offline_map
 from gausslite_bench.chaos.agent_team import AgentTeam
 from gausslite_bench.chaos.fault_proxy import FaultProxy
-from gausslite_bench.chaos.map_watcher import MapWatcher
-from gausslite_bench.server.server_process import ServerProcess
+from gausslite_bench.report import Report
+from gausslite_bench.service_process import FUSION_SERVER, ServiceProcess
 
 _STORE = "store.sqlite"
-_DAY_S = 86_400.0
 _PROGRESS_MESSAGES_PER_AGENT = 2
 _PROGRESS_S = 120.0
-_WATCH_S = 60.0
 _POLL_S = 0.02
 _MAX_FAULT_S, _MAX_FULL_S = 1.0, 5.0
-_MAX_DELAY_S = 0.15
-_RESENT_MESSAGES = 20
-_RESEND_LIMIT_S = 10.0
-_DISK_FULL_SHARE, _RESEND_SHARE, _CLOCK_SHARE = 0.15, 0.4, 0.5
+_DISK_FULL_SHARE = 0.15
 _FREE_BYTES = 50_000
 
 
 class Fault(StrEnum):
-    """What is counted. The first five are the kills and partitions of a run."""
+    """What is counted. The first four are the kills and partitions of a run."""
 
     SERVER_KILL = "server kills"
     AGENT_KILL = "agent kills"
     CUT = "cut connections"
     STALL = "stalled connections"
-    DELAY = "delayed connections"
-    CLOCK_JUMP = "clock jumps"
     DISK_FULL = "full disks"
-    RESEND = "resent messages"
 
 
-_WEIGHTS = {Fault.SERVER_KILL: 3, Fault.AGENT_KILL: 3, Fault.CUT: 2, Fault.STALL: 1, Fault.DELAY: 1}
+_WEIGHTS = {Fault.SERVER_KILL: 3, Fault.AGENT_KILL: 3, Fault.CUT: 2, Fault.STALL: 1}
 
 
 @dataclass(frozen=True, slots=True)
 class ChaosSettings:
-    """kills: number of kills and partitions. out: folder that receives the store, journals and logs."""
+    """The options of `bench chaos`."""
 
-    kills: int = 200
-    agents: int = 4
-    seed: int = 0
-    out: Path | None = None
+    kills: int = option(200, "kills and partitions", low=1)
+    agents: int = option(4, "agents that send", low=1, high=32)
+    seed: int = option(0, "seed of all faults (default: 0)", low=0)
+    out: Path | None = option(None, "keep the store, the journals and the logs there (default: no)", metavar="FOLDER")
 
 
-@dataclass(frozen=True, slots=True)
-class ChaosResult:
-    """Figures of a run.
+def run_chaos(settings: ChaosSettings) -> Report:
+    """Run the faults; the report is good if nothing that was acknowledged is lost or differs. Raises UnavailableError.
 
-    lost, wrong: sums over the comparisons of the store after each kill of the server, and after the run.
-    same_map: the map that the server exports at the end is the offline one, bit for bit. same_watch: a watcher that
-    continued from its last revision after each restart has the same voxels, Σkappa and counts at the end.
+    lost, wrong: voxels, summed over the comparisons of the store after each kill of the server, and after the run.
+    same_map: the map that the server exports at the end is the one computed offline, bit for bit.
     disk_errors: lines in the server's log about a disk that refuses to write; server_errors: unexpected errors there.
     """
-
-    faults: dict[str, int]
-    acknowledged_messages: int
-    acknowledged_updates: int
-    disk_errors: int
-    comparisons: int
-    voxels: int
-    fused_voxels: int
-    lost: int
-    wrong: int
-    extra_at_end: int
-    same_map: bool
-    same_watch: bool
-    server_errors: int
-    time_s: float
-    rss_mib: tuple[float, float]
-
-    @property
-    def is_correct(self) -> bool:
-        """True if nothing that was acknowledged is lost or differs."""
-        has_faults = self.lost or self.wrong or self.extra_at_end or self.server_errors
-        return self.same_map and self.same_watch and not has_faults
-
-
-def run_chaos(settings: ChaosSettings, on_fault: Callable[[], object]) -> ChaosResult:
-    """Run the faults; `on_fault` is called after each kill or partition. Raises UnavailableError."""
     with tempfile.TemporaryDirectory() as name, ExitStack() as opened:
         folder = Path(name)
         if settings.out is not None:
             opened.callback(shutil.copytree, folder, settings.out, dirs_exist_ok=True, ignore=_ignore_sockets)
         agents = [f"agent-{number}" for number in range(settings.agents)]
-        server = ServerProcess(_server_command(0.0), folder, "sqlite")
+        server = ServiceProcess(_server_command(folder), folder)
         opened.callback(server.kill)
-        proxy = FaultProxy(folder, dict.fromkeys(agents, Path(server.address.removeprefix("unix:"))))
+        proxy = FaultProxy(folder, agents, Path(server.address.removeprefix("unix:")))
         opened.callback(proxy.close)
         team = AgentTeam(folder, agents, proxy.address)
         opened.callback(team.close)
-        watcher = MapWatcher(server.address)
-        opened.callback(watcher.close)
-        return _ChaosRun(settings, folder, server, proxy, team, watcher).run(on_fault)
+        values = _ChaosRun(settings, folder, server, proxy, team).run()
+    has_faults = any(values[name] for name in ("lost", "wrong", "extra_at_end", "server_errors"))
+    return Report(values, is_good=bool(values["same_map"]) and not has_faults)
 
 
 @dataclass(slots=True)
@@ -125,28 +86,26 @@ class _ChaosRun:
 
     settings: ChaosSettings
     folder: Path
-    server: ServerProcess
+    server: ServiceProcess
     proxy: FaultProxy
     team: AgentTeam
-    watcher: MapWatcher
     faults: Counter[Fault] = field(default_factory=Counter)
     comparisons: list[StoreComparison] = field(default_factory=list)
     _random: random.Random = field(init=False)
     _peak_mib: float = 0.0
 
-    def run(self, on_fault: Callable[[], object]) -> ChaosResult:
+    def run(self) -> dict[str, object]:
         begin_s = time.monotonic()
         self._random = random.Random(self.settings.seed)  # noqa: S311 - reproducible faults
         for agent_id in self.team.acknowledged:
             self._start_agent(agent_id)
-        for _ in range(self.settings.kills):
-            self._wait_for_progress()
-            if self._random.random() < _DISK_FULL_SHARE:
-                self._fill_disk()
-            if self._random.random() < _RESEND_SHARE:
-                self._resend()
-            self._inject(self._random.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0])
-            on_fault()
+        with progress_bar(self.settings.kills, "chaos", "fault") as progress:
+            for _ in range(self.settings.kills):
+                self._wait_for_progress()
+                if self._random.random() < _DISK_FULL_SHARE:
+                    self._fill_disk()
+                self._inject(self._random.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0])
+                progress.update()
         return self._finish(begin_s)
 
     def _inject(self, fault: Fault) -> None:
@@ -155,22 +114,14 @@ class _ChaosRun:
         match fault:
             case Fault.SERVER_KILL:
                 self._kill_server()
-                self.server.start(_server_command(self._clock_offset_s()))
+                self.server.start()
             case Fault.AGENT_KILL:
                 self.team.kill(agent_id)
                 self._start_agent(agent_id)
             case _:
-                self._disturb(agent_id, fault)
-
-    def _disturb(self, agent_id: str, fault: Fault) -> None:
-        if fault is Fault.CUT:
-            self.proxy.cut(agent_id)
-        elif fault is Fault.STALL:
-            self.proxy.stall(agent_id)
-        else:
-            self.proxy.delay(agent_id, self._random.uniform(0.01, _MAX_DELAY_S))
-        self._pause()
-        self.proxy.clear_faults(agent_id)
+                (self.proxy.cut if fault is Fault.CUT else self.proxy.stall)(agent_id)
+                threading.Event().wait(self._random.uniform(0.1, _MAX_FAULT_S))
+                self.proxy.clear_faults(agent_id)
 
     def _kill_server(self) -> None:
         self._peak_mib = max(self._peak_mib, self.server.rss_mib())
@@ -199,38 +150,8 @@ class _ChaosRun:
         """Return how often the log reports them; it sums up those of a minute."""
         return self.server.log.read_text(errors="replace").count("disk I/O error")
 
-    def _resend(self) -> None:
-        """Send messages of the past again: duplicates, in another order."""
-        chosen = self._random.choice(list(self.team.acknowledged))
-        # another one stands in for an agent that has sent nothing yet
-        for agent_id in (chosen, *self.team.acknowledged):
-            acknowledged = self.team.acknowledged[agent_id]
-            acknowledged.read()
-            if acknowledged.sent:
-                break
-        # drawn also before the agent's first message, so that the seed alone decides the order of faults
-        shares = [self._random.random() for _ in range(_RESENT_MESSAGES)]
-        sent = list(acknowledged.sent)
-        if sent:
-            messages = [sent[int(share * len(sent))] for share in shares]
-            limit_s, resent = time.monotonic() + _RESEND_LIMIT_S, 0
-            while resent == 0 and time.monotonic() < limit_s:
-                # an agent that joins again has another session, which its journal shows with its next message
-                acknowledged.read()
-                resent = asyncio.run(_resend_messages(self.server.address, acknowledged.session_id, messages))
-            self.faults[Fault.RESEND] += resent
-
     def _start_agent(self, agent_id: str) -> None:
-        self.team.start(agent_id, self._random.getrandbits(31), self._clock_offset_s())
-
-    def _clock_offset_s(self) -> float:
-        if self._random.random() > _CLOCK_SHARE:
-            return 0.0
-        self.faults[Fault.CLOCK_JUMP] += 1
-        return self._random.uniform(-_DAY_S, _DAY_S)
-
-    def _pause(self) -> None:
-        threading.Event().wait(self._random.uniform(0.1, _MAX_FAULT_S))
+        self.team.start(agent_id, self._random.getrandbits(31))
 
     def _wait_for_progress(self) -> None:
         """Wait until the agents have sent some messages since the last fault, so that every fault meets a load."""
@@ -241,43 +162,37 @@ class _ChaosRun:
                 raise UnavailableError(f"chaos: expected acknowledgements within {_PROGRESS_S:.0f} s after a fault")
             threading.Event().wait(_POLL_S)
 
-    def _finish(self, begin_s: float) -> ChaosResult:
+    def _finish(self, begin_s: float) -> dict[str, object]:
         self.team.finish()
         offline = offline_map(self.team.acknowledged)
         with FusionClient(self.server.address, deadline_s=60.0) as client:
             exported = client.export(Export())
-        same_watch = self.watcher.wait_for(offline.batch, _WATCH_S)
         rss_mib = self.server.rss_mib()
         self._kill_server()
         parts, last = list(self.team.acknowledged.values()), self.comparisons[-1]
-        return ChaosResult(
-            faults={str(fault): self.faults[fault] for fault in Fault},
-            acknowledged_messages=sum(part.messages for part in parts),
-            acknowledged_updates=sum(part.updates for part in parts),
-            disk_errors=self._disk_errors(),
-            comparisons=len(self.comparisons),
-            voxels=last.voxels,
-            fused_voxels=len(offline.batch),
-            lost=sum(comparison.lost for comparison in self.comparisons),
-            wrong=sum(comparison.wrong for comparison in self.comparisons),
-            extra_at_end=last.extra,
-            same_map=exported == ply_bytes(offline.gaussians),
-            same_watch=same_watch,
-            server_errors=self.server.log.read_text(errors="replace").count("Traceback"),
-            time_s=time.monotonic() - begin_s,
-            rss_mib=(rss_mib, max(self._peak_mib, rss_mib)),
-        )
+        return {
+            "seed": self.settings.seed,
+            "faults": {str(fault): self.faults[fault] for fault in Fault},
+            "acknowledged_messages": sum(part.messages for part in parts),
+            "acknowledged_updates": sum(part.updates for part in parts),
+            "disk_errors": self._disk_errors(),
+            "comparisons": len(self.comparisons),
+            "voxels": last.voxels,
+            "fused_voxels": len(offline.batch),
+            "lost": sum(comparison.lost for comparison in self.comparisons),
+            "wrong": sum(comparison.wrong for comparison in self.comparisons),
+            "extra_at_end": last.extra,
+            "same_map": exported == ply_bytes(offline.gaussians),
+            "server_errors": self.server.unexpected_errors,
+            "time_s": time.monotonic() - begin_s,
+            "rss_mib_at_end": rss_mib,
+            "rss_mib_at_most": max(self._peak_mib, rss_mib),
+        }
 
 
-async def _resend_messages(address: str, session_id: str, messages: list[bytes]) -> int:
-    async with UpdateStreams(address) as streams:
-        return await streams.open(session_id).resend(messages)
-
-
-def _server_command(clock_offset_s: float) -> str:
-    shifted = f"-m gausslite_bench.chaos.shifted_clock {clock_offset_s}"
+def _server_command(folder: Path) -> str:
     # the offline vote of the comparison knows no corrected frames
-    return f"{shlex.quote(sys.executable)} {shifted} gausslite_fusion_server --set frame-alignment=trust"
+    return f"{FUSION_SERVER} --set frame-alignment=trust --store {folder / _STORE}"
 
 
 def _ignore_sockets(folder: str, names: list[str]) -> list[str]:

@@ -2,105 +2,69 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 from gausslite.config.command_parser import CommandParser
-from gausslite_bench.cli.chaos import configure_chaos
-from gausslite_bench.cli.fuzz import configure_fuzz
-from gausslite_bench.cli.gpu import configure_gpu
+from gausslite.config.option import build
+from gausslite.config.program import add_flags
+from gausslite_bench.chaos.run import ChaosSettings, run_chaos
 from gausslite_bench.cli.loop import configure_loop
-from gausslite_bench.cli.parser import configure_parser
 from gausslite_bench.cli.perception import configure_perception
-from gausslite_bench.cli.places import configure_places
 from gausslite_bench.cli.quality import configure_ablation, configure_quality
-from gausslite_bench.cli.raster import configure_raster
-from gausslite_bench.cli.server import configure_server
 from gausslite_bench.cli.team import configure_team
-from gausslite_bench.cli.view import configure_view
+from gausslite_bench.fuzz.run import FuzzSettings, run_fuzz
+from gausslite_bench.parser_scores import configure_parser
+from gausslite_bench.raster.operation_costs import GpuSettings, RasterSettings, run_gpu, run_raster
+from gausslite_bench.report import Report
+from gausslite_bench.server.bench import ServerBenchSettings, run_server
 
-_BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str, str]] = {
-    "raster": (
-        configure_raster,
-        "speed of the CPU rasterizer, per operation and stage",
-        "Time forward, backward and whole training steps of the CPU rasterizer on a procedural room. Optionally "
-        "compare with an external rasterizer library in the same run.",
-    ),
-    "loop": (
-        configure_loop,
-        "speed and memory of one agent's mapping loop on a sequence",
-        "Map a sequence and report latency percentiles of each stage, the frame rate and the memory use. Optionally "
-        "measure the quality lost to a frame rate (--unlimited).",
-    ),
+
+@dataclass(frozen=True, slots=True)
+class _Measurement:
+    """A benchmark of a settings class, whose fields are its flags; the command prints the report."""
+
+    settings: type
+    measure: Callable[[Any], Report]
+
+    def __call__(self, parser: CommandParser) -> None:
+        """Add the options to a parser."""
+        add_flags(parser, self.settings)
+        parser.add_argument("--json", action="store_true", help="print JSON for scripts")
+        parser.set_defaults(run=self._run)
+
+    def _run(self, options: argparse.Namespace) -> int:
+        report = self.measure(build(self.settings, options))
+        print(report.text(options.json))
+        return 0 if report.is_good else 1
+
+
+_BENCHMARKS: dict[str, tuple[Callable[[CommandParser], None], str]] = {
+    "quality": (configure_quality, "map quality of every policy on held-out views, at an equal budget"),
+    "ablation": (configure_ablation, "map quality with the paper's components enabled one by one"),
+    "team": (configure_team, "quality of the fused map of several agents, by strategy and policy"),
+    "perception": (configure_perception, "accuracy of a detector's masks against ground truth, stage by stage"),
+    "parser": (configure_parser, "accuracy and speed of a task parser on known sentences"),
+    "loop": (configure_loop, "frame rate, time of each stage and memory of one agent's mapping loop"),
+    "raster": (_Measurement(RasterSettings, run_raster), "time of the CPU rasterizer's operations on a room"),
+    "gpu": (_Measurement(GpuSettings, run_gpu), "time of the CUDA backend's operations on a room"),
     "server": (
-        configure_server,
-        "largest team, memory and times of a fusion server by the size of its map",
-        "Fill a fusion server with synthetic updates, and measure acknowledgements of agents that send at 4 Hz, the "
-        "snapshot, the status, a restart and the memory.",
+        _Measurement(ServerBenchSettings, run_server),
+        "largest team, memory and times of a fusion server by the size of its map, and under attacks",
     ),
     "chaos": (
-        configure_chaos,
-        "a fusion server and its agents under kills, partitions, wrong clocks and a full disk",
-        "Drive agents and a fusion server through seeded faults. Check after each kill of the server, and at the end, "
-        "that every acknowledged voxel is stored, and that the fused map equals the one computed offline.",
+        _Measurement(ChaosSettings, run_chaos),
+        "a fusion server and its agents under kills, partitions and a full disk",
     ),
-    "fuzz": (
-        configure_fuzz,
-        "mutated messages for the codec and for every method of the services",
-        "Mutate valid messages. Decode most of them in this process, and send the others to every method of a fusion "
-        "server, an agent and a parser. No message may crash a program, take over a second, or make its memory grow.",
-    ),
-    "gpu": (
-        configure_gpu,
-        "training speed of the CUDA backend, compared with gsplat",
-        "Time training iterations of the CUDA backend and of a plain gsplat training loop, and one mapped frame.",
-    ),
-    "parser": (
-        configure_parser,
-        "accuracy and speed of a task parser",
-        "Parse sentences with known task graphs and report the share of correct graphs and the time per sentence.",
-    ),
-    "perception": (
-        configure_perception,
-        "accuracy of a detector's masks against ground truth",
-        "Compare the masks of a detector with ground truth after each stage of perception: detection, relations, "
-        "evidence and tracking.",
-    ),
-    "quality": (
-        configure_quality,
-        "map quality of every policy at an equal budget",
-        "Map scenes with several policies and score the maps on held-out views. The budget per frame is equal: "
-        "iterations or time.",
-    ),
-    "ablation": (
-        configure_ablation,
-        "map quality with the paper's components enabled one by one",
-        "Map scenes while enabling the components of the method one after the other, and score the maps on held-out "
-        "views.",
-    ),
-    "team": (
-        configure_team,
-        "quality of the fused map of several agents, by strategy and policy",
-        "Map one home with several agents and tasks. Fuse their maps by concatenation, by the vote and with a joint "
-        "refinement, and score the fused maps on held-out views.",
-    ),
-    "view": (
-        configure_view,
-        "loading time and frame rate of the live view in a headless browser",
-        "Serve synthetic maps on the page of `gausslite view`, open it in a headless Chromium with software rendering, "
-        "and measure the time until the map is drawn and the frame rates at rest and while the camera moves.",
-    ),
-    "places": (
-        configure_places,
-        "frames of a sequence that are localised in a saved map",
-        "Localise each frame in the map of a run, from any start. Report how many poses are right, wrong and refused, "
-        "the time, and after how many frames a run is localised. With mirrored images, or in another place, every pose "
-        "is wrong. --loops presents the frames as keyframes that may close a loop instead.",
-    ),
+    "fuzz": (_Measurement(FuzzSettings, run_fuzz), "mutated messages for the codec and every method of the services"),
 }
 
 
 def configure(parser: CommandParser) -> None:
     """Add the benchmarks and their options."""
     benchmarks = parser.add_subparsers(dest="bench", required=True, metavar="BENCHMARK")
-    for name, (configure_benchmark, summary, description) in _BENCHMARKS.items():
+    for name, (configure_benchmark, summary) in _BENCHMARKS.items():
+        description = f"{summary[0].upper()}{summary[1:]}."
         configure_benchmark(benchmarks.add_parser(name, help=summary, description=description))

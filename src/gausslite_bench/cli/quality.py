@@ -3,130 +3,159 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from gausslite.config.plain_values import split_names
+from gausslite.cli.progress import print_above_bar, progress_bar
+from gausslite.config.option import build, option
 from gausslite.domain.errors import InvalidInputError
 from gausslite.mapping.policies import POLICIES
-from gausslite.mission.settings import PerceptionSettings
-from gausslite_bench.cli.argument_types import read_image_size
-from gausslite_bench.cli.study_options import add_study_options, scene_plans
-from gausslite_bench.cli.study_progress import RATE_FILE, run_with_progress, write_results
-from gausslite_bench.quality.ablation import cumulative_variants
-from gausslite_bench.quality.study import Study
-from gausslite_bench.quality.tables import ablation_table, quality_table
-from gausslite_bench.quality.trials import BudgetMode, Conditions, PerceptionMode, TrialBudget, Variant
+from gausslite.mission.settings import MAX_RATE_HZ, MIN_RATE_HZ
+from gausslite_bench.cli.study_options import (
+    DEFAULT_HOME_FRAMES,
+    DEFAULT_SIZE,
+    StudyOptions,
+    add_study_options,
+    real_sequence_plans,
+    write_results,
+)
+from gausslite_bench.quality.equal_time import RATE_FILE, with_measured_rate
+from gausslite_bench.quality.home_scenes import HomeScenePlan
+from gausslite_bench.quality.home_tasks import choose_home_tasks
+from gausslite_bench.quality.scenes import UnseenRegionError
+from gausslite_bench.quality.study import FinishedTrial, Study, run_study
+from gausslite_bench.quality.tables import StudyResults, ablation_table, quality_table
+from gausslite_bench.quality.trial_cache import TrialCache
+from gausslite_bench.quality.trials import BudgetMode, Conditions, ScenePlan, TrialBudget, Variant, cumulative_variants
+from gausslite_evaluation.lpips import LPIPS_HELP, load_lpips
 
 _ABLATION_TASK = "home-4-manipulation"
 _BOTH = "both"
+_EQUAL_HELP = "quantity per frame that is equal for all policies"
+_EQUAL = (*map(str, BudgetMode), _BOTH)
+_PAIR_HELP = "homes or home-task pairs such as home-3,home-4-search"
+
+
+@dataclass(frozen=True, slots=True)
+class _BudgetOptions:
+    views: int = option(24, "held-out views per home", low=2)
+    rate_hz: float | None = option(
+        None,
+        "frame rate at equal time (default: that of uniform mapping with --iterations, measured on the first scene and "
+        f"stored in DIR/{RATE_FILE})",
+        key="rate",
+        metavar="HZ",
+        low=MIN_RATE_HZ,
+        high=MAX_RATE_HZ,
+    )
+    lpips_weights: Path | None = option(None, LPIPS_HELP)
+
+
+@dataclass(frozen=True, slots=True)
+class _QualityOptions:
+    pairs: tuple[str, ...] = option((), f"{_PAIR_HELP} (default: all 24 pairs)", metavar="A,B")
+    policies: tuple[str, ...] = option(
+        tuple(POLICIES), "policies; tables compare the first with the best other (default: all)", metavar="A,B"
+    )
+    seeds: tuple[int, ...] = option((0,), "mapping seeds", metavar="N,...")
+    equal: str = option(str(BudgetMode.ITERATIONS), _EQUAL_HELP, choices=_EQUAL)
+
+
+@dataclass(frozen=True, slots=True)
+class _AblationOptions:
+    pair: tuple[str, ...] = option((), f"{_PAIR_HELP} (default: {_ABLATION_TASK}, or none with --real)", metavar="A,B")
+    seeds: tuple[int, ...] = option((0, 1, 2), "mapping seeds", metavar="N,...")
+    equal: str = option(_BOTH, _EQUAL_HELP, choices=_EQUAL)
 
 
 def configure_quality(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench quality`."""
-    add = parser.add_argument
-    add(
-        "--pairs",
-        metavar="A,B",
-        type=split_names,
-        default=(),
-        help="homes or home-task pairs such as home-3,home-4-search (default: all 24 pairs)",
-    )
-    add(
-        "--policies",
-        metavar="A,B",
-        type=split_names,
-        default=tuple(POLICIES),
-        help="policies; tables compare the first with the best other (default: all)",
-    )
-    add_study_options(parser, default_seeds=(0,))
-    _add_size_and_budget(parser, default_equal=str(BudgetMode.ITERATIONS))
-    add(
-        "--perception",
-        metavar="gt|text|FILE.onnx",
-        default="gt",
-        help="region of the task: ground-truth masks (gt), ground-truth objects named in the task (text), or a "
-        "detector model (default: %(default)s)",
-    )
+    add_study_options(parser, _QualityOptions, _BudgetOptions)
     parser.set_defaults(run=run_quality)
 
 
 def configure_ablation(parser: argparse.ArgumentParser) -> None:
     """Add the options of `bench ablation`."""
-    parser.add_argument(
-        "--pair",
-        metavar="A,B",
-        type=split_names,
-        default=(),
-        help=f"homes or home-task pairs (default: {_ABLATION_TASK}, or none with --real)",
-    )
-    add_study_options(parser, default_seeds=(0, 1, 2))
-    _add_size_and_budget(parser, default_equal=_BOTH)
+    add_study_options(parser, _AblationOptions, _BudgetOptions)
     parser.set_defaults(run=run_ablation)
 
 
 def run_quality(options: argparse.Namespace) -> int:
-    """Compare policies and write quality.md, quality.json and comparison sheets."""
+    """Compare policies and write quality.md and quality.json."""
     variants = [Variant(name, name) for name in options.policies]
     if not variants:
         raise InvalidInputError(f"policies: expected names among {', '.join(POLICIES)}, got none")
-    plans, default_size = scene_plans(options, options.pairs, ())
-    conditions = Conditions(options.size or default_size, _perception_mode(options), options.threads)
-    study = Study(plans, variants, _budgets(options), options.seeds, conditions)
-    results = run_with_progress(study, options.out, options.lpips_weights, options.reuse_other_code)
-    write_results(options.out, "quality", quality_table(results), results)
+    results = _run(options, _study(options, options.pairs, (), variants))
+    _write(options.out, "quality", quality_table(results), results)
     return 0
 
 
 def run_ablation(options: argparse.Namespace) -> int:
     """Enable the components one by one and write ablation.md and ablation.json."""
-    plans, default_size = scene_plans(options, options.pair, (_ABLATION_TASK,))
-    conditions = Conditions(options.size or default_size, PerceptionMode(), options.threads)
-    study = Study(plans, cumulative_variants(), _budgets(options), options.seeds, conditions)
-    results = run_with_progress(study, options.out, options.lpips_weights, options.reuse_other_code)
-    write_results(options.out, "ablation", ablation_table(results), results)
+    study = _study(options, options.pair, (_ABLATION_TASK,), cumulative_variants())
+    results = _run(options, study)
+    _write(options.out, "ablation", ablation_table(results), results)
     return 0
 
 
-def _add_size_and_budget(parser: argparse.ArgumentParser, default_equal: str) -> None:
-    parser.add_argument(
-        "--size",
-        metavar="WxH",
-        type=read_image_size,
-        help="image size (default: 320x240; real sequences keep their aspect ratio)",
-    )
-    add, budget = parser.add_argument_group("budget").add_argument, TrialBudget()
-    add(
-        "--equal",
-        choices=[*(str(mode) for mode in BudgetMode), _BOTH],
-        default=default_equal,
-        help="quantity per frame that is equal for all policies (default: %(default)s)",
-    )
-    add("--max-gaussians", metavar="N", type=int, default=budget.max_gaussians, help="hard cap (default: %(default)s)")
-    add(
-        "--iterations",
-        metavar="N",
-        type=int,
-        default=budget.iterations,
-        help="iterations per frame at equal iterations (default: %(default)s)",
-    )
-    add(
-        "--rate",
-        metavar="HZ",
-        type=float,
-        help="frame rate at equal time (default: the rate of uniform mapping with --iterations, measured on the first "
-        f"scene and stored in DIR/{RATE_FILE})",
-    )
+def _study(
+    options: argparse.Namespace,
+    pairs: Sequence[str],
+    default_pairs: Sequence[str],
+    variants: Sequence[Variant],
+) -> Study:
+    """Return the study; wrong names, numbers and files fail here, before hours of work. Raises GaussLiteError.
 
-
-def _budgets(options: argparse.Namespace) -> list[TrialBudget]:
+    default_pairs replaces an empty list if there is no real sequence.
+    """
+    chosen, budget = build(StudyOptions, options), build(_BudgetOptions, options)
+    real = real_sequence_plans(options, chosen.frames)
+    plans, size = ([], DEFAULT_SIZE) if real is None else real
+    scenes: list[ScenePlan] = list(plans)
+    if real is None or pairs:
+        frames = DEFAULT_HOME_FRAMES if chosen.frames is None else chosen.frames
+        tasks = choose_home_tasks(pairs or default_pairs)
+        scenes[:0] = [HomeScenePlan(task, frames, budget.views) for task in tasks]
     modes = list(BudgetMode) if options.equal == _BOTH else [BudgetMode(options.equal)]
-    return [TrialBudget(options.max_gaussians, mode, options.iterations, options.rate) for mode in modes]
+    budgets = [TrialBudget(chosen.max_gaussians, equal, chosen.iterations, budget.rate_hz) for equal in modes]
+    conditions = Conditions(chosen.size or size, chosen.threads)
+    study = Study(scenes, variants, budgets, options.seeds, conditions)
+    for plan in scenes:
+        for trial in study.trials(plan):
+            _ = trial.mission
+    return study
 
 
-def _perception_mode(options: argparse.Namespace) -> PerceptionMode:
-    if options.perception == "gt":
-        return PerceptionMode()
-    if options.perception == "text":
-        return PerceptionMode(from_text=True)
-    detector = PerceptionSettings(Path(options.perception), threads=options.threads)
-    return PerceptionMode(from_text=True, detector=detector)
+def _run(options: argparse.Namespace, study: Study) -> StudyResults:
+    """Return the results of the study; finished trials are cached in the folder. Raises GaussLiteError."""
+    lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights, options.threads)
+    cache = TrialCache(options.out)
+    study = with_measured_rate(study, options.out)
+    finished: list[FinishedTrial] = []
+    unseen: list[UnseenRegionError] = []
+    with progress_bar(sum(len(study.trials(plan)) for plan in study.plans), "trials", "trial") as bar:
+        for each in run_study(study, cache, lpips):
+            if isinstance(each, UnseenRegionError):
+                unseen.append(each)
+                print_above_bar(f"skipped: {each}")
+                continue
+            finished.append(each)
+            print_above_bar(_line(each))
+            bar.update()
+    if not finished:
+        raise unseen[0]
+    return StudyResults(finished)
+
+
+def _line(finished: FinishedTrial) -> str:
+    trial, scores = finished.trial, finished.result.scores
+    roi = "no view shows the region" if scores.roi_psnr is None else f"ROI {scores.roi_psnr:.2f} dB"
+    origin = " (cached)" if finished.is_cached else ""
+    name = f"{trial.plan.name} {trial.variant.label} equal {trial.budget.equal} ({trial.budget}) seed {trial.seed}"
+    return f"{name}: {roi}, full {scores.full_psnr:.2f} dB{origin}"
+
+
+def _write(folder: Path, name: str, table: str, results: StudyResults) -> None:
+    write_results(folder, name, table, results.trials_as_json())
+    print(f"{table}→ {folder / f'{name}.md'}")

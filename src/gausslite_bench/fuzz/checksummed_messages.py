@@ -9,7 +9,6 @@ import google_crc32c
 import zstandard
 
 _FRAME_MAGIC = b"\x28\xb5\x2f\xfd"
-_CRC = struct.Struct("<I")
 _SIZE = struct.Struct("<I")
 _BODY_SIZE_OFFSETS = {b"GLSB": 19, b"GLFS": 10}
 """Where the header of each format has the number of bytes of its body."""
@@ -18,7 +17,7 @@ _MAX_BODY_BYTES = 1 << 20
 
 def with_checksum(message: bytes) -> bytes:
     """Return the message with the CRC32C of what precedes it as its last four bytes."""
-    return message[: -_CRC.size] + _CRC.pack(google_crc32c.value(message[: -_CRC.size]))
+    return message[: -_SIZE.size] + _SIZE.pack(google_crc32c.value(message[: -_SIZE.size]))
 
 
 def change_body(message: bytes, change: Callable[[bytes], bytes]) -> bytes:

@@ -1,4 +1,4 @@
-"""Decode mutated messages of the codec in this process."""
+"""Read the corpus of valid messages, `TARGET/NAME.bin`, and decode mutated ones of the codec in this process."""
 
 from __future__ import annotations
 
@@ -6,26 +6,23 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from gausslite.codec.json import decode_object_report
 from gausslite.codec.ply import gaussians_from_ply, world_frame_from_ply
 from gausslite.codec.stored import from_bytes
 from gausslite.codec.stored_voxels import StoredVoxels
 from gausslite.codec.subset_codec import decode_subset
-from gausslite.domain.errors import GaussLiteError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.wire.convert import decode_frame
 from gausslite_bench.fuzz.mutations import Mutator
 
+CORPUS = Path(__file__).with_name("corpus")
+SESSION_ID = b"f" * 32
+"""Stands for the session id in the corpus; a running server gives another one of the same length."""
+AGENT_ID = "fuzzer"
+"""The agent that the corpus contributes as."""
 HANG_S = 1.0
-
-
-def _decode_ply(data: bytes) -> None:
-    world_frame_from_ply(data)
-    gaussians_from_ply(data)
-
-
-def _decode_stored_row(data: bytes) -> None:
-    StoredVoxels.from_row(data).batch()
 
 
 DECODERS: Mapping[str, Callable[[bytes], object]] = {
@@ -33,17 +30,25 @@ DECODERS: Mapping[str, Callable[[bytes], object]] = {
     "keyframe": decode_frame,
     "object-report": decode_object_report,
     "records": from_bytes,
-    "stored-row": _decode_stored_row,
-    "ply": _decode_ply,
+    "stored-row": lambda data: StoredVoxels.from_row(data).batch(),
+    "ply": lambda data: (world_frame_from_ply(data), gaussians_from_ply(data)),
 }
-_SHARES = {
-    "subset": 0.6,
-    "keyframe": 0.1,
-    "object-report": 0.1,
-    "records": 0.05,
-    "stored-row": 0.05,
-    "ply": 0.1,
-}
+_SHARES = {"subset": 0.6, "keyframe": 0.1, "object-report": 0.1, "records": 0.05, "stored-row": 0.05, "ply": 0.1}
+
+
+def read_corpus(folder: Path) -> dict[str, list[bytes]]:
+    """Return the messages of each target. Raises InvalidInputError if the folder has none."""
+    targets = {
+        target.name: [path.read_bytes() for path in sorted(target.glob("*.bin"))]
+        for target in sorted(folder.glob("*"))
+        if target.is_dir()
+    }
+    found = {name: messages for name, messages in targets.items() if messages}
+    if not found:
+        raise InvalidInputError(
+            f"corpus {folder}: expected folders of messages such as subset/two-voxels.bin, got none"
+        )
+    return found
 
 
 @dataclass(slots=True)

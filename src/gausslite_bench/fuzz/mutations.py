@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import struct
 from collections.abc import Sequence
+from typing import TypeVar
 
 from gausslite_bench.fuzz.checksummed_messages import change_body, with_checksum
 from gausslite_bench.fuzz.protobuf_fields import change_field, encode_fields, parse_fields
@@ -16,6 +17,7 @@ _NUMBERS = (
     *(struct.pack("<d", value) for value in (0.0, -1.0, 1e-300, 1e300, float("inf"), float("nan"))),
     *(struct.pack("<f", value) for value in (-1.0, 3e38, float("inf"), float("nan"))),
 )
+Value = TypeVar("Value")
 _MAX_EDITS = 4
 _MAX_BYTES = 1 << 21
 _SEALED = (b"GLSB", b"GLFS")
@@ -27,13 +29,9 @@ class Mutator:
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(seed)  # noqa: S311 - reproducible messages
 
-    def choose(self, messages: Sequence[bytes]) -> bytes:
-        """Return one of these messages."""
-        return self._rng.choice(messages)
-
-    def choose_name(self, names: Sequence[str]) -> str:
-        """Return one of these names."""
-        return self._rng.choice(names)
+    def choose(self, values: Sequence[Value]) -> Value:
+        """Return one of these messages or names."""
+        return self._rng.choice(values)
 
     def chance(self, share: float) -> bool:
         """Return True in this share of the calls."""

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import random
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES = {_FIXED64: 8, _FIXED32: 4}
 _EXTREME_INTEGERS = (0, 1, 127, 1 << 31, (1 << 32) - 1, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
-_EXTREME_NUMBERS = {
-    8: tuple(
-        bytes.fromhex(digits)
-        for digits in ("00" * 8, "000000000000f07f", "000000000000f8ff", "ff" * 8, "9c7500883ce4377e")
-    ),
-    4: tuple(bytes.fromhex(digits) for digits in ("00" * 4, "0000807f", "0000c0ff", "ff" * 4)),
-}
-"""Zero, infinity, NaN and large values, as doubles and as floats."""
+_EXTREME_NUMBERS = (0.0, math.inf, math.nan, -1.0, 3e38)
 _EXTREME_TEXTS = (b"", b"\x00", b"\xff\xfe", "\u202e\U0001f916".encode(), b"\x1b[2J\n", b"a" * 10_000)
 _MAX_DEPTH = 4
 
@@ -84,7 +79,7 @@ def _changed_value(field: Field, rng: random.Random, depth: int) -> bytes:
     if field.wire_type == _VARINT:
         return encode_varint(rng.choice(_EXTREME_INTEGERS))
     if field.wire_type in _FIXED_BYTES:
-        return rng.choice(_EXTREME_NUMBERS[_FIXED_BYTES[field.wire_type]])
+        return struct.pack("<d" if field.wire_type == _FIXED64 else "<f", rng.choice(_EXTREME_NUMBERS))
     if depth < _MAX_DEPTH and field.value and parse_fields(field.value) and rng.random() < 0.8:
         return change_field(field.value, rng, depth + 1)
     return rng.choice(_EXTREME_TEXTS)
@@ -95,18 +90,10 @@ def _fields(data: bytes) -> Iterator[Field]:
     while start < len(data):
         key, start = _varint(data, start)
         number, wire_type = key >> 3, key & 7
-        end = start
-        if wire_type == _VARINT:
-            _, end = _varint(data, start)
-        elif wire_type == _BYTES:
-            length, start = _varint(data, start)
-            end = start + length
-        elif wire_type in _FIXED_BYTES:
-            end = start + _FIXED_BYTES[wire_type]
-        else:
-            raise ValueError(f"wire type: expected 0, 1, 2 or 5, got {wire_type}")
-        if number == 0 or end > len(data):
-            raise ValueError("field: expected a number above 0 and a value inside the message")
+        length, start = _varint(data, start) if wire_type == _BYTES else (_FIXED_BYTES.get(wire_type, 0), start)
+        end = _varint(data, start)[1] if wire_type == _VARINT else start + length
+        if number == 0 or wire_type not in (_VARINT, _BYTES, *_FIXED_BYTES) or end > len(data):
+            raise ValueError("field: expected a number above 0, a wire type and a value inside the message")
         yield Field(number, wire_type, data[start:end])
         start = end
 

@@ -3,117 +3,104 @@
 from __future__ import annotations
 
 import tempfile
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from gausslite_bench.fuzz.corpus import CORPUS, read_corpus
-from gausslite_bench.fuzz.decoders import Outcomes, decode_one, mutated_messages
-from gausslite_bench.fuzz.fuzzed_service import AGENT, FuzzedService
+from gausslite.cli.progress import progress_bar
+from gausslite.codec.state_file import write_atomic
+from gausslite.config.option import option
+from gausslite_bench.fuzz.decoders import CORPUS, Outcomes, decode_one, mutated_messages, read_corpus
 from gausslite_bench.fuzz.mutations import Mutator
-from gausslite_bench.fuzz.service_calls import ServiceFuzzer
-from gausslite_bench.loop.memory import resident_mib
+from gausslite_bench.fuzz.service_calls import ServiceFuzzer, command_of
+from gausslite_bench.report import Report
+from gausslite_bench.service_process import ServiceProcess, resident_mib
 
-_SHARES = {"codec": 0.88, "FusionService": 0.07, AGENT: 0.02, "ParserService": 0.03}
+_SHARES = {"codec": 0.88, "FusionService": 0.07, "AgentService": 0.02, "ParserService": 0.03}
+_MAX_WRITTEN = 200
 _WARM_SHARE = 0.3
 """Memory is compared with the one after this share of the messages, when caches and quotas are full."""
+Note = Callable[[int], object]
+_Fuzzed = tuple[Outcomes, dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class FuzzSettings:
-    """messages: in total, most of them decoded in this process. corpus: folder of the valid messages.
+    """The options of `bench fuzz`."""
 
-    detector: model file of the agent; without one it refuses tasks and frames.
-    """
-
-    messages: int = 1_000_000
-    seed: int = 0
-    corpus: Path = CORPUS
-    detector: Path | None = None
+    messages: int = option(1_000_000, "messages in total, most of them decoded in this process", low=1000)
+    seed: int = option(0, "seed of the mutations (default: 0)", low=0)
+    corpus: Path = option(CORPUS, "valid messages, TARGET/NAME.bin (default: those of the package)", metavar="FOLDER")
+    out: Path | None = option(None, "write the messages that failed there (default: no)", metavar="FOLDER")
 
 
-@dataclass(frozen=True, slots=True)
-class FuzzResult:
-    """What mutated messages did to the codec or to one service.
+def run_fuzz(settings: FuzzSettings) -> Report:
+    """Fuzz the codec, then each service; the report is good without a crash and a hang. Raises UnavailableError.
 
     crashes: unexpected exceptions, undocumented codes, and ends of the process. hangs: messages that took over 1 s.
-    growth_mib: of the memory over the last 70 % of the messages. faults: description and bytes of what failed.
-    """
-
-    target: str
-    messages: int
-    results: dict[str, int]
-    crashes: int
-    hangs: int
-    slowest_s: float
-    rss_mib: float
-    growth_mib: float
-    faults: list[tuple[str, bytes]] = field(repr=False)
-
-
-def run_fuzz(settings: FuzzSettings, note: Callable[[int], object]) -> Iterator[FuzzResult]:
-    """Fuzz the codec, then each service, and yield each result; `note` receives numbers of sent messages.
-
-    Raises UnavailableError if a service does not start.
+    growth_mib: of the memory over the last 70 % of the messages. faults: descriptions of what failed.
     """
     corpus = read_corpus(settings.corpus)
-    options = () if settings.detector is None else ("--detector", str(settings.detector))
-    for index, (target, share) in enumerate(_SHARES.items()):
-        mutator = Mutator(settings.seed * len(_SHARES) + index)
-        run = _Run(target, corpus, mutator, round(settings.messages * share), note)
-        yield _fuzz_codec(run) if target == "codec" else _fuzz_service(run, options if target == AGENT else ())
+    results: list[dict[str, Any]] = []
+    with progress_bar(settings.messages, "fuzz", "message") as progress:
+        for index, (target, share) in enumerate(_SHARES.items()):
+            mutator, count = Mutator(settings.seed * len(_SHARES) + index), round(settings.messages * share)
+            if target == "codec":
+                outcomes, figures = _fuzz_codec(corpus, mutator, count, progress.update)
+            else:
+                command = command_of(target)
+                fuzzer_of = partial(ServiceFuzzer, target, corpus, mutator)
+                outcomes, figures = _fuzz_service(command, fuzzer_of, count, progress.update)
+            results.append({"target": target, **figures})
+            if settings.out is not None:
+                _write_faults(settings.out, target, outcomes)
+    return Report({"targets": results}, is_good=not any(each["crashes"] or each["hangs"] for each in results))
 
 
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """The part of the messages that one target gets."""
-
-    target: str
-    corpus: Mapping[str, list[bytes]]
-    mutator: Mutator
-    messages: int
-    note: Callable[[int], object]
-
-    @property
-    def warm_messages(self) -> int:
-        return round(self.messages * _WARM_SHARE)
-
-
-def _fuzz_codec(run: _Run) -> FuzzResult:
+def _fuzz_codec(corpus: Mapping[str, list[bytes]], mutator: Mutator, messages: int, note: Note) -> _Fuzzed:
     outcomes = Outcomes()
     warm_mib = resident_mib()
-    for number, (name, data) in enumerate(mutated_messages(run.corpus, run.mutator, run.messages)):
-        if number == run.warm_messages:
+    for number, (name, data) in enumerate(mutated_messages(corpus, mutator, messages)):
+        if number == round(messages * _WARM_SHARE):
             warm_mib = resident_mib()
         decode_one(name, data, outcomes)
-        run.note(1)
-    return _result(run.target, outcomes, 0, (warm_mib, resident_mib()))
+        note(1)
+    return outcomes, _figures(outcomes, 0, warm_mib, resident_mib())
 
 
-def _fuzz_service(run: _Run, options: Sequence[str]) -> FuzzResult:
+def _fuzz_service(
+    command: str, fuzzer_of: Callable[[ServiceProcess], ServiceFuzzer], messages: int, note: Note
+) -> _Fuzzed:
     with tempfile.TemporaryDirectory() as folder:
-        service = FuzzedService.start(run.target, Path(folder), options)
+        service = ServiceProcess(command, Path(folder))
         try:
-            fuzzer = ServiceFuzzer(service, run.corpus, run.mutator)
-            fuzzer.run(run.warm_messages, run.note)
+            fuzzer, warm = fuzzer_of(service), round(messages * _WARM_SHARE)
+            fuzzer.run(warm, note)
             warm_mib = service.rss_mib() if service.is_running else 0.0
-            fuzzer.run(run.messages - run.warm_messages, run.note)
+            fuzzer.run(messages - warm, note)
             end_mib = service.rss_mib() if service.is_running else 0.0
-            return _result(run.target, fuzzer.outcomes, service.unexpected_errors, (warm_mib, end_mib))
+            return fuzzer.outcomes, _figures(fuzzer.outcomes, service.unexpected_errors, warm_mib, end_mib)
         finally:
-            service.close()
+            service.kill()
 
 
-def _result(target: str, outcomes: Outcomes, logged: int, rss_mib: tuple[float, float]) -> FuzzResult:
-    return FuzzResult(
-        target=target,
-        messages=outcomes.messages,
-        results=dict(Counter(outcomes.results).most_common()),
-        crashes=max(len(outcomes.crashes), logged),
-        hangs=len(outcomes.hangs),
-        slowest_s=outcomes.slowest_s,
-        rss_mib=rss_mib[1],
-        growth_mib=rss_mib[1] - rss_mib[0],
-        faults=[*outcomes.crashes, *outcomes.hangs],
-    )
+def _figures(outcomes: Outcomes, logged: int, warm_mib: float, end_mib: float) -> dict[str, Any]:
+    return {
+        "messages": outcomes.messages,
+        "results": dict(outcomes.results.most_common()),
+        "crashes": max(len(outcomes.crashes), logged),
+        "hangs": len(outcomes.hangs),
+        "slowest_s": outcomes.slowest_s,
+        "rss_mib": end_mib,
+        "growth_mib": end_mib - warm_mib,
+        "faults": sorted({description for description, _ in (*outcomes.crashes, *outcomes.hangs)}),
+    }
+
+
+def _write_faults(folder: Path, target: str, outcomes: Outcomes) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, (description, data) in enumerate([*outcomes.crashes, *outcomes.hangs][:_MAX_WRITTEN]):
+        write_atomic(folder / f"{target}-{number}.bin", data)
+        write_atomic(folder / f"{target}-{number}.txt", f"{description}\n".encode())

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import shlex
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from gausslite.domain.errors import NameInUseError, NotPermittedError
+from gausslite.wire.clients import FusionClient
 from gausslite_bench.async_calls import RawCalls, service_methods
-from gausslite_bench.fuzz.corpus import SESSION_ID
-from gausslite_bench.fuzz.decoders import HANG_S, Outcomes
-from gausslite_bench.fuzz.fuzzed_service import FuzzedService
+from gausslite_bench.fuzz.decoders import AGENT_ID, HANG_S, SESSION_ID, Outcomes
 from gausslite_bench.fuzz.mutations import Mutator
+from gausslite_bench.server.synthetic_updates import GRID
+from gausslite_bench.service_process import ServiceProcess
 
 _TIMEOUT_S = 20.0
 _BATCH = 40
@@ -22,6 +26,15 @@ _FAULTS = frozenset({"INTERNAL", "UNKNOWN", "UNAVAILABLE", "CANCELLED", "ABORTED
 _RARE = {"RefineFusedMap": 0.02, "EndMission": 0.0}
 """Share of a method, relative to the others, that trains or ends the service; a last batch has EndMission."""
 _MAX_STREAMED = 3
+_FUSION = "FusionService"
+_OPTIONS: Mapping[str, str] = {
+    _FUSION: "gausslite_fusion_server --set quota-agents=200 --set quota-voxels=2000 --set quota-gaussians=20000 "
+    "--set quota-keyframes=8 --set refine-iterations=2 --mission mission",
+    "AgentService": "gausslite_agent --iterations 1 --max-gaussians 2000 --set threads=1",
+    "ParserService": "gausslite_parser",
+}
+"""The program of each service. Small quotas are full soon, so that memory which grows later is a leak."""
+_TOKEN = "fuzzer"  # noqa: S105 - of the agent that the corpus contributes as
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +48,13 @@ class Call:
 class ServiceFuzzer:
     """Mutates the corpus of one service and sends it."""
 
-    def __init__(self, service: FuzzedService, corpus: Mapping[str, list[bytes]], mutator: Mutator) -> None:
-        self._service, self._mutator = service, mutator
-        prefix = f"{service.name}."
+    def __init__(self, name: str, corpus: Mapping[str, list[bytes]], mutator: Mutator, service: ServiceProcess) -> None:
+        self._name, self._service, self._mutator = name, service, mutator
+        prefix = f"{name}."
         self._corpus = {
-            name.removeprefix(prefix): messages for name, messages in corpus.items() if name.startswith(prefix)
+            method.removeprefix(prefix): messages for method, messages in corpus.items() if method.startswith(prefix)
         }
-        self._full_name = f"gausslite.v1.{service.name}"
+        self._full_name = f"gausslite.v1.{name}"
         self._takes_stream = service_methods()[self._full_name]
         self.outcomes = Outcomes()
         self._slow: list[Call] = []
@@ -63,10 +76,10 @@ class ServiceFuzzer:
                 note(sent)
         if not self._service.is_running:
             last = itertools.chain.from_iterable(call.messages for call in batch)
-            self.outcomes.crashes += [(f"{self._service.name}: ended", data) for data in last]
+            self.outcomes.crashes += [(f"{self._name}: ended", data) for data in last]
 
     def _batch(self, messages: int, is_last: bool) -> list[Call]:
-        session_id = self._service.open_session()
+        session_id = _open_session(self._name, self._service.address)
         batch: list[Call] = []
         while messages > 0:
             method = self._choose_method(is_last)
@@ -81,7 +94,7 @@ class ServiceFuzzer:
 
     def _choose_method(self, is_last: bool) -> str:
         while True:
-            method = self._mutator.choose_name(tuple(self._corpus))
+            method = self._mutator.choose(tuple(self._corpus))
             if is_last or self._mutator.chance(_RARE.get(method, 1.0)):
                 return method
 
@@ -101,7 +114,7 @@ class ServiceFuzzer:
                 code, took_s = await _timed(calls, call)
                 self.outcomes.results[code] += len(call.messages)
                 if code in _FAULTS:
-                    description = f"{self._service.name}.{call.method}: {code}"
+                    description = f"{self._name}.{call.method}: {code}"
                     self.outcomes.crashes += [(description, data) for data in call.messages]
                 if took_s > HANG_S:
                     self._slow.append(call)
@@ -114,7 +127,7 @@ class ServiceFuzzer:
             fastest_s = min([(await _timed(calls, call))[1] for _ in range(3)])
             self.outcomes.slowest_s = max(self.outcomes.slowest_s, fastest_s)
             if fastest_s > HANG_S:
-                description = f"{self._service.name}.{call.method}: {fastest_s:.1f} s"
+                description = f"{self._name}.{call.method}: {fastest_s:.1f} s"
                 self.outcomes.hangs += [(description, data) for data in call.messages]
         self._slow.clear()
 
@@ -123,3 +136,24 @@ async def _timed(calls: RawCalls, call: Call) -> tuple[str, float]:
     begin_s = time.monotonic()
     code = await calls.call(call.method, call.messages, _TIMEOUT_S)
     return code, time.monotonic() - begin_s
+
+
+def command_of(service: str) -> str:
+    """Return the command that starts a service."""
+    return f"{shlex.quote(sys.executable)} -m {_OPTIONS[service]}"
+
+
+def _open_session(service: str, address: str) -> bytes:
+    """Return a session id of the corpus's agent; empty for a service without sessions."""
+    if service != _FUSION:
+        return b""
+    with FusionClient(address, deadline_s=60.0, token=_TOKEN) as client:
+        try:
+            return client.join(AGENT_ID, GRID).session_id.encode()
+        except NotPermittedError:
+            # a mutated message has banned the agent
+            client.unban(AGENT_ID)
+        except NameInUseError:
+            # a mutated message has joined under its name with another token
+            client.evict(AGENT_ID)
+        return client.join(AGENT_ID, GRID).session_id.encode()

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.datasets.source import Source
 from gausslite.domain.frame import Frame
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.mission.settings import SceneInfo
 from gausslite_bench.quality.home_tasks import HomeTask
-from gausslite_bench.quality.scenes import PosePolicy, Scene, make_scene, require_count
+from gausslite_bench.quality.scenes import Scene, make_scene
 from gausslite_evaluation.views import HeldOutView
 
 _TRAINING_TRAJECTORIES = (0, 1)
@@ -22,22 +23,12 @@ _FIRST_TRAJECTORY_SHARE = 2 / 3
 
 @dataclass(frozen=True, slots=True)
 class HomeScenePlan:
-    """A task in its simulated home: two training trajectories with sensor noise, held-out views without noise.
-
-    recorded_size: (width_px, height_px) of the camera; images are made smaller, and a detector sees them as recorded.
-    None: the camera records at the size of the maps.
-    """
+    """A task in its simulated home: two training trajectories with sensor noise, held-out views without noise."""
 
     pair: HomeTask
     frames: int = 60
     views: int = 24
     seed: int = 0
-    pose_policy: PosePolicy = field(default_factory=PosePolicy)
-    recorded_size: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        require_count("frames", self.frames)
-        require_count("views", self.views)
 
     @property
     def name(self) -> str:
@@ -49,26 +40,27 @@ class HomeScenePlan:
         """The task's sentence."""
         return self.pair.task
 
+    @property
+    def pose_prior(self) -> PoseExposurePrior:
+        """Poses and exposures are exact."""
+        return PoseExposurePrior()
+
     def settings(self) -> Mapping[str, object]:
         """Return the trajectories, the task and its objects."""
         return {
-            "specs": [*self._training_specs(), self._held_out_spec()],
+            **self.training_settings(),
+            "held_out": self._held_out_spec(),
             "task": self.task,
             "objects": list(self.pair.objects),
-            "pose_policy": str(self.pose_policy),
-            **({} if self.recorded_size is None else {"recorded_size": list(self.recorded_size)}),
         }
 
     def training_settings(self) -> Mapping[str, object]:
         """Return the training trajectories."""
-        recorded = {} if self.recorded_size is None else {"recorded_size": list(self.recorded_size)}
-        return {"specs": self._training_specs(), **recorded}
+        return {"specs": self._training_specs()}
 
     def load(self, size: tuple[int, int]) -> Scene:
         """Return the scene; the training trajectories follow each other as one mission."""
-        recorded = self.recorded_size or size
-        size_option = f"&size={recorded[0]}x{recorded[1]}"
-        walks = [_walk(f"{spec}{size_option}", size) for spec in (*self._training_specs(), self._held_out_spec())]
+        walks = [_walk(f"{spec}&size={size[0]}x{size[1]}") for spec in (*self._training_specs(), self._held_out_spec())]
         *training, held_out = (frames for _, frames in walks)
         source = walks[0][0]
         regions = choose_regions(source.regions(), self.pair.objects)
@@ -90,7 +82,7 @@ class HomeScenePlan:
 
 
 @lru_cache(maxsize=len(_TRAINING_TRAJECTORIES) + 1)
-def _walk(spec: str, size: tuple[int, int]) -> tuple[Source, tuple[Frame, ...]]:
+def _walk(spec: str) -> tuple[Source, tuple[Frame, ...]]:
     """Return a source with its frames; cached, because a home's tasks follow each other and have the same walks."""
     source = open_source(spec)
-    return source, tuple(source.frame(i, size) for i in range(len(source)))
+    return source, tuple(source.frame(i) for i in range(len(source)))

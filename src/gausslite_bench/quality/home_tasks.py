@@ -1,4 +1,4 @@
-"""The 24 tasks in simulated homes with the objects in their regions, and one whole-home task per home."""
+"""The 24 tasks in simulated homes with the objects in their regions."""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ class TaskKind(StrEnum):
     MANIPULATION = "manipulation"
     SEARCH = "search"
     NAVIGATION = "navigation"
-    FULL_FRAME = "everything"
-    """All objects of a home: measures the cost of following a task that covers everything. Not one of the 24 tasks."""
 
 
 @dataclass(frozen=True, slots=True)
 class HomeTask:
-    """A task in a home. objects: names of the ground-truth objects in its region; empty means all."""
+    """A task in a home. objects: names of the ground-truth objects in its region."""
 
     home: int
     kind: TaskKind
@@ -65,25 +63,15 @@ HOME_TASKS = (
     HomeTask(8, TaskKind.NAVIGATION, "Navigate to the ladder", ("ladder",)),
 )
 
-WHOLE_HOMES = tuple(HomeTask(home, TaskKind.FULL_FRAME, "Inspect everything", ()) for home in range(1, 9))
-"""Each home with all objects as the region, more than half of the image; selected only by their full names."""
-
 
 def choose_home_tasks(names: Sequence[str]) -> tuple[HomeTask, ...]:
     """Return the tasks whose name equals or starts with one of these ("home-3" selects three); all without names.
 
     Raises InvalidInputError.
     """
-    tasks = tuple(task for task in HOME_TASKS if not names or any(_matches(task.name, name) for name in names))
-    chosen = (*tasks, *(whole for whole in WHOLE_HOMES if whole.name in names))
-    unknown = [name for name in names if not any(_matches(task.name, name) for task in chosen)]
+    chosen = tuple(task for task in HOME_TASKS if not names or any(f"{task.name}-".startswith(f"{n}-") for n in names))
+    unknown = [name for name in names if not any(f"{task.name}-".startswith(f"{name}-") for task in chosen)]
     if unknown:
-        kinds = ", ".join(TaskKind)
-        raise InvalidInputError(
-            f"pairs: expected names such as home-3 or home-3-search (1 to 8; {kinds}), got {', '.join(unknown)}"
-        )
+        expected = f"names such as home-3 or home-3-search (1 to 8; {', '.join(TaskKind)})"
+        raise InvalidInputError(f"pairs: expected {expected}, got {', '.join(unknown)}")
     return chosen
-
-
-def _matches(name: str, selector: str) -> bool:
-    return name == selector or name.startswith(f"{selector}-")

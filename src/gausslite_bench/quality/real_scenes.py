@@ -21,10 +21,10 @@ from gausslite.domain.recording import CameraCorrection, DepthRegistration, Pose
 from gausslite.domain.relevance import MIN_ROI_PIXELS
 from gausslite.mission.settings import SceneInfo
 from gausslite.nouns import head_of
-from gausslite_bench.quality.scenes import PosePolicy, Scene, UnseenRegionError, make_scene, require_count
+from gausslite_bench.quality.scenes import Scene, UnseenRegionError, make_scene
 from gausslite_evaluation.views import HeldOutView
 
-REAL_CAMERA = PosePolicy(PoseExposurePrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03), fit_views=True)
+REAL_CAMERA = PoseExposurePrior(translation_m=0.01, rotation_deg=0.5, gain=0.1, offset=0.03)
 """A handheld camera with automatic exposure, tracked to about a centimetre."""
 _NUMBERED = re.compile(r"seq-?\d+")
 """Folder names that need the parent's name to be distinctive."""
@@ -45,14 +45,12 @@ class RealScenePlan:
     up_axis: UpAxis | None = None
     depth_registration: DepthRegistration | None = None
     camera_correction: CameraCorrection | None = None
-    pose_policy: PosePolicy = REAL_CAMERA
+    pose_prior: PoseExposurePrior = REAL_CAMERA
     split: HeldOutSplit = field(default_factory=HeldOutSplit)
 
     def __post_init__(self) -> None:
         if not self.kind or "/" in self.kind:
             raise InvalidInputError(f"{self.roi}: expected objects that can name files, got {', '.join(self.objects)}")
-        if self.frames is not None:
-            require_count("frames", self.frames)
 
     @property
     def name(self) -> str:
@@ -69,12 +67,7 @@ class RealScenePlan:
     def settings(self) -> Mapping[str, object]:
         """Return the training settings, the objects and the digest of the region file."""
         regions = hashlib.sha256(self.roi.read_bytes()).hexdigest()
-        return {
-            **self.training_settings(),
-            "objects": list(self.objects),
-            "regions": regions,
-            "pose_policy": str(self.pose_policy),
-        }
+        return {**self.training_settings(), "objects": list(self.objects), "regions": regions}
 
     def training_settings(self) -> Mapping[str, object]:
         """Return the folder, the frame selection, and the digests of the camera files."""
@@ -85,8 +78,8 @@ class RealScenePlan:
             "frames": self.frames,
             "up": self.up_axis,
             "test_every": self.split.every,
-            "depth_registration": None if self.depth_registration is None else str(self.depth_registration),
-            **({} if self.camera_correction is None else {"camera_correction": str(self.camera_correction)}),
+            "depth_registration": str(self.depth_registration),
+            "camera_correction": str(self.camera_correction),
             **files,
         }
 
@@ -120,22 +113,20 @@ def real_plans(
     roi: Path,
     frames: int | None = None,
     up_axis: UpAxis | None = None,
-    pose_policy: PosePolicy = REAL_CAMERA,
+    chosen: Sequence[str] = (),
 ) -> list[RealScenePlan]:
-    """Return one plan per kind of object in the region file: mug_1 and mug_2 are of kind mug. Raises DatasetError."""
+    """Return one plan per kind of object in the region file: mug_1 and mug_2 are of kind mug.
+
+    chosen: kinds to return; all if empty. Raises DatasetError, InvalidInputError for an unknown kind.
+    """
     kinds: dict[str, list[str]] = {}
     for name in load_voxel_regions(roi):
         kinds.setdefault(head_of(name), []).append(name)
-    return [
-        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis, pose_policy=pose_policy)
-        for kind, objects in kinds.items()
-    ]
-
-
-def choose_kinds(plans: Sequence[RealScenePlan], kinds: Sequence[str]) -> list[RealScenePlan]:
-    """Return the plans of these kinds; all if kinds is empty. Raises InvalidInputError for an unknown kind."""
-    known = [plan.kind for plan in plans]
-    unknown = [kind for kind in kinds if kind not in known]
+    unknown = [kind for kind in chosen if kind not in kinds]
     if unknown:
-        raise InvalidInputError(f"kinds: expected names among {', '.join(known)}, got {', '.join(unknown)}")
-    return [plan for plan in plans if not kinds or plan.kind in kinds]
+        raise InvalidInputError(f"kinds: expected names among {', '.join(kinds)}, got {', '.join(unknown)}")
+    return [
+        RealScenePlan(folder, roi, kind, tuple(objects), frames, up_axis)
+        for kind, objects in kinds.items()
+        if not chosen or kind in chosen
+    ]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
@@ -12,13 +11,10 @@ from numpy import ndarray
 
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
-from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import Region, RelevanceMap
 from gausslite.mission.settings import SceneInfo
 from gausslite.perception.relevance import RegionRelevanceEstimator, RelevanceEstimate, RelevanceEstimator
 from gausslite_evaluation.views import HeldOutView
-
-_MAX_FRAMES = 100_000
 
 
 class UnseenRegionError(DatasetError):
@@ -40,49 +36,6 @@ class Scene:
         """Region's share of the pixels, over the held-out views that show it."""
         shares = [float(view.roi.mean()) for view in self.held_out if view.roi.any()]
         return float(np.mean(shares)) if shares else 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class PosePolicy:
-    """A study's handling of pose and exposure errors in a scene.
-
-    pose_prior: size of the errors, for mapping. fit_views: also score held-out views with fitted pose and exposure.
-    """
-
-    pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
-    fit_views: bool = False
-
-
-@runtime_checkable
-class ScenePlan(Protocol):
-    """Description of a scene before its frames are loaded."""
-
-    @property
-    def name(self) -> str:
-        """Short name for tables and files."""
-        ...
-
-    @property
-    def task(self) -> str:
-        """The task's sentence."""
-        ...
-
-    @property
-    def pose_policy(self) -> PosePolicy:
-        """How pose and exposure errors are handled, the same for every policy."""
-        ...
-
-    def settings(self) -> Mapping[str, object]:
-        """Return everything that determines the frames and scores, to identify finished trials."""
-        ...
-
-    def training_settings(self) -> Mapping[str, object]:
-        """Return everything that determines the training frames; task-independent maps are shared if it is equal."""
-        ...
-
-    def load(self, size: tuple[int, int]) -> Scene:
-        """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
-        ...
 
 
 class RecordedRelevanceEstimator(RelevanceEstimator):
@@ -115,9 +68,3 @@ def make_scene(
         raise DatasetError(f"{task!r}: expected training frames and held-out views with depth, got {counts}")
     estimator = RegionRelevanceEstimator(regions)
     return Scene(task, usable, [estimator.estimate(frame).relevance for frame in usable], views, info)
-
-
-def require_count(name: str, count: int) -> None:
-    """Raise InvalidInputError unless there are 2 to 100000."""
-    if not 2 <= count <= _MAX_FRAMES:
-        raise InvalidInputError(f"{name}: expected 2 to {_MAX_FRAMES}, got {count}")

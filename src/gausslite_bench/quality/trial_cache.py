@@ -1,96 +1,59 @@
-"""Folder of finished trials, so that a study can be interrupted and continued."""
+"""Folder of finished trials, so that a study can be interrupted and continued; results of other code do not count."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float32
-from numpy import ndarray
-
-from gausslite.codec.state_file import write_png
-from gausslite.domain.errors import GaussLiteError, StorageError
 from gausslite.mission.results import prepare_folder, write_json
-from gausslite_bench.quality.code_hash import current_code_hash
-from gausslite_bench.quality.scenes import Scene
-from gausslite_bench.quality.trials import SHEET_VIEWS, Trial, TrialResult, ViewImages
-from gausslite_evaluation.pictures import comparison_sheet
-from gausslite_evaluation.views import largest_roi_views
+from gausslite_bench.quality.trials import Trial, TrialResult
 
-
-@dataclass(frozen=True, slots=True)
-class CachedTrial:
-    """A result from the cache, and the hash of the code that computed it."""
-
-    result: TrialResult
-    code: str
+_SOURCES = Path(__file__).resolve().parents[2]
+"""The folder of the packages that a trial runs."""
 
 
 class TrialCache:
-    """A folder with one JSON record and the rendered views per trial (trials/), and comparison sheets (sheets/).
-
-    code: hash of the running code, computed before the first trial, since the files may change during a study.
-    """
+    """A folder with one JSON record for each trial and each state of the code."""
 
     def __init__(self, folder: Path) -> None:
         """Create the folder. Raises StorageError if it cannot be written."""
-        self.code = current_code_hash()
-        self._trials, self._sheets = folder / "trials", folder / "sheets"
-        for part in (self._trials, self._sheets):
-            prepare_folder(part)
+        self._folder = folder / "trials"
+        # before the first trial, since the files may change during a study
+        self._code = current_code_hash()
+        prepare_folder(self._folder)
 
-    def load_trial(self, trial: Trial, with_lpips: bool) -> CachedTrial | None:
-        """Return the stored result, whatever code computed it.
-
-        None if there is no complete record, if an image is missing, or if it lacks the requested LPIPS.
-        """
+    def load(self, trial: Trial, with_lpips: bool) -> TrialResult | None:
+        """Return the stored result; None without a complete record, or if it lacks the requested LPIPS."""
         try:
-            record = json.loads(self._record_path(trial).read_text())
-            cached = CachedTrial(TrialResult.from_json(record["result"]), str(record["code"]))
-            images = [self._image_path(trial, position) for position in record["pictures"]]
-        except (OSError, ValueError, KeyError, TypeError, GaussLiteError):
+            result = TrialResult.from_json(json.loads(self._path(trial).read_text())["result"])
+        except (OSError, ValueError, KeyError, TypeError):
             return None
-        if with_lpips and cached.result.scores.full_lpips is None:
-            return None
-        return cached if all(image.is_file() for image in images) else None
+        return None if with_lpips and result.scores.full_lpips is None else result
 
-    def store_trial(self, trial: Trial, result: TrialResult, images: ViewImages) -> None:
-        """Write a trial computed by the running code; the record is written last. Raises StorageError."""
-        for position, image in images.items():
-            write_png(self._image_path(trial, position), image)
-        record = {
-            "settings": _settings(trial),
-            "code": self.code,
-            "pictures": sorted(images),
-            "result": result.as_json(),
-        }
-        write_json(self._record_path(trial), record)
+    def store(self, trial: Trial, result: TrialResult) -> None:
+        """Write a trial that the running code computed. Raises StorageError."""
+        settings = {"scene": dict(trial.plan.settings()), "mission": str(trial.mission)}
+        record = {**settings, "conditions": str(trial.conditions), "result": asdict(result)}
+        write_json(self._path(trial), record)
 
-    def write_sheets(self, trials: Sequence[Trial], scene: Scene) -> None:
-        """Write comparison sheets of these trials' maps on one scene. Raises StorageError."""
-        for position in sorted(largest_roi_views(scene.held_out, SHEET_VIEWS)):
-            renderings = {trial.variant.label: self._load_image(trial, position) for trial in trials}
-            sheet = comparison_sheet(scene.held_out[position], renderings)
-            write_png(self._sheets / f"{trials[0].plan.name}-view-{position:03d}.png", sheet)
-
-    def _load_image(self, trial: Trial, position: int) -> Float32[ndarray, "h w 3"]:
-        import cv2
-
-        path = self._image_path(trial, position)
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if image is None:
-            raise StorageError(f"{path}: expected an image; remove the file to compute its trial again")
-        return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / np.float32(255.0)
-
-    def _record_path(self, trial: Trial) -> Path:
-        return self._trials / f"{trial.key}.json"
-
-    def _image_path(self, trial: Trial, position: int) -> Path:
-        return self._trials / f"{trial.key}-view-{position:03d}.png"
+    def _path(self, trial: Trial) -> Path:
+        return self._folder / f"{trial.key}-{self._code}.json"
 
 
-def _settings(trial: Trial) -> Mapping[str, object]:
-    return {"scene": dict(trial.plan.settings()), "mission": str(trial.mission), "conditions": str(trial.conditions)}
+@functools.cache
+def current_code_hash() -> str:
+    """Return the hash of the sources and kernels on disk at the first call, without other libraries.
+
+    It is cached, since a process keeps running the code it loaded.
+    """
+    # an editable installation stores the kernels apart from the sources
+    kernels = [find_spec(name) for name in ("gausslite.render._kernels", "gausslite.codec._unpack")]
+    origins = (Path(spec.origin) for spec in kernels if spec is not None and spec.origin is not None)
+    digest = hashlib.sha256()
+    for path in (*sorted(_SOURCES.glob("gausslite*/**/*.py")), *origins):
+        digest.update(f"{path.name} ".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:12]

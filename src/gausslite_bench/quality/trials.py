@@ -5,34 +5,33 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from statistics import fmean
 from typing import Any
 
-from jaxtyping import UInt8
-from numpy import ndarray
-
 from gausslite.codec.subset_codec import encode_subset, split_batch
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
-from gausslite.mission.build import EstimatorFactory, build_mapper
-from gausslite.mission.frame_scheduler import Clock, FrameScheduler
+from gausslite.mapping.policies import ABLATION_FLAGS, EXTENSION_FLAGS, PAPER_FLAGS, TASK
+from gausslite.mission.build import build_mapper
+from gausslite.mission.frame_scheduler import FrameScheduler
 from gausslite.mission.runner import MissionRunner
-from gausslite.mission.settings import MissionSettings, PerceptionSettings
+from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
-from gausslite.perception.relevance import NoTaskEstimator, RelevanceEstimator
+from gausslite.perception.relevance import NoTaskEstimator
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.map_viewer import MapViewer
-from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene, ScenePlan
+from gausslite_bench.quality.home_scenes import HomeScenePlan
+from gausslite_bench.quality.real_scenes import RealScenePlan
+from gausslite_bench.quality.scenes import RecordedRelevanceEstimator, Scene
 from gausslite_evaluation.compare import MapScores, average, score_view
 from gausslite_evaluation.lpips import Lpips
-from gausslite_evaluation.pictures import to_uint8
-from gausslite_evaluation.views import largest_roi_views, render_fitted, render_fitted_at_region
+from gausslite_evaluation.views import render_fitted
 
-SHEET_VIEWS = 2
+ScenePlan = HomeScenePlan | RealScenePlan
+"""Description of a scene before its frames are loaded."""
 
 
 class BudgetMode(StrEnum):
@@ -75,15 +74,11 @@ class Variant:
     disabled: frozenset[str] = frozenset()
 
 
-@dataclass(frozen=True, slots=True)
-class PerceptionMode:
-    """Source of the task's region: ground-truth masks, or perception from the task's text.
-
-    from_text without a detector model: the text's nouns select among the scene's ground-truth objects.
-    """
-
-    from_text: bool = False
-    detector: PerceptionSettings = field(default_factory=PerceptionSettings)
+def cumulative_variants() -> list[Variant]:
+    """Return none, +SB, +MVO, +ROI, +SIS, +GFD, then the extensions; each variant keeps all previous components."""
+    labels = [*(name.upper() for name in PAPER_FLAGS), *EXTENSION_FLAGS]
+    rows = [Variant("none", TASK, frozenset(ABLATION_FLAGS))]
+    return rows + [Variant(f"+{label}", TASK, frozenset(ABLATION_FLAGS[i + 1 :])) for i, label in enumerate(labels)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +86,6 @@ class Conditions:
     """Settings shared by all trials of a study. size: (width_px, height_px)."""
 
     size: tuple[int, int]
-    perception: PerceptionMode = field(default_factory=PerceptionMode)
     threads: int | None = None
 
 
@@ -117,7 +111,7 @@ class Trial:
             rate_hz=self.budget.rate_hz if timed else None,
             seed=self.seed,
             threads=self.conditions.threads,
-            pose_prior=self.plan.pose_policy.pose_prior,
+            pose_prior=self.plan.pose_prior,
         )
 
     @property
@@ -148,52 +142,32 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class TrialResult:
-    """Result of a trial. roi_share: region's share of the held-out views. map_bytes: size of the whole map in messages.
+class MapCost:
+    """Cost of a map. map_bytes: size of the whole map in messages. ms_per_frame: perception and mapping."""
 
-    ms_per_frame: perception and mapping. fitted: scores after fitting each view's pose and exposure; region_fitted:
-    fitted at the region alone, on the views that show it. None if that was not requested, or if no view shows it.
+    gaussians: int
+    map_bytes: int
+    iterations_mean: float
+    ms_per_frame: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrialResult:
+    """Result of a trial. roi_share: region's share of the held-out views.
+
+    fitted: scores after fitting each view's pose and exposure, where poses may be wrong.
     """
 
     scores: MapScores
     fitted: MapScores | None
     roi_share: float
-    gaussians: int
-    map_bytes: int
-    iterations_mean: float
-    ms_per_frame: float
-    region_fitted: MapScores | None = None
-
-    def as_json(self) -> dict[str, object]:
-        """Return the result as JSON values."""
-        return asdict(self)
+    cost: MapCost
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> TrialResult:
-        """Return the result of as_json's values. Raises InvalidInputError for other content."""
-        try:
-            scores = {name: _stored_scores(stored[name]) for name in ("scores", "fitted", "region_fitted")}
-            return cls(**{**stored, **scores})
-        except (TypeError, KeyError) as error:
-            raise InvalidInputError(f"cached trial: expected the fields of a result, got {error}") from None
-
-
-def _stored_scores(stored: dict[str, Any] | None) -> MapScores | None:
-    return None if stored is None else MapScores(**stored)
-
-
-ViewImages = dict[int, UInt8[ndarray, "h w 3"]]
-"""Renderings of a map by the position of the held-out view."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrialMap:
-    """A trial's map at the end of its mission. ms_per_frame: perception and mapping."""
-
-    gaussians: Gaussians
-    map_bytes: int
-    iterations_mean: float
-    ms_per_frame: float
+        """Return the result of `asdict`'s values. Raises TypeError, KeyError for other content."""
+        fitted = None if stored["fitted"] is None else MapScores(**stored["fitted"])
+        return cls(MapScores(**stored["scores"]), fitted, stored["roi_share"], MapCost(**stored["cost"]))
 
 
 def message_bytes(gaussians: Gaussians, grid: VoxelGrid) -> int:
@@ -202,73 +176,29 @@ def message_bytes(gaussians: Gaussians, grid: VoxelGrid) -> int:
     return sum(len(encode_subset(RoiSubset("agent", "", 1, 1, part), grid)) for part in parts)
 
 
-def build_map(trial: Trial, scene: Scene, on_frame: Callable[[int], None]) -> TrialMap:
-    """Return the map of the scene; on_frame gets the number of Gaussians after each frame. Raises GaussLiteError."""
+def build_map(trial: Trial, scene: Scene) -> tuple[Gaussians, MapCost]:
+    """Return the map of the scene at the end of its mission, and its cost. Raises GaussLiteError."""
     settings = trial.mission
-    estimator = _build_estimator(trial, scene)
-    loop = TaskMapper(
-        estimator,
-        build_mapper(settings),
-        scheduler=FrameScheduler(settings.scheduler_settings, clock_for(settings.threads)),
-    )
+    # without a task if the policy ignores it, as ROI flags would affect eviction
+    estimator = RecordedRelevanceEstimator(scene) if trial.follows_task else NoTaskEstimator()
+    # CPU time with one thread, as other programs affect it less
+    clock = time.process_time if settings.threads == 1 else time.perf_counter
+    scheduler = FrameScheduler(settings.scheduler_settings, clock)
+    loop = TaskMapper(estimator, build_mapper(settings), scheduler=scheduler)
     outcomes: list[FrameOutcome] = []
-
-    def record(outcome: FrameOutcome) -> None:
-        outcomes.append(outcome)
-        on_frame(outcome.gaussians)
-
-    MissionRunner(loop.process, record).run(scene.training).raise_if_stopped()
+    MissionRunner(loop.process, outcomes.append).run(scene.training).raise_if_stopped()
     gaussians = loop.gaussians()
-    return TrialMap(
-        gaussians=gaussians,
-        map_bytes=message_bytes(gaussians, VoxelGrid()),
-        iterations_mean=fmean(outcome.iterations for outcome in outcomes),
-        ms_per_frame=1e3 * fmean(outcome.timing.seconds for outcome in outcomes),
-    )
+    iterations, seconds = zip(*((outcome.iterations, outcome.timing.seconds) for outcome in outcomes), strict=True)
+    size = message_bytes(gaussians, VoxelGrid())
+    return gaussians, MapCost(len(gaussians), size, fmean(iterations), 1e3 * fmean(seconds))
 
 
-def evaluate_map(
-    trial_map: TrialMap, trial: Trial, scene: Scene, lpips: Lpips | None
-) -> tuple[TrialResult, ViewImages]:
-    """Return the map's scores on the held-out views, and its renderings for the sheets. Raises GaussLiteError."""
-    viewer = MapViewer(trial_map.gaussians, choose_rasterizer(threads=trial.conditions.threads))
-    shown = largest_roi_views(scene.held_out, SHEET_VIEWS)
-    scores, fitted, region_fitted, images = [], [], [], {}
-    for i, view in enumerate(scene.held_out):
-        rendering = viewer.render_frame(view.frame)
-        scores.append(score_view(rendering, view, lpips))
-        if trial.plan.pose_policy.fit_views:
-            fitted.append(score_view(render_fitted(viewer, view.frame), view, lpips))
-            if view.shows_region:
-                region_fitted.append(score_view(render_fitted_at_region(viewer, view), view, lpips))
-        if i in shown:
-            images[i] = to_uint8(rendering.rgb)
-    result = TrialResult(
-        scores=average(scores),
-        fitted=average(fitted) if fitted else None,
-        roi_share=scene.roi_share,
-        gaussians=len(trial_map.gaussians),
-        map_bytes=trial_map.map_bytes,
-        iterations_mean=trial_map.iterations_mean,
-        ms_per_frame=trial_map.ms_per_frame,
-        region_fitted=average(region_fitted) if region_fitted else None,
-    )
-    return result, images
-
-
-def clock_for(threads: int | None) -> Clock:
-    """Return the clock for frame times: CPU time with one thread, as other programs affect it less."""
-    return time.process_time if threads == 1 else time.perf_counter
-
-
-def _build_estimator(trial: Trial, scene: Scene) -> RelevanceEstimator:
-    """Return the trial's estimator; without task if the policy ignores it, as ROI flags would affect eviction."""
-    if not trial.follows_task:
-        return NoTaskEstimator()
-    if not trial.conditions.perception.from_text:
-        return RecordedRelevanceEstimator(scene)
-    from gausslite_language.rules import RuleParser
-
-    return EstimatorFactory(trial.conditions.perception.detector, lambda: scene.info).build(
-        RuleParser().parse(scene.task)
-    )
+def evaluate_map(built: tuple[Gaussians, MapCost], trial: Trial, scene: Scene, lpips: Lpips | None) -> TrialResult:
+    """Return the map's scores on the held-out views. Raises GaussLiteError."""
+    gaussians, cost = built
+    viewer = MapViewer(gaussians, choose_rasterizer(threads=trial.conditions.threads))
+    scores = average([score_view(viewer.render_frame(view.frame), view, lpips) for view in scene.held_out])
+    fitted = None
+    if trial.plan.pose_prior.has_pose_error:
+        fitted = average([score_view(render_fitted(viewer, view.frame), view, lpips) for view in scene.held_out])
+    return TrialResult(scores, fitted, scene.roi_share, cost)

@@ -1,198 +1,144 @@
-"""Times of the CPU rasterizer's operations and stages, optionally interleaved with an external rasterizer."""
+"""Times of a rasterizer's operations, as the mapper calls them: a training step, the image, its gradients."""
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from gausslite.domain.errors import InvalidInputError
+from gausslite.config.option import option
 from gausslite.mapping.splat_table import SplatTable
-from gausslite.render.cpu import CpuRasterizer, core_clock_ghz
-from gausslite.render.rasterizer import Rendering
-from gausslite_bench.raster.block_cost import BlockCost
-from gausslite_bench.raster.external_rasterizer import ExternalRasterizer
-from gausslite_bench.raster.motion_costs import MotionCost, motion_costs
+from gausslite.render.choose import choose_rasterizer
+from gausslite.render.cpu import CpuRasterizer, usable_simd
+from gausslite.render.rasterizer import FULL_FRAME, TILE_PX, AdamSettings, LossWeights, Rasterizer, Subset
+from gausslite_bench.cli.study_options import read_image_size
 from gausslite_bench.raster.procedural_room import BenchView, held_out_view, seed_rows
-from gausslite_bench.raster.region_costs import RegionCost, region_costs
-from gausslite_bench.raster.repeated_step import LOSSES, RUNS_PER_BATCH, Duration, RepeatedStep, measure_seconds
+from gausslite_bench.report import Report
 
-SIZES = ((320, 240), (640, 480))
-GAUSSIANS = (20_000, 100_000, 300_000)
-OPERATIONS = (*LOSSES, "forward", "backward")
-_PAUSE_S = 0.02
+_LOSSES = {
+    "fused_l1": LossWeights(colour=0.8, depth=1.0, ssim=0.0),
+    "fused_l1_ssim": LossWeights(colour=0.8, depth=1.0, ssim=0.2),
+}
+"""Losses of the two kinds of iteration; with L1 only, forward, loss and backward are one pass."""
+_STILL = AdamSettings(means=0.0, log_scales=0.0, quats=0.0, opacity_logits=0.0, rgb=0.0)
+"""Adam runs in full but changes no parameter, so that every run does the same work."""
+_REGION_SHARE = 0.2
+_RUNS_PER_BATCH = 10
+"""Consecutive runs of one operation before the next operation: other load on the machine then affects all alike."""
+_WARM_UP = 3
 
 
-@dataclass(frozen=True, slots=True)
-class RasterTiming:
-    """Times of one case: whole calls, as the mapper makes them.
-
-    stages_ms: minimum time of each stage of each fused step. blocks: cost of the fused step with L1. external: times
-    of the external library, empty without one. motions: costs of steps with a moving camera. regions: costs of steps
-    masked to a region, empty without shares.
-    """
-
-    gaussians: int
-    width: int
-    height: int
-    threads: int
-    simd: str
-    durations: Mapping[str, Duration]
-    stages_ms: Mapping[str, Mapping[str, float]]
-    blocks: BlockCost
-    motions: Sequence[MotionCost]
-    external: Mapping[str, Duration] = field(default_factory=dict)
-    regions: Sequence[RegionCost] = ()
-
-    def summary(self) -> dict[str, object]:
-        """Return the case and the minimum time of each operation as one flat JSON object."""
-        minima = {f"{name}_ms_min": self.durations[name].min_ms for name in OPERATIONS}
-        return {**self._case(), **minima}
-
-    def details(self) -> dict[str, object]:
-        """Return all measurements as nested JSON objects."""
-        return {
-            **self._case(),
-            "operations": {name: asdict(duration) for name, duration in self.durations.items()},
-            "stages_ms_min": {name: dict(stages) for name, stages in self.stages_ms.items()},
-            "blocks": asdict(self.blocks),
-            "external": {name: asdict(duration) for name, duration in self.external.items()},
-            "motions": [{**asdict(cost), "ratio": cost.ratio} for cost in self.motions],
-            "regions": [{**asdict(cost), "ratio": cost.ratio} for cost in self.regions],
-        }
-
-    def _case(self) -> dict[str, object]:
-        return {name: getattr(self, name) for name in ("gaussians", "width", "height", "threads", "simd")}
+def read_image_sizes(texts: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
+    """Return the sizes of "WxH". Raises InvalidInputError."""
+    return tuple(map(read_image_size, texts))
 
 
 @dataclass(frozen=True, slots=True)
-class RasterBench:
-    """Measures every image size with every number of Gaussians and every instruction set (None: the fastest).
+class RasterSettings:
+    """The options of `bench raster`: every image size with every number of Gaussians and every instruction set."""
 
-    repetitions: timed runs of each operation. threads: None means one per available core. shares_percent: shares of
-    the image for additional measurements of masked steps.
-    """
-
-    sizes: Sequence[tuple[int, int]] = SIZES
-    gaussians: Sequence[int] = GAUSSIANS
-    simd: Sequence[str | None] = (None,)
-    threads: int | None = None
-    repetitions: int = 60
-    external_library: Path | None = None
-    shares_percent: Sequence[float] = ()
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.repetitions <= 100_000:
-            raise InvalidInputError(f"repetitions: expected 1 to 100000, got {self.repetitions}")
-
-    def run(self) -> Iterator[RasterTiming]:
-        """Yield the times of each case. Raises KernelError, InvalidInputError."""
-        for width_px, height_px in self.sizes:
-            view = held_out_view(width_px, height_px)
-            for count in self.gaussians:
-                for simd in self.simd:
-                    yield self._measure(CpuRasterizer(self.threads, simd), _table(count), view)
-
-    def _measure(self, rasterizer: CpuRasterizer, table: SplatTable, view: BenchView) -> RasterTiming:
-        own = _OwnOperations(rasterizer, table, view)
-        contenders: list[_OwnOperations | ExternalRasterizer] = [own]
-        if self.external_library is not None:
-            contenders.append(ExternalRasterizer(self.external_library, rasterizer.threads, _table(table.count), view))
-        seconds, clock_ghz = _measure_interleaved(contenders, self.repetitions)
-        durations = [{name: Duration.of(times) for name, times in second.items()} for second in seconds]
-        blocks = BlockCost.of(own.evaluations, clock_ghz, rasterizer.threads, own.stages_ms["fused_l1"])
-        return RasterTiming(
-            gaussians=table.count,
-            width=view.camera.width_px,
-            height=view.camera.height_px,
-            threads=rasterizer.threads,
-            simd=rasterizer.simd,
-            durations=durations[0],
-            stages_ms=own.stages_ms,
-            blocks=blocks,
-            motions=motion_costs(rasterizer, table, view, self.repetitions),
-            external=durations[1] if self.external_library is not None else {},
-            regions=region_costs(rasterizer, table, view, self.shares_percent, self.repetitions),
-        )
+    sizes: tuple[tuple[int, int], ...] = option(
+        ((320, 240), (640, 480)),
+        "image sizes (default: 320x240,640x480)",
+        metavar="WxH,...",
+        plain_type=tuple[str, ...],
+        convert=read_image_sizes,
+    )
+    gaussians: tuple[int, ...] = option((20_000, 100_000, 300_000), "numbers of Gaussians", metavar="N,...")
+    threads: int | None = option(None, "threads (default: all available cores)", low=1)
+    simd: str | None = option(None, "instruction set, or all (default: the fastest supported one)", metavar="NAME")
+    reps: int = option(60, "timed runs of each operation", low=1, high=100_000)
 
 
-class _OwnOperations:
-    """Operations of GaussLite's CPU rasterizer on one case; stores the minimum time of every stage."""
+@dataclass(frozen=True, slots=True)
+class GpuSettings:
+    """The options of `bench gpu`."""
 
-    def __init__(self, rasterizer: CpuRasterizer, table: SplatTable, view: BenchView) -> None:
-        self.stages_ms: dict[str, dict[str, float]] = {}
-        self.evaluations = 0
-        self._rasterizer = rasterizer
-        self._table = table
-        self._view = view
-        self._train = RepeatedStep(rasterizer, table, view)
-        self._rendering: Rendering = self._render()
-        self._d_rgb = np.full(view.rgb.shape, 1e-5, np.float32)
-        self._d_depth_m = np.full(view.depth_m.shape, 1e-5, np.float32)
-        self._d_alpha = np.zeros(view.depth_m.shape, np.float32)
-
-    def active(self) -> AbstractContextManager[None]:
-        """Bind the table to the rasterizer during the measurement."""
-        return self._train.bind_tables()
-
-    def fused_l1(self) -> None:
-        """Run one whole iteration with L1 on colour and depth."""
-        self._step("fused_l1")
-
-    def fused_l1_ssim(self) -> None:
-        """Run one whole iteration with L1 and SSIM."""
-        self._step("fused_l1_ssim")
-
-    def forward(self) -> None:
-        """Render the image."""
-        self._rendering = self._render()
-
-    def backward(self) -> None:
-        """Compute the gradients of the rows from those of the image; call `forward` first."""
-        self._rasterizer.backward(self._rendering, self._d_rgb, self._d_depth_m, self._d_alpha)
-
-    def _render(self) -> Rendering:
-        return self._rasterizer.forward(self._table.rows, self._view.camera, self._view.T_camera_world)
-
-    def _step(self, name: str) -> None:
-        self._train(LOSSES[name])
-        self.evaluations = self._rasterizer.block_evaluations()
-        minima = self.stages_ms.setdefault(name, {})
-        for stage, ms in self._rasterizer.stage_times_ms().items():
-            minima[stage] = min(ms, minima.get(stage, ms))
+    gaussians: tuple[int, ...] = option(
+        (100_000, 300_000, 1_000_000, 3_000_000), "numbers of Gaussians", metavar="N,..."
+    )
+    reps: int = option(100, "timed runs of each operation", low=1, high=100_000)
 
 
-def _table(count: int) -> SplatTable:
+def run_raster(settings: RasterSettings) -> Report:
+    """Measure every case on the CPU. Raises KernelError, InvalidInputError."""
+    sets = usable_simd() if settings.simd == "all" else (settings.simd,)
+    cases: list[dict[str, object]] = []
+    for size in settings.sizes:
+        for simd in sets:
+            rasterizer = CpuRasterizer(settings.threads, simd)
+            machine = {"simd": rasterizer.simd, "threads": rasterizer.threads}
+            cases += [{**machine, **case} for case in _cases(rasterizer, size, settings.gaussians, settings.reps)]
+    return Report({"cases": cases})
+
+
+def run_gpu(settings: GpuSettings) -> Report:
+    """Measure this machine's GPU. Raises KernelError without a usable one."""
+    rasterizer = choose_rasterizer("cuda")
+    return Report(
+        {"backend": rasterizer.name, "cases": _cases(rasterizer, (640, 480), settings.gaussians, settings.reps)}
+    )
+
+
+def _cases(rasterizer: Rasterizer, size: tuple[int, int], counts: Sequence[int], reps: int) -> list[dict[str, object]]:
+    view = held_out_view(*size)
+    return [
+        {"gaussians": count, "size": list(size), "operations": operation_times(rasterizer, count, view, reps)}
+        for count in counts
+    ]
+
+
+def operation_times(
+    rasterizer: Rasterizer, count: int, view: BenchView, repetitions: int
+) -> dict[str, dict[str, float]]:
+    """Return the minimum and the median of each operation in milliseconds; region: a step on a fifth of the image."""
     table = SplatTable(count)
     table.append_rows(
         seed_rows(count), np.zeros(count, np.bool_), np.zeros(count, np.uint32), np.full(count, -1, np.int16)
     )
-    return table
+    operations = _operations(rasterizer, table, view)
+    seconds: dict[str, list[float]] = {name: [] for name in operations}
+    with rasterizer.bind_tables(table.rows, table.first_moment, table.second_moment):
+        for done in range(0, repetitions, _RUNS_PER_BATCH):
+            for name, operation in operations.items():
+                seconds[name] += _measure_seconds(operation, min(_RUNS_PER_BATCH, repetitions - done))
+    return {
+        name: {"min_ms": 1e3 * min(times), "median_ms": 1e3 * float(np.median(times))}
+        for name, times in seconds.items()
+    }
 
 
-def _measure_interleaved(
-    contenders: Sequence[_OwnOperations | ExternalRasterizer], repetitions: int
-) -> tuple[list[dict[str, list[float]]], float]:
-    """Return the seconds of each run of each contender's operations, and the highest core clock in GHz.
+def _operations(rasterizer: Rasterizer, table: SplatTable, view: BenchView) -> dict[str, Callable[[], object]]:
+    height, width = view.depth_m.shape
+    tiles = np.zeros((-(-height // TILE_PX), -(-width // TILE_PX)), np.bool_)
+    top, left = (round((1.0 - _REGION_SHARE**0.5) / 2.0 * count) for count in tiles.shape)
+    tiles[top : len(tiles) - top, left : tiles.shape[1] - left] = True
+    pixels = tiles.repeat(TILE_PX, 0).repeat(TILE_PX, 1)[:height, :width].astype(np.float32)
+    prepared = rasterizer.prepare_view(view.rgb, view.depth_m, view.camera, pixels)
+    step = functools.partial(
+        rasterizer.step,
+        *(table.rows, table.first_moment, table.second_moment, prepared, view.T_camera_world),
+        adam=_STILL,
+    )
+    d_rgb, d_depth_m = (np.full(image.shape, 1e-5, np.float32) for image in (view.rgb, view.depth_m))
+    forward = functools.partial(rasterizer.forward, table.rows, view.camera, view.T_camera_world)
+    return {
+        **{name: functools.partial(step, loss=loss, subset=FULL_FRAME) for name, loss in _LOSSES.items()},
+        "region": functools.partial(step, loss=_LOSSES["fused_l1_ssim"], masked=True, subset=Subset(tiles=tiles)),
+        "forward": forward,
+        "forward_backward": lambda: rasterizer.backward(forward(), d_rgb, d_depth_m, np.zeros_like(view.depth_m)),
+    }
 
-    The contenders alternate in batches, so that other load on the machine affects all of them.
-    """
-    seconds: list[dict[str, list[float]]] = [{name: [] for name in OPERATIONS} for _ in contenders]
-    clock_ghz = 0.0
-    for done in range(0, repetitions, RUNS_PER_BATCH):
-        runs = min(RUNS_PER_BATCH, repetitions - done)
-        for contender, times in zip(contenders, seconds, strict=True):
-            # idle threads of the previous contender may still spin on the cores
-            time.sleep(_PAUSE_S)
-            with contender.active():
-                for fused in LOSSES:
-                    times[fused] += measure_seconds([getattr(contender, fused)], runs)[0]
-                clock_ghz = max(clock_ghz, core_clock_ghz())
-                forward, backward = measure_seconds([contender.forward, contender.backward], runs)
-            times["forward"] += forward
-            times["backward"] += backward
-    return seconds, clock_ghz
+
+def _measure_seconds(operation: Callable[[], object], repetitions: int) -> list[float]:
+    """Return the seconds of each run after the warm-up."""
+    seconds = []
+    for i in range(_WARM_UP + repetitions):
+        started_s = time.perf_counter()
+        operation()
+        if i >= _WARM_UP:
+            seconds.append(time.perf_counter() - started_s)
+    return seconds

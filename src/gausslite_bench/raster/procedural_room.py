@@ -1,7 +1,6 @@
-"""Procedural room for rasterizer benchmarks, ray-traced analytically from textured boxes and balls.
+"""Procedural room for rasterizer benchmarks, ray-traced analytically from textured boxes.
 
-The room measures 4.8 x 4.2 x 2.6 m, with a table, objects on it and furniture. Twelve cameras on a ring look at the
-table and provide the seeds. A thirteenth camera between two of them is the view that is timed.
+Twelve cameras on a ring look at a table and provide the seeds. A camera between two of them is the view that is timed.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ _FOCAL_PER_WIDTH = 0.82
 _NEIGHBOURS = 5
 _SCALE_PER_SPACING = 0.6
 _SCALE_BOUNDS_M = (1e-4, 0.2)
-_LIGHT = np.array([0.36, 0.28, 0.89])
 
 _ROOM = ((-2.4, -2.1, 0.0), (2.4, 2.1, 2.6))
 _ROOM_COLOUR = (0.74, 0.70, 0.63)
@@ -39,12 +37,6 @@ _BOXES = (
     ((-2.40, 1.20, 0.00), (-1.60, 2.10, 1.20), (0.47, 0.58, 0.42)),
     ((1.40, -2.10, 0.00), (2.30, -1.65, 1.75), (0.60, 0.51, 0.36)),
     ((1.55, 1.05, 0.00), (2.20, 1.70, 0.48), (0.72, 0.68, 0.34)),
-)
-_BALLS = (
-    ((0.02, -0.14, 0.87), 0.14, (0.88, 0.74, 0.24)),
-    ((0.42, -0.24, 0.82), 0.09, (0.32, 0.76, 0.42)),
-    ((-1.35, -1.25, 0.34), 0.34, (0.66, 0.32, 0.68)),
-    ((-0.12, 0.24, 0.80), 0.07, (0.92, 0.92, 0.94)),
 )
 
 
@@ -131,15 +123,13 @@ def _trace(
     rays = lift(pixels_px, np.ones(len(pixels_px)), camera) @ T_world_camera[:3, :3].T
     eye = T_world_camera[:3, 3]
     depth_m, shape = _first_hit(eye, rays)
-    p_world = eye + rays * depth_m[:, None]
-    shade = 0.65 + 0.35 * np.abs(_normals(p_world, shape) @ _LIGHT)
-    return np.clip(_texture(p_world, shape) * shade[:, None], 0.0, 1.0), depth_m
+    return _texture(eye + rays * depth_m[:, None], shape), depth_m
 
 
 def _first_hit(
     eye: Float64[ndarray, "3"], rays: Float64[ndarray, "n 3"]
 ) -> tuple[Float64[ndarray, " n"], Int64[ndarray, " n"]]:
-    """Return each ray's first hit: the ray parameter and the shape (0 the room, then boxes, then balls)."""
+    """Return each ray's first hit: the ray parameter and the shape (0 the room, then boxes)."""
     with np.errstate(divide="ignore"):
         inverse_rays = 1.0 / rays
     _, nearest = _through_box(eye, inverse_rays, *_ROOM)
@@ -148,14 +138,6 @@ def _first_hit(
         enters, leaves = _through_box(eye, inverse_rays, low, high)
         hit = (enters < leaves) & (enters > 0.0) & (enters < nearest)
         nearest[hit], shape[hit] = enters[hit], 1 + i
-    squared = (rays * rays).sum(axis=1)
-    for i, (centre, radius_m, _) in enumerate(_BALLS):
-        to_eye = eye - np.array(centre)
-        half_b = rays @ to_eye
-        discriminant = half_b * half_b - squared * (to_eye @ to_eye - radius_m**2)
-        distance = (-half_b - np.sqrt(np.maximum(discriminant, 0.0))) / squared
-        hit = (discriminant > 0.0) & (distance > 0.0) & (distance < nearest)
-        nearest[hit], shape[hit] = distance[hit], 1 + len(_BOXES) + i
     return nearest, shape
 
 
@@ -170,29 +152,14 @@ def _through_box(
     return np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
 
 
-def _normals(p_world: Float64[ndarray, "n 3"], shape: Int64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
-    """Return unit normals, up to sign."""
-    normals = np.zeros_like(p_world)
-    for i, (low, high) in enumerate((_ROOM, *((low, high) for low, high, _ in _BOXES))):
-        hits = np.flatnonzero(shape == i)
-        centre, half = (np.array(low) + high) / 2, (np.array(high) - low) / 2
-        normals[hits, np.argmax(np.abs((p_world[hits] - centre) / half), axis=1)] = 1.0
-    for i, (ball_centre, radius_m, _) in enumerate(_BALLS):
-        hits = np.flatnonzero(shape == 1 + len(_BOXES) + i)
-        normals[hits] = (p_world[hits] - ball_centre) / radius_m
-    return normals
-
-
 def _texture(p_world: Float64[ndarray, "n 3"], shape: Int64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
     """Return each shape's colour modulated by waves of 2 to 30 per metre and by coarse squares."""
-    colours = np.array([_ROOM_COLOUR, *(c for _, _, c in _BOXES), *(c for _, _, c in _BALLS)])
+    colours = np.array([_ROOM_COLOUR, *(c for _, _, c in _BOXES)])
     rng = np.random.default_rng(1)
     waves = np.zeros(len(p_world))
     for per_metre, strength in ((2.0, 0.16), (5.0, 0.13), (12.0, 0.10), (30.0, 0.07)):
-        direction, bend = rng.normal(size=(2, 3))
-        phase = 2.0 * np.pi * per_metre * (p_world @ (direction / np.linalg.norm(direction)))
-        waves += strength * np.sin(phase + 2.0 * np.sin(1.3 * per_metre * (p_world @ bend)))
+        waves += strength * np.sin(2.0 * np.pi * per_metre * (p_world @ rng.normal(size=3)))
     # offset from the walls, where rounding would decide the result of floor
     squares = np.floor(4.0 * p_world + 0.37).sum(axis=1) % 2.0
-    textured: Float64[ndarray, "n 3"] = colours[shape] * (0.85 + waves + 0.2 * squares)[:, None]
+    textured: Float64[ndarray, "n 3"] = np.clip(colours[shape] * (0.7 + waves + 0.2 * squares)[:, None], 0.0, 1.0)
     return textured

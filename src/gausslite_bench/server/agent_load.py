@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextlib import AsyncExitStack
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,7 @@ _SETTLE_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class LoadResult:
-    """Acknowledgement times of one load, the longest beside; missing: messages that were not acknowledged.
+    """Acknowledgement times of one load; missing: messages that were not acknowledged.
 
     refused: reports of objects and keyframes that the server did not store.
     server_cpu_ms: processor time of the server per message, which other programs on the machine hardly change.
@@ -39,35 +38,25 @@ class LoadResult:
     p50_ms: float
     p99_ms: float
     missing: int
-    longest_ms: float
-    refused: int = 0
+    refused: int
     server_cpu_ms: float = float("nan")
 
 
 class AgentLoad:
-    """Joins agents and sends their messages. Sequence numbers continue from one load to the next.
+    """Joins agents and sends their messages. Sequence numbers continue from one load to the next."""
 
-    With several addresses, the agents are connected to one after the other.
-    """
-
-    def __init__(self, *addresses: str) -> None:
-        self._addresses = addresses
+    def __init__(self, address: str) -> None:
+        self._address = address
         self._next_seq = 1
-
-    def at(self, *addresses: str) -> AgentLoad:
-        """Return the load that continues at these servers."""
-        load = AgentLoad(*addresses)
-        load._next_seq = self._next_seq
-        return load
 
     def fill(self, gaussians: int, gaussians_per_voxel: int) -> None:
         """Store this many Gaussians, from the first _FILL_AGENTS agents of the loads: a team holds its own map."""
         voxels = gaussians // gaussians_per_voxel // _FILL_AGENTS
         if not voxels:
             return
-        with FusionClient(self._addresses[0], deadline_s=600.0, token=_TOKEN) as client:
+        with FusionClient(self._address, deadline_s=600.0, token=_TOKEN) as client:
             for number in range(_FILL_AGENTS):
-                agent_id = _name(number)
+                agent_id = f"load-{number}"
                 session_id = client.join(agent_id, GRID).session_id
                 messages = list(fill_messages(agent_id, 200_000 + number * voxels, voxels))
                 asyncio.run(self._send_all(session_id, messages))
@@ -76,18 +65,18 @@ class AgentLoad:
     def run(self, agents: int, seconds: float) -> LoadResult:
         """Send updates, objects and keyframes from these agents."""
         count = max(int(seconds * RATE_HZ), 1)
-        names = [_name(number) for number in range(agents)]
-        with FusionClient(self._addresses[0], deadline_s=60.0, token=_TOKEN) as client:
+        names = [f"load-{number}" for number in range(agents)]
+        with FusionClient(self._address, deadline_s=60.0, token=_TOKEN) as client:
             sessions = [client.join(name, GRID).session_id for name in names]
         messages = [delta_messages(name, number, count, self._next_seq) for number, name in enumerate(names)]
         self._next_seq += count
         times_s, refused = asyncio.run(self._send(sessions, messages))
-        p50, p99, longest = np.percentile(times_s or [np.inf], [50, 99, 100]) * 1000
+        p50, p99 = np.percentile(times_s or [np.inf], [50, 99]) * 1000
         total = agents * count
-        return LoadResult(agents, total, float(p50), float(p99), total - len(times_s), float(longest), refused=refused)
+        return LoadResult(agents, total, float(p50), float(p99), total - len(times_s), refused)
 
     async def _send_all(self, session_id: str, messages: Sequence[bytes]) -> None:
-        async with UpdateStreams(self._addresses[0]) as streams:
+        async with UpdateStreams(self._address) as streams:
             stream = streams.open(session_id)
             for data in messages:
                 await stream.send(data)
@@ -95,21 +84,15 @@ class AgentLoad:
 
     async def _send(self, sessions: Sequence[str], messages: Sequence[Sequence[bytes]]) -> tuple[list[float], int]:
         times_s: list[float] = []
-        async with AsyncExitStack() as stack:
-            connected = {
-                address: await stack.enter_async_context(UpdateStreams(address)) for address in self._addresses
-            }
-            servers = list(connected.values())
+        async with UpdateStreams(self._address) as streams:
             begin_s = time.monotonic() + 0.5
             begins_s = [begin_s + number / len(sessions) / RATE_HZ for number in range(len(sessions))]
             tasks = [
-                asyncio.ensure_future(
-                    _send_agent(connected, servers[number % len(servers)].open(session), own, own_begin_s, times_s)
-                )
-                for number, (session, own, own_begin_s) in enumerate(zip(sessions, messages, begins_s, strict=True))
+                asyncio.ensure_future(_send_agent(streams.open(session), own, own_begin_s, times_s))
+                for session, own, own_begin_s in zip(sessions, messages, begins_s, strict=True)
             ]
             refused: list[str] = []
-            others = [asyncio.ensure_future(_send_others(servers[0], sessions, begin_s, refused))]
+            others = [asyncio.ensure_future(_send_others(streams, sessions, begin_s, refused))]
             duration_s = len(messages[0]) / RATE_HZ
             _, late = await asyncio.wait(tasks, timeout=duration_s + _SETTLE_S)
             for task in (*late, *others):
@@ -118,29 +101,13 @@ class AgentLoad:
         return times_s, len(refused)
 
 
-def _name(number: int) -> str:
-    return f"load-{number}"
-
-
-async def _send_agent(
-    servers: Mapping[str, UpdateStreams],
-    stream: UpdateStream,
-    messages: Sequence[bytes],
-    begin_s: float,
-    times_s: list[float],
-) -> None:
-    """Send one message each period; a time counts from when the message was due, also if the one before was late.
-
-    As FusionClient does, an agent goes to the server that owns what it sends.
-    """
+async def _send_agent(stream: UpdateStream, messages: Sequence[bytes], begin_s: float, times_s: list[float]) -> None:
+    """Send one message each period; a time counts from when the message was due, also if the one before was late."""
     for index, data in enumerate(messages):
         due_s = begin_s + index / RATE_HZ
         await asyncio.sleep(max(0.0, due_s - time.monotonic()))
         await stream.send(data)
         times_s.append(time.monotonic() - due_s)
-        if stream.owner in servers:
-            await stream.close()
-            stream = servers[stream.owner].open(stream.session_id)
     await stream.close()
 
 

@@ -2,73 +2,85 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
 
-from gausslite.domain.errors import GaussLiteError
+from gausslite.cli.progress import progress_bar
+from gausslite.config.option import option
+from gausslite.domain.errors import InvalidInputError
 from gausslite.wire.clients import FusionClient
+from gausslite_bench.report import Report
 from gausslite_bench.server.agent_load import AgentLoad, LoadResult
-from gausslite_bench.server.server_process import ServerProcess
+from gausslite_bench.server.hostile import ATTACKS, measure_attack
 from gausslite_bench.server.synthetic_updates import GAUSSIANS_PER_VOXEL
+from gausslite_bench.service_process import FUSION_SERVER, ServiceProcess
 
-P99_LIMIT_MS = 100.0
+_P99_LIMIT_MS = 100.0
 _STATUS_CALLS = 5
-_WATCH_PAUSE_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class ServerBenchSettings:
-    """What to measure; command: starts the server. watchers: number that stop reading after the first block."""
+    """The options of `bench server`."""
 
-    held: Sequence[int]
-    agents: Sequence[int]
-    seconds: float
-    command: str
-    store: str
-    watchers: int
+    held: tuple[int, ...] = option((0, 1_000_000), "Gaussians that the server holds", metavar="N,N")
+    agents: tuple[int, ...] = option(
+        (8, 16, 32, 64), "agents that send updates at 4 Hz, and objects and keyframes as real agents do", metavar="N,N"
+    )
+    seconds: float = option(10.0, "duration of each load", low=0.1)
+    server: str = option(FUSION_SERVER, "starts the server (default: with its default options)", metavar="COMMAND")
+    hostile: tuple[str, ...] = option(
+        (),
+        f"only measure 4 agents under these attacks, each on a new server: all, or some of {', '.join(ATTACKS)}",
+        metavar="A,B",
+    )
 
-
-@dataclass(frozen=True, slots=True)
-class StoredSizeResult:
-    """The figures of a server that holds this many Gaussians."""
-
-    held: int
-    loads: tuple[LoadResult, ...]
-    fill_s: float
-    snapshot_s: float
-    status_ms: float
-    restart_s: float
-    rss_mib: float
-    watchers_mib: float
-
-    @property
-    def largest_team(self) -> int:
-        """The largest number of agents before the first with a p99 over the limit or a missing acknowledgement."""
-        largest = 0
-        for load in self.loads:
-            if load.p99_ms > P99_LIMIT_MS or load.missing:
-                break
-            largest = load.agents
-        return largest
+    def __post_init__(self) -> None:
+        for name, counts, least in (("held", self.held, 0), ("agents", self.agents, 1)):
+            if not counts or min(counts) < least:
+                raise InvalidInputError(f"--{name}: expected numbers of at least {least}, got {counts}")
+        unknown = set(self.hostile) - {*ATTACKS, "all"}
+        if unknown:
+            raise InvalidInputError(f"--hostile: expected all, or some of {', '.join(ATTACKS)}, got {min(unknown)!r}")
 
 
-def measure(settings: ServerBenchSettings, held: int, on_progress: Callable[[str], None]) -> StoredSizeResult:
-    """Fill a new server and measure it. `on_progress` receives a description of each step."""
-    with tempfile.TemporaryDirectory() as folder:
-        server = ServerProcess(settings.command, Path(folder), settings.store)
-        with closing(server):
-            return _measure(settings, held, server, on_progress)
+def run_server(settings: ServerBenchSettings) -> Report:
+    """Measure a server for each number of Gaussians held, or for each attack."""
+    if settings.hostile:
+        names = list(ATTACKS) if "all" in settings.hostile else list(settings.hostile)
+        attacks = []
+        with progress_bar(len(names), "attacks", "attack") as progress:
+            for name in names:
+                with _new_server(settings) as server:
+                    attacks.append(measure_attack(name, server, settings.held[0], settings.seconds))
+                progress.update()
+        return Report({"server": settings.server, "held": settings.held[0], "attacks": attacks})
+    results = []
+    with progress_bar(len(settings.held), "server", "server") as progress:
+        for held in settings.held:
+            with _new_server(settings) as server:
+                results.append(_measure(settings, held, server, progress.set_description))
+            progress.update()
+    return Report({"server": settings.server, "servers": results})
+
+
+@contextmanager
+def _new_server(settings: ServerBenchSettings) -> Iterator[ServiceProcess]:
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        command = f"{settings.server} --store {folder}/store.sqlite"
+        yield stack.enter_context(closing(ServiceProcess(command, Path(folder))))
 
 
 def _measure(
-    settings: ServerBenchSettings, held: int, server: ServerProcess, on_progress: Callable[[str], None]
-) -> StoredSizeResult:
+    settings: ServerBenchSettings, held: int, server: ServiceProcess, on_progress: Callable[[str], None]
+) -> dict[str, object]:
     load = AgentLoad(server.address)
     on_progress(f"{held} Gaussians: fill")
     begin_s = time.monotonic()
@@ -81,20 +93,22 @@ def _measure(
         result = load.run(agents, settings.seconds)
         loads.append(replace(result, server_cpu_ms=1000 * (server.cpu_s() - cpu_s) / result.messages))
     on_progress(f"{held} Gaussians: snapshot, status, restart")
-    snapshot_s, status_ms = _snapshot_s(server.address), _status_ms(server.address)
-    rss_mib = server.rss_mib()
-    watchers_mib = _idle_watchers_mib(server, settings.watchers)
-    restart_s = server.restart()
-    return StoredSizeResult(
-        held=held,
-        loads=tuple(loads),
-        fill_s=fill_s,
-        snapshot_s=snapshot_s,
-        status_ms=status_ms,
-        restart_s=restart_s,
-        rss_mib=rss_mib,
-        watchers_mib=watchers_mib,
-    )
+    return {
+        "held": held,
+        "largest_team": _largest_team(loads),
+        "loads": [asdict(result) for result in loads],
+        "fill_s": fill_s,
+        "snapshot_s": _snapshot_s(server.address),
+        "status_ms": _status_ms(server.address),
+        "rss_mib": server.rss_mib(),
+        "restart_s": server.restart(),
+    }
+
+
+def _largest_team(loads: Sequence[LoadResult]) -> int:
+    """Return the largest number of agents before the first with a p99 over the limit or a missing acknowledgement."""
+    passed = itertools.takewhile(lambda load: load.p99_ms <= _P99_LIMIT_MS and not load.missing, loads)
+    return max((load.agents for load in passed), default=0)
 
 
 def _snapshot_s(address: str) -> float:
@@ -116,22 +130,3 @@ def _status_ms(address: str) -> float:
             client.status()
             times_s.append(time.monotonic() - begin_s)
         return 1000 * median(times_s)
-
-
-def _idle_watchers_mib(server: ServerProcess, watchers: int) -> float:
-    """Return how much memory of the server watchers take that stop reading after the first block."""
-    if not watchers:
-        return 0.0
-    before_mib = server.rss_mib()
-    clients = [FusionClient(server.address, deadline_s=600.0) for _ in range(watchers)]
-    try:
-        streams = [client.watch() for client in clients]
-        for stream in streams:
-            next(stream)
-        threading.Event().wait(_WATCH_PAUSE_S)
-        return server.rss_mib() - before_mib
-    except GaussLiteError:
-        return float("nan")
-    finally:
-        for client in clients:
-            client.close()

@@ -15,23 +15,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from contextlib import contextmanager
+from dataclasses import asdict
 
 import numpy as np
 
 from gausslite.codec.subset_codec import encode_subset
-from gausslite.domain.camera import Camera
 from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.voxels import RoiSubset
 from gausslite.wire.channel import require_serving
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import frame_to_message
 from gausslite_bench.async_calls import UpdateStreams
-from gausslite_bench.server.agent_load import AgentLoad, LoadResult
-from gausslite_bench.server.server_process import ServerProcess
+from gausslite_bench.server.agent_load import AgentLoad
 from gausslite_bench.server.synthetic_updates import (
     GAUSSIANS_PER_VOXEL,
     GRID,
@@ -40,6 +36,7 @@ from gausslite_bench.server.synthetic_updates import (
     tombstone_message,
     voxels_batch,
 )
+from gausslite_bench.service_process import ServiceProcess
 from gausslite_language.rules import RuleParser
 
 GOOD_AGENTS = 4
@@ -113,8 +110,7 @@ def _storm_of_queries(address: str) -> None:
 
 def _storm_of_views(address: str) -> None:
     frame = keyframe(0, 320, 240)
-    camera = Camera(256.0, 256.0, 160.0, 120.0, 320, 240)
-    _storm(address, lambda client, _: client.render(camera, frame.T_world_camera))
+    _storm(address, lambda client, _: client.render(frame.camera, frame.T_world_camera))
 
 
 def _large_keyframes(address: str) -> None:
@@ -178,48 +174,30 @@ ATTACKS: Mapping[str, tuple[str, Callable[[str], None]]] = {
 """What each attack does, and the function that does it without end."""
 
 
-@dataclass(frozen=True, slots=True)
-class AttackResult:
-    """The good agents' acknowledgements without and under an attack, and what the server says of itself.
+def measure_attack(attack: str, server: ServiceProcess, held: int, seconds: float) -> dict[str, object]:
+    """Fill a new server, and measure good agents without and under an attack, and what the server says of itself.
 
     rss_mib: memory before the attack, rss_growth_mib: its largest growth. unhealthy: share of the health checks that
     were not SERVING, slowest_health_ms: of their answers. log: lines that the server wrote.
     """
-
-    attack: str
-    quiet: LoadResult
-    attacked: LoadResult
-    rss_mib: float
-    rss_growth_mib: float
-    unhealthy: float
-    slowest_health_ms: float
-    log: tuple[str, ...]
-
-
-def measure_attack(attack: str, command: str, store: str, held: int, seconds: float) -> AttackResult:
-    """Start a server, fill it, and measure it without and under an attack."""
-    with TemporaryDirectory() as folder, closing(ServerProcess(command, Path(folder), store)) as server:
-        load = AgentLoad(server.address)
-        load.fill(held, GAUSSIANS_PER_VOXEL)
-        quiet = load.run(GOOD_AGENTS, seconds)
-        rss_mib, logged = server.rss_mib(), len(_lines(server.log))
-        with _watched(server) as samples, _attacking(attack, server.address):
-            attacked = load.run(GOOD_AGENTS, seconds)
-        lines = _lines(server.log)[logged:]
-    return AttackResult(
-        attack,
-        quiet,
-        attacked,
-        rss_mib=rss_mib,
-        rss_growth_mib=max(sample.rss_mib for sample in samples) - rss_mib,
-        unhealthy=sum(not sample.serving for sample in samples) / len(samples),
-        slowest_health_ms=1000 * max(sample.health_s for sample in samples),
-        log=tuple(lines),
-    )
-
-
-def _lines(log: Path) -> list[str]:
-    return log.read_text(errors="replace").splitlines()
+    load = AgentLoad(server.address)
+    load.fill(held, GAUSSIANS_PER_VOXEL)
+    quiet = load.run(GOOD_AGENTS, seconds)
+    rss_mib, logged = server.rss_mib(), len(server.log.read_bytes())
+    with _watched(server) as samples, _attacking(attack, server.address):
+        attacked = load.run(GOOD_AGENTS, seconds)
+    memory_mib, are_healthy, answers_s = zip(*samples, strict=True)
+    return {
+        "attack": attack,
+        "does": ATTACKS[attack][0],
+        "quiet": asdict(quiet),
+        "attacked": asdict(attacked),
+        "rss_mib": rss_mib,
+        "rss_growth_mib": max(memory_mib) - rss_mib,
+        "unhealthy": 1.0 - sum(are_healthy) / len(are_healthy),
+        "slowest_health_ms": 1000 * max(answers_s),
+        "log": server.log.read_bytes()[logged:].decode(errors="replace").splitlines(),
+    }
 
 
 @contextmanager
@@ -236,28 +214,19 @@ def _attacking(attack: str, address: str) -> Iterator[None]:
             process.kill()
 
 
-@dataclass(frozen=True, slots=True)
-class _Sample:
-    rss_mib: float
-    serving: bool
-    health_s: float
-
-
 @contextmanager
-def _watched(server: ServerProcess) -> Iterator[list[_Sample]]:
-    """Yield samples of the server's memory and health, as a supervisor sees them."""
-    samples: list[_Sample] = []
+def _watched(server: ServiceProcess) -> Iterator[list[tuple[float, bool, float]]]:
+    """Yield samples of the server's memory, its health, and the time of that answer, as a supervisor sees them."""
+    samples: list[tuple[float, bool, float]] = []
     ended = threading.Event()
 
     def watch() -> None:
         while not ended.wait(_SAMPLE_S) or not samples:
-            begin_s = time.monotonic()
-            try:
+            begin_s, is_serving = time.monotonic(), False
+            with contextlib.suppress(GaussLiteError):
                 require_serving(server.address, None)
-                serving = True
-            except GaussLiteError:
-                serving = False
-            samples.append(_Sample(server.rss_mib(), serving, time.monotonic() - begin_s))
+                is_serving = True
+            samples.append((server.rss_mib(), is_serving, time.monotonic() - begin_s))
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gausslite.codec.subset_codec import encode_subset, split_batch
@@ -32,10 +32,9 @@ _MAX_KEYFRAMES = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentMap:
-    """One agent's map as it hands it over, its keyframes, and what it sent: bytes and Gaussians, resends included.
-    bytes_whole: size of its whole map as messages.
+    """One agent's map as it hands it over, its keyframes, and the subsets that it sent, in order.
 
-    messages: the subsets in the order of sending, as the fusion server would receive them.
+    bytes_sent: of all messages, resends included. bytes_whole: size of its whole map as messages.
     """
 
     agent_id: str
@@ -43,7 +42,6 @@ class AgentMap:
     keyframes: tuple[AgentKeyframe, ...]
     messages: tuple[RoiSubset, ...]
     bytes_sent: int
-    gaussians_sent: int
     bytes_whole: int
 
 
@@ -71,9 +69,7 @@ class _SentMessages:
             self._spool.mark_done(due.voxels)
 
 
-def map_agent(
-    agent: AgentScene, settings: MissionSettings, grid: VoxelGrid, on_frame: Callable[[FrameOutcome], None]
-) -> AgentMap:
+def map_agent(agent: AgentScene, settings: MissionSettings, grid: VoxelGrid) -> AgentMap:
     """Return the agent's map after all its frames. A policy without a task sends its whole map once, at the end."""
     follows_task = settings.mapper_settings().components.follow_task
     scene = Scene(agent.task, agent.frames, agent.masks, (), SceneInfo())
@@ -87,21 +83,18 @@ def map_agent(
         FrameScheduler(settings.scheduler_settings),
         sent.publish,
     )
-    count = 0
+    outcomes: list[FrameOutcome] = []
 
     def after_frame(outcome: FrameOutcome) -> None:
-        nonlocal count
-        count += 1
-        if count % _ROUND_FRAMES == 0:
+        outcomes.append(outcome)
+        if len(outcomes) % _ROUND_FRAMES == 0:
             sent.send()
-        on_frame(outcome)
 
     MissionRunner(mapper.process, after_frame).run(agent.frames).raise_if_stopped()
     sent.send(0.0)
     keyframes = tuple(
         AgentKeyframe(agent.agent_id, keyframe) for keyframe in _select_keyframes(mapper.keyframes(), grid)
     )
-    gaussians_sent = sum(len(message.batch.gaussians) for message in sent.messages)
     gaussians = gaussian_mapper.shared_gaussians()
     return AgentMap(
         agent_id=agent.agent_id,
@@ -109,7 +102,6 @@ def map_agent(
         keyframes=keyframes,
         messages=tuple(sent.messages),
         bytes_sent=sent.byte_count,
-        gaussians_sent=gaussians_sent,
         bytes_whole=message_bytes(gaussians, grid),
     )
 

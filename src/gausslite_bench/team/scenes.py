@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 from gausslite.datasets.open import open_source
 from gausslite.datasets.regions import choose_regions
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
+from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import Region, RelevanceMap
-from gausslite.mission.settings import SceneInfo
 from gausslite.perception.relevance import RegionRelevanceEstimator
 from gausslite_bench.quality.home_tasks import HOME_TASKS, HomeTask
 from gausslite_bench.quality.real_scenes import RealScenePlan
-from gausslite_bench.quality.scenes import PosePolicy
 from gausslite_evaluation.views import HeldOutView
 
 _HELD_OUT_TRAJECTORY = 2
 _WALKS = ((0, 0), (1, 0), (0, 3), (1, 3))
 """Trajectory of each agent, and frames beyond the stated number: a second robot on the same way sees other views."""
-_MAX_FRAMES = 10_000
-MAX_AGENTS = len(_WALKS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,61 +34,24 @@ class AgentScene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TeamScene:
-    """The agents, held-out views with the union of their tasks' regions, and the ground truth of the whole scene."""
+    """The agents, and held-out views with the union of their tasks' regions."""
 
     name: str
     agents: tuple[AgentScene, ...]
     views: Sequence[HeldOutView]
-    info: SceneInfo
-
-    def regions(self, names: Sequence[str]) -> list[Region]:
-        """Return the regions of these objects. Raises DatasetError for an unknown name."""
-        return list(choose_regions(self.info.regions, names))
-
-
-@runtime_checkable
-class TeamPlan(Protocol):
-    """Description of a team's scene before its frames are loaded."""
-
-    @property
-    def name(self) -> str:
-        """Short name for tables."""
-        ...
-
-    @property
-    def agents(self) -> int:
-        """Number of agents."""
-        ...
-
-    @property
-    def pose_policy(self) -> PosePolicy:
-        """How pose and exposure errors are handled, the same for every policy."""
-        ...
-
-    def load(self, size: tuple[int, int]) -> TeamScene:
-        """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
 class HomeTeamPlan:
-    """A team in one home: agent i has the i-th of the home's tasks, in turn, and its own views of the home.
-
-    same_task: all agents have the first task instead.
-    """
+    """A team in one home: agent i has the i-th of the home's tasks, in turn, and its own views of the home."""
 
     home: int
     agents: int = 2
     frames: int = 60
     views: int = 16
-    same_task: bool = False
 
     def __post_init__(self) -> None:
-        if not 2 <= self.agents <= MAX_AGENTS:
-            raise InvalidInputError(f"agents: expected 2 to {MAX_AGENTS}, got {self.agents}")
-        for name in ("frames", "views"):
-            if not 1 <= getattr(self, name) <= _MAX_FRAMES:
-                raise InvalidInputError(f"{name}: expected 1 to {_MAX_FRAMES}, got {getattr(self, name)}")
+        _require_agents(self.agents)
         if not any(task.home == self.home for task in HOME_TASKS):
             raise InvalidInputError(f"homes: expected 1 to 8, got {self.home}")
 
@@ -102,21 +61,20 @@ class HomeTeamPlan:
         return f"home-{self.home} x {self.agents}"
 
     @property
-    def pose_policy(self) -> PosePolicy:
-        """Trust the poses."""
-        return PosePolicy()
+    def pose_prior(self) -> PoseExposurePrior:
+        """Poses and exposures are exact."""
+        return PoseExposurePrior()
 
     def load(self, size: tuple[int, int]) -> TeamScene:
         """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
-        tasks = [task for task in HOME_TASKS if task.home == self.home][: 1 if self.same_task else None]
+        tasks = [task for task in HOME_TASKS if task.home == self.home]
         chosen = [tasks[i % len(tasks)] for i in range(self.agents)]
         agents = tuple(self._agent_scene(f"agent-{i}", task, _WALKS[i], size) for i, task in enumerate(chosen))
         held_out = open_source(f"{self._spec(_HELD_OUT_TRAJECTORY, self.views, size)}&noise=0&exposure=0")
         names = tuple(dict.fromkeys(name for task in chosen for name in task.objects))
         regions = choose_regions(held_out.regions(), names)
         views = [HeldOutView.of(held_out.frame(i), regions) for i in range(len(held_out))]
-        info = SceneInfo(held_out.up_axis, held_out.regions())
-        return TeamScene(self.name, agents, [view for view in views if not view.frame.defect], info)
+        return TeamScene(self.name, agents, [view for view in views if not view.frame.defect])
 
     def _agent_scene(self, agent_id: str, task: HomeTask, walk: tuple[int, int], size: tuple[int, int]) -> AgentScene:
         trajectory, more_frames = walk
@@ -136,10 +94,7 @@ class RecordingTeamPlan:
     agents: int = 2
 
     def __post_init__(self) -> None:
-        if not 2 <= self.agents <= MAX_AGENTS:
-            raise InvalidInputError(f"agents: expected 2 to {MAX_AGENTS}, got {self.agents}")
-        if not self.kinds:
-            raise InvalidInputError("kinds: expected at least one kind of object, got none")
+        _require_agents(self.agents)
 
     @property
     def name(self) -> str:
@@ -147,9 +102,9 @@ class RecordingTeamPlan:
         return f"{'-'.join([self.kinds[0].name, *(plan.kind for plan in self.kinds[1 : self.agents])])} x {self.agents}"
 
     @property
-    def pose_policy(self) -> PosePolicy:
+    def pose_prior(self) -> PoseExposurePrior:
         """That of the recording."""
-        return self.kinds[0].pose_policy
+        return self.kinds[0].pose_prior
 
     def load(self, size: tuple[int, int]) -> TeamScene:
         """Return the scene at (width_px, height_px). Raises DatasetError, InvalidInputError."""
@@ -161,7 +116,11 @@ class RecordingTeamPlan:
         for i, plan in enumerate(chosen):
             part = scene.training[i * count // self.agents : (i + 1) * count // self.agents]
             agents.append(agent_scene(f"agent-{i}", plan.task, plan.objects, part, scene.info.regions))
-        return TeamScene(self.name, tuple(agents), scene.held_out, scene.info)
+        return TeamScene(self.name, tuple(agents), scene.held_out)
+
+
+TeamPlan = HomeTeamPlan | RecordingTeamPlan
+"""Description of a team's scene before its frames are loaded."""
 
 
 def agent_scene(
@@ -171,3 +130,8 @@ def agent_scene(
     estimator = RegionRelevanceEstimator(choose_regions(regions, objects))
     masks = [estimator.estimate(frame).relevance for frame in frames]
     return AgentScene(agent_id, task, objects, frames, masks)
+
+
+def _require_agents(count: int) -> None:
+    if not 2 <= count <= len(_WALKS):
+        raise InvalidInputError(f"agents: expected 2 to {len(_WALKS)}, got {count}")

@@ -6,9 +6,6 @@ from collections.abc import Sequence
 from statistics import fmean
 
 from gausslite_bench.team.bench import CONCATENATION, TeamResult
-from gausslite_evaluation.compare import MapScores
-
-_STRATEGY_COLUMNS = ("ROI PSNR", "gain", "ROI SSIM", "full PSNR")
 
 
 def team_table(results: Sequence[TeamResult]) -> str:
@@ -18,12 +15,12 @@ def team_table(results: Sequence[TeamResult]) -> str:
         "Gaussians of the regions; sent: Gaussians and bytes of all messages of the regions, resends included, and the "
         "bytes as a share of the whole maps' bytes.",
         "",
-        f"| scene | policy | strategy | {' | '.join(_STRATEGY_COLUMNS)} | share | sent | seeds |",
+        "| scene | policy | strategy | ROI PSNR | gain | ROI SSIM | full PSNR | share | sent | seeds |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups: dict[tuple[str, str], list[TeamResult]] = {}
     for result in results:
-        groups.setdefault((result.trial.plan.name, result.trial.policy), []).append(result)
+        groups.setdefault((result.scene, result.policy), []).append(result)
     for (scene, policy), group in groups.items():
         lines += [
             f"| {scene} | {policy} | {strategy} | {_scores(group, strategy)} | {_sent(group)} | {len(group)} |"
@@ -34,23 +31,18 @@ def team_table(results: Sequence[TeamResult]) -> str:
 
 def _scores(group: Sequence[TeamResult], strategy: str) -> str:
     scores = [result.scores[strategy] for result in group]
-    base = _roi_psnr([result.scores[CONCATENATION] for result in group])
-    roi_psnr = _roi_psnr(scores)
-    roi_ssim = fmean(score.roi_ssim or 0.0 for score in scores)
-    return (
-        f"{roi_psnr:.2f} | {roi_psnr - base:+.2f} | {roi_ssim:.3f} | {fmean(score.full_psnr for score in scores):.2f}"
-    )
+    gain = _mean(group, strategy) - _mean(group, CONCATENATION)
+    ssim, full = fmean(score.roi_ssim or 0.0 for score in scores), fmean(score.full_psnr for score in scores)
+    return f"{_mean(group, strategy):.2f} | {gain:+.2f} | {ssim:.3f} | {full:.2f}"
 
 
-def _roi_psnr(scores: Sequence[MapScores]) -> float:
-    return fmean(score.roi_psnr or 0.0 for score in scores)
+def _mean(group: Sequence[TeamResult], strategy: str) -> float:
+    return fmean(result.scores[strategy].roi_psnr or 0.0 for result in group)
 
 
 def _sent(group: Sequence[TeamResult]) -> str:
     share = fmean(result.share_percent for result in group)
-    gaussians, megabytes = (
-        fmean(result.gaussians_sent for result in group),
-        fmean(result.bytes_sent for result in group) / 1e6,
-    )
+    gaussians = fmean(result.gaussians_sent for result in group)
+    megabytes = fmean(result.bytes_sent / 1e6 for result in group)
     percent = fmean(100 * result.bytes_sent / max(result.bytes_whole, 1) for result in group)
     return f"{share:.1f} % | {gaussians:.0f}, {megabytes:.2f} MB ({percent:.1f} %)"

@@ -27,9 +27,9 @@ class Speed(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Options with bounds, an alternative and a preset."""
+    """Options with bounds and an alternative."""
 
-    limit: int = option(10, "limit", key="max-items", low=1, presets={"large": 77})
+    limit: int = option(10, "limit", key="max-items", low=1)
     steps: int | None = option(None, "steps", low=0, excludes="rate")
     rate_hz: float | None = option(None, "rate", key="rate", metavar="HZ", unit="Hz", low=0.01, high=1000)
 
@@ -58,7 +58,6 @@ def parser_of_settings() -> CommandParser:
         Settings,
         flags="out max-items rate steps names ball verbose colour",
         positional="source",
-        removed={"vote": "the vote has one rule"},
     ).add_to(parser)
     return parser
 
@@ -117,7 +116,6 @@ WRONG_FILES = {
     "max-itms = 5": "max-itms: unknown option; did you mean max-items?",
     "max_items = 5": "max_items: unknown option; did you mean max-items?",
     "config = 'x'": "config: unknown option",
-    "vote = 'free'": "vote: was removed; the vote has one rule",
     "[mapping]\nrate = 1": "[mapping]: tables are not supported; write NAME = VALUE at the top level",
     "speed = ['slow', 'fast']": "speed: expected text, got ['slow', 'fast']",
     "rate = -1": "rate: expected 0.01 to 1000 Hz, got -1",
@@ -146,7 +144,6 @@ WRONG_ARGUMENTS = {
     ("--set", "verbose=maybe"): "--set verbose: expected true or false, got 'maybe'",
 }
 WRONG_FLAGS = {
-    ("--vote=free",): "--vote: was removed; the vote has one rule",
     ("--no-verbose",): "--no-verbose: write --set verbose=false",
     ("--max-item", "5"): "unrecognized arguments: --max-item 5; did you mean --max-items?",
     ("--sped=fast",): "unrecognized arguments: --sped=fast; did you mean --speed?",

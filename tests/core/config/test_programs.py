@@ -21,7 +21,7 @@ from gausslite.config.program import PROGRAM, Program, choices_of, parse_options
 from gausslite.domain.errors import InvalidInputError
 
 COMMANDS = ("map", "demo", "eval", "parse")
-BENCHMARKS = ("loop", "perception", "parser")
+BENCHMARKS = ("loop", "perception")
 TEXTS = {
     "up": "0,1,0",
     "target-at": "0,0,1,0.5",
@@ -129,9 +129,7 @@ def test_flag_variable_and_file_give_every_option_the_same_value(name: str, tmp_
 def test_a_printed_configuration_is_read_again(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = program_of(name).options
     changed = [
-        f"--set={key}={other_text(declared)}"
-        for key, declared in options.items()
-        if key != "preset" and not declared.option.excludes
+        f"--set={key}={other_text(declared)}" for key, declared in options.items() if not declared.option.excludes
     ]
     file = tmp_path / "program.toml"
     for arguments in ([], changed):
@@ -195,10 +193,3 @@ def test_the_printed_configuration_states_defaults_that_depend_on_other_options(
 def test_a_printed_configuration_has_no_password(capsys: pytest.CaptureFixture[str]) -> None:
     text = printed("gausslite-parser", capsys, "--llm-url", "http://user:secret@host:8000/v1")
     assert 'llm-url = "http://user:***@host:8000/v1"' in text
-
-
-def test_the_preset_of_the_paper_is_below_every_other_layer(tmp_path: Path) -> None:
-    file = tmp_path / "map.toml"
-    file.write_text('preset = "paper"\npolicy = "task"\n')
-    options = read("gausslite map", "SOURCE", "--out=x", f"--config={file}")
-    assert (options.policy, options.max_gaussians, options.pose_prior.is_exact) == ("task", 1_000_000, True)

@@ -15,7 +15,6 @@ from gausslite.domain.task import ObjectAttributes, Predicate, Relation, TaskGra
 from gausslite.perception.colours import ColourMatch, basic_terms, colour_counts, is_evaluated, match_colour, no_colours
 from gausslite.perception.detector_file import DetectorOptions
 from gausslite.perception.relevance import TaskRelevanceEstimator
-from gausslite.perception.settings import ColourSettings
 from gausslite_detectors.models import READER
 
 # colours that every table of colour names gives these names
@@ -35,7 +34,7 @@ FOCAL = {
 
 
 def match_word(word: str, counts: np.ndarray) -> ColourMatch:
-    return match_colour(word, counts, ColourSettings())
+    return match_colour(word, counts)
 
 
 def counts_of(*rgb: tuple[int, int, int]) -> np.ndarray:

@@ -123,13 +123,13 @@ def test_an_object_missed_by_most_frames_is_not_confirmed():
     ],
 )
 def test_only_visible_landmarks_can_be_missed(frame, expected):
-    assert VisibilityCheck(frame, frame.depth_m, EvidenceSettings()).is_visible(landmark_at()) is expected
+    assert VisibilityCheck(frame, frame.depth_m).is_visible(landmark_at()) is expected
 
 
 def test_landmarks_farther_than_any_observation_are_not_missed():
     far_frame = frame_at(wall_m=9.0)
     far_frame.T_world_camera[2, 3] = -3.0
-    assert not VisibilityCheck(far_frame, far_frame.depth_m, EvidenceSettings()).is_visible(landmark_at())
+    assert not VisibilityCheck(far_frame, far_frame.depth_m).is_visible(landmark_at())
 
 
 def test_the_order_of_observations_does_not_matter():

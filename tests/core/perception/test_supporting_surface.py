@@ -11,11 +11,10 @@ from gausslite.domain.objects import MatchBasis, NounMatch
 from gausslite.domain.relevance import Detection
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.perception.relevance import TaskRelevanceEstimator
-from gausslite.perception.settings import HeightSettings, RelevanceTrackerSettings
+from gausslite.perception.settings import RelevanceTrackerSettings
 from gausslite.perception.supporting_surface import FloorLevel, level_under_m, nouns_known_by_height, stands_on
 
 UP = np.array([0.0, 0.0, 1.0])
-SETTINGS = HeightSettings()
 CAMERA = Camera(200.0, 200.0, 120.0, 90.0, 240, 180)
 # low and high corners in metres: a counter with a bottle on it, a desk with another, a third on the floor
 FLOOR = ((-5.0, -5.0, -0.1), (5.0, 8.0, 0.0))
@@ -79,9 +78,9 @@ def marked(anchor: str, negated: bool) -> tuple[list[bool], tuple[str, ...]]:
 
 def test_planes_and_floor_are_measured():
     frame, shown = view(0)
-    levels = [level_under_m(shown == number, frame, UP, SETTINGS) for number in (3, 4, 5)]
+    levels = [level_under_m(shown == number, frame, UP) for number in (3, 4, 5)]
     assert levels == pytest.approx([0.92, 0.73, 0.0], abs=0.01)
-    assert FloorLevel.before_frames(SETTINGS).add(frame, UP).level_m == pytest.approx(0.0, abs=0.03)
+    assert FloorLevel.before_frames().add(frame, UP).level_m == pytest.approx(0.0, abs=0.03)
 
 
 @pytest.mark.parametrize(
@@ -110,17 +109,17 @@ def test_heights_decide_what_stands_on_a_surface_without_a_class(anchor, negated
 def test_without_a_floor_in_view_nothing_is_sure():
     """A counter that fills the view is no floor: it is too near to the camera."""
     frame, shown = view(0, (((-3.0, 0.0, 0.0), (3.0, 4.0, 0.92)), ((-0.05, 1.2, 0.92), (0.05, 1.3, 1.1))), 40.0)
-    floor = FloorLevel.before_frames(SETTINGS).add(frame, UP)
+    floor = FloorLevel.before_frames().add(frame, UP)
     assert np.isnan(floor.level_m)
-    level_m = level_under_m(shown == 1, frame, UP, SETTINGS)
+    level_m = level_under_m(shown == 1, frame, UP)
     assert level_m == pytest.approx(0.92, abs=0.01)
-    assert stands_on("counter", np.array([level_m]), floor.level_m, np.nan, SETTINGS) is None
+    assert stands_on("counter", np.array([level_m]), floor.level_m, np.nan) is None
 
 
 def test_an_object_in_the_air_or_without_its_bottom_in_view_has_no_plane():
     frame, shown = view(0, (FLOOR, ((-0.1, 1.8, 0.4), (0.1, 1.9, 0.6))))
-    assert np.isnan(level_under_m(shown == 1, frame, UP, SETTINGS))
-    assert np.isnan(level_under_m(np.zeros((180, 240), np.bool_), frame, UP, SETTINGS))
+    assert np.isnan(level_under_m(shown == 1, frame, UP))
+    assert np.isnan(level_under_m(np.zeros((180, 240), np.bool_), frame, UP))
 
 
 @pytest.mark.parametrize(
@@ -132,14 +131,14 @@ def test_an_object_in_the_air_or_without_its_bottom_in_view_has_no_plane():
     ],
 )  # fmt: skip
 def test_usual_heights(noun, height_m, expected):
-    assert stands_on(noun, np.array([height_m + 2.0, height_m + 2.01]), 2.0, np.nan, SETTINGS) is expected
-    assert stands_on(noun, np.zeros(0), 2.0, np.nan, SETTINGS) is None
+    assert stands_on(noun, np.array([height_m + 2.0, height_m + 2.01]), 2.0, np.nan) is expected
+    assert stands_on(noun, np.zeros(0), 2.0, np.nan) is None
 
 
 def test_what_reaches_the_floor_is_not_on_a_shelf():
-    assert stands_on("book shelf", np.array([2.3]), 2.0, 2.03, SETTINGS) is False
-    assert stands_on("book shelf", np.array([2.3]), 2.0, 2.29, SETTINGS) is None
-    assert stands_on("shelf", np.zeros(0), np.nan, 2.03, SETTINGS) is None
+    assert stands_on("book shelf", np.array([2.3]), 2.0, 2.03) is False
+    assert stands_on("book shelf", np.array([2.3]), 2.0, 2.29) is None
+    assert stands_on("shelf", np.zeros(0), np.nan, 2.03) is None
 
 
 def test_only_surfaces_that_the_detector_cannot_find_as_themselves_are_decided_by_height():

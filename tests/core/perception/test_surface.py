@@ -10,8 +10,8 @@ import pytest
 from gausslite.domain.camera import Camera, back_project
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import transform_points
-from gausslite.perception.settings import SurfaceSettings
 from gausslite.perception.surface import (
+    VOXEL_SIZES_M,
     SurfaceVotes,
     is_in_large_part,
     mask_votes,
@@ -20,7 +20,6 @@ from gausslite.perception.surface import (
     surface_mask,
 )
 
-SETTINGS = SurfaceSettings()
 CAMERA = Camera(150.0, 150.0, 80.0, 60.0, 160, 120)
 
 
@@ -52,13 +51,13 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("pose", [(0.3, 0.0, 0.0), (-0.2, -0.5, 0.0), (0.2, 0.0, 10.0)])
 def test_a_surface_gives_the_mask_in_other_frames(pose):
     first, other = frame_at(), frame_at(*pose)
-    votes = mask_votes(box_mask(first), first, SETTINGS)
+    votes = mask_votes(box_mask(first), first)
     assert iou(surface_mask(votes, other), box_mask(other)) > 0.9
 
 
 def test_an_occluder_and_a_removed_object_leave_no_mask():
     first = frame_at()
-    votes = mask_votes(box_mask(first), first, SETTINGS)
+    votes = mask_votes(box_mask(first), first)
     hidden = replace(first, depth_m=np.full_like(first.depth_m, 0.5))
     removed = replace(first, depth_m=np.full_like(first.depth_m, 2.0))
     assert not surface_mask(votes, hidden).any()
@@ -74,11 +73,11 @@ def test_a_mask_that_spills_over_the_wall_is_cut_back_to_the_measured_object():
     frames = [frame_at(x_m) for x_m in (0.0, 0.1, -0.1)]
     votes = SurfaceVotes.empty()
     for frame in frames:
-        votes = votes.add(mask_votes(box_mask(frame), frame, SETTINGS))
+        votes = votes.add(mask_votes(box_mask(frame), frame))
     spilled = frame_at(0.05)
     mask = box_mask(spilled)
     mask[35:90, 30:130] = True
-    votes = votes.add(mask_votes(mask, spilled, SETTINGS))
+    votes = votes.add(mask_votes(mask, spilled))
     assert iou(mask, box_mask(spilled)) < 0.4
     refined = refined_mask(mask, votes, spilled)
     assert refined[box_mask(spilled)].all()
@@ -94,7 +93,7 @@ def test_adjacent_objects_of_one_noun_do_not_vote_each_other_out():
     for siblings, is_whole in ((box, True), (None, False)):
         votes = SurfaceVotes.empty()
         for third in thirds:
-            votes = votes.add(mask_votes(third, frame, SETTINGS, siblings))
+            votes = votes.add(mask_votes(third, frame, siblings))
         assert (iou(surface_mask(votes, frame), box) > 0.95) is is_whole
 
 
@@ -102,7 +101,7 @@ def test_a_detection_of_a_part_is_completed():
     frames = [frame_at(x_m) for x_m in (0.0, 0.1, -0.1)]
     votes = SurfaceVotes.empty()
     for frame in frames:
-        votes = votes.add(mask_votes(box_mask(frame), frame, SETTINGS))
+        votes = votes.add(mask_votes(box_mask(frame), frame))
     part = box_mask(frames[0])
     part[:, 80:] = False
     assert iou(refined_mask(part, votes, frames[0]), box_mask(frames[0])) > 0.8
@@ -110,7 +109,7 @@ def test_a_detection_of_a_part_is_completed():
 
 def test_votes_of_two_halves_are_their_sum():
     frames = [frame_at(x_m) for x_m in (0.0, 0.1, -0.1, 0.2)]
-    votes = [mask_votes(box_mask(frame), frame, SETTINGS) for frame in frames]
+    votes = [mask_votes(box_mask(frame), frame) for frame in frames]
     left, right = votes[0].add(votes[1]), votes[2].add(votes[3])
     one, other = left.add(right), votes[3].add(votes[0]).add(votes[2].add(votes[1]))
     for name in ("keys", "inside", "outside"):
@@ -121,7 +120,7 @@ def test_a_part_apart_from_the_object_is_left_out():
     frame = frame_at()
     mask = box_mask(frame)
     mask[50:60, 125:135] = True
-    votes = mask_votes(mask, frame, SETTINGS)
+    votes = mask_votes(mask, frame)
     assert iou(surface_mask(votes, frame), box_mask(frame)) > 0.9
 
 
@@ -129,33 +128,33 @@ def test_two_large_parts_are_one_object():
     columns, rows = np.meshgrid(np.linspace(0.0, 0.2, 20), np.linspace(0.0, 0.2, 20))
     part = np.stack([columns, rows, np.ones_like(rows)], axis=-1).reshape(-1, 3).astype(np.float32)
     points = np.concatenate([part, part + np.float32((0.5, 0, 0)), part[:9] + np.float32((0, 0.5, 0))])
-    kept = is_in_large_part(points, np.ones(len(points), np.int64), SETTINGS)
+    kept = is_in_large_part(points, np.ones(len(points), np.int64))
     assert kept[:800].all()
     assert not kept[800:].any()
-    assert is_in_large_part(points[:0], np.ones(0, np.int64), SETTINGS).shape == (0,)
+    assert is_in_large_part(points[:0], np.ones(0, np.int64)).shape == (0,)
 
 
 def test_voxels_follow_the_extent_and_what_a_frame_resolves():
     def disc(diameter_m: float) -> SurfaceVotes:
         grid = np.arange(-diameter_m / 2, diameter_m / 2, diameter_m / 60)
         points = np.stack([*np.meshgrid(grid, grid), np.ones((len(grid), len(grid)))], axis=-1).reshape(-1, 3)
-        return SurfaceVotes.from_points(points, np.hypot(points[:, 0], points[:, 1]) < diameter_m / 2, SETTINGS)
+        return SurfaceVotes.from_points(points, np.hypot(points[:, 0], points[:, 1]) < diameter_m / 2)
 
     mug, table = disc(0.09), disc(0.9)
     assert mug.extent_m == pytest.approx(0.09, rel=0.2)
-    assert mug.resolved(0.001).voxel_m == SETTINGS.voxel_sizes_m[0]
-    assert mug.resolved(0.014).voxel_m == SETTINGS.voxel_sizes_m[1]
-    assert table.resolved(0.001).voxel_m == SETTINGS.voxel_sizes_m[-1]
+    assert mug.resolved(0.001).voxel_m == VOXEL_SIZES_M[0]
+    assert mug.resolved(0.014).voxel_m == VOXEL_SIZES_M[1]
+    assert table.resolved(0.001).voxel_m == VOXEL_SIZES_M[-1]
 
 
 def test_votes_that_exceed_the_memory_get_larger_voxels():
     side = np.arange(0.0, 2.0, 0.008)
     points = np.stack([*np.meshgrid(side, side), np.ones((len(side), len(side)))], axis=-1).reshape(-1, 3)
-    inside = SurfaceVotes.from_points(points, np.ones(len(points), np.bool_), SETTINGS)
-    assert inside.voxel_m > SETTINGS.voxel_sizes_m[0]
+    inside = SurfaceVotes.from_points(points, np.ones(len(points), np.bool_))
+    assert inside.voxel_m > VOXEL_SIZES_M[0]
     assert len(inside.keys) < len(points) / 2
     assert inside.is_on_surface(points).all()
-    near = SurfaceVotes.from_points(points[:10], np.zeros(10, np.bool_), SETTINGS)
+    near = SurfaceVotes.from_points(points[:10], np.zeros(10, np.bool_))
     both = near.add(inside)
     assert both.voxel_m == inside.voxel_m
     assert np.array_equal(both.outside, inside.add(near).outside)
@@ -174,7 +173,7 @@ def test_an_outline_moves_to_the_edge():
     rgb, square = red_square()
     for shift in ((0, 1), (1, -1), (-1, 0)):
         rough = np.roll(square, shift, (0, 1))
-        snapped = snapped_to_edges(rough, rgb, SETTINGS)
+        snapped = snapped_to_edges(rough, rgb)
         assert (snapped ^ square).sum() < 0.3 * (rough ^ square).sum()
 
 
@@ -182,12 +181,12 @@ def test_pixels_away_from_the_outline_are_unchanged():
     rgb, square = red_square()
     far = np.zeros_like(square)
     far[5:15, 5:15] = True
-    snapped = snapped_to_edges(far, rgb, SETTINGS)
+    snapped = snapped_to_edges(far, rgb)
     assert snapped[7:13, 7:13].all()
     assert not snapped[18:].any()
 
 
 def test_masks_at_the_border_and_empty_masks():
     rgb, square = red_square()
-    assert not snapped_to_edges(np.zeros_like(square), rgb, SETTINGS).any()
-    assert snapped_to_edges(np.ones_like(square), rgb, SETTINGS).all()
+    assert not snapped_to_edges(np.zeros_like(square), rgb).any()
+    assert snapped_to_edges(np.ones_like(square), rgb).all()

@@ -175,5 +175,5 @@ def test_a_connection_without_a_call_is_closed() -> None:
 
 
 def test_limits_are_at_least_one() -> None:
-    with pytest.raises(InvalidInputError, match="calls: expected at least 1, got 0"):
-        CallLimits(calls=0)
+    with pytest.raises(InvalidInputError, match="connections: expected at least 1, got 0"):
+        CallLimits(connections=0)

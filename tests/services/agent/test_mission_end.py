@@ -168,8 +168,6 @@ def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
         "handover=true",
         "--set",
         "grace-period=60",
-        "--set",
-        "uplink-interval=0",
         "--out",
         str(tmp_path),
     )
