@@ -52,9 +52,10 @@ def test_wheels_are_built_for_every_declared_python() -> None:
     assert project["project"]["requires-python"] == f">=3.{declared[0]}"
 
 
-def test_source_files_have_at_most_450_lines() -> None:
+def test_source_files_have_at_most_600_lines() -> None:
+    # a longer file has more than one reason to open it; a lower limit would only merge and split files
     sources = [path for path in _tracked("*.py", "*.cpp", "*.h") if "v1" not in path.parts]
-    too_long = {str(p.relative_to(ROOT)): n for p in sources if (n := len(p.read_text().splitlines())) > 450}
+    too_long = {str(p.relative_to(ROOT)): n for p in sources if (n := len(p.read_text().splitlines())) > 600}
     assert not too_long
 
 
