@@ -55,7 +55,7 @@ def test_mapping_error_matches_the_oracle() -> None:
             mapper = mapped(rasterizer, seed)
             rendering = mapper.render(frame.camera, frame.T_world_camera)
             errors[backend, seed] = np.abs(rendering.rgb - frame.rgb / 255.0)[region].mean()
-            kappas[backend, seed] = mapper.roi_gaussians().kappa.max()
+            kappas[backend, seed] = mapper.gaussians(active_only=True).kappa.max()
     assert errors[0].mean() < 1.2 * errors[1].mean()
     assert (kappas[0] == kappas[1]).all()
     assert kappas.min() > 0

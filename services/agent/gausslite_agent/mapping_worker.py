@@ -280,7 +280,7 @@ class MappingWorker:
         self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
         # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
         # and the server may have voxels that the saved map does not
-        self._publish(self._voxels_to_send(self._mapper.roi_gaussians(), Purpose.ROI))
+        self._publish(self._voxels_to_send(self._mapper.gaussians(active_only=True), Purpose.ROI))
         self._on_change()
 
     def _voxels_to_send(self, gaussians: Gaussians, purpose: Purpose | None = None) -> VoxelBatch:

@@ -115,13 +115,13 @@ MAX_COORDINATE_M = 10_000.0
 class FrameId(NamedTuple):
     """Identifies a captured frame, whatever becomes of its pose and pixels. Clocks restart, so times may repeat."""
 
-    index: int
+    frame_index: int
     capture_time_ns: int
 
     @property
     def number(self) -> int:
         """The id as one number of 63 bits, for sets of views in saved states."""
-        return (self.index & 0x7FFFFFFF) << 32 | zlib.crc32(struct.pack("<q", self.capture_time_ns))
+        return (self.frame_index & 0x7FFFFFFF) << 32 | zlib.crc32(struct.pack("<q", self.capture_time_ns))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

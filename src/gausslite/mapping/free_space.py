@@ -125,7 +125,7 @@ def seen_through(
     return (through >= min_views) & (through >= _MIN_RATIO * shown)
 
 
-def guessed_far(points_m: Float32[ndarray, "n 3"], frames: Iterable[Frame]) -> Bool[ndarray, " n"]:
+def has_guessed_depth(points_m: Float32[ndarray, "n 3"], frames: Iterable[Frame]) -> Bool[ndarray, " n"]:
     """Return the points at pixels without a depth, if no frame shows them within 4 m or with a measured surface there.
 
     Their distance is a guess: the surface may lie beyond the sensor's range, so that they float in other views.
@@ -155,7 +155,7 @@ def contradicted_rows(
     return contradicted
 
 
-def left_behind(
+def rows_moved_away(
     means_m: Float32[ndarray, "n 3"], frame: Frame, moved: Bool[ndarray, "h w"], others: Iterable[Frame]
 ) -> Int64[ndarray, " m"]:
     """Return the rows of the means that a frame shows on pixels that moved later, and that other frames contradict.
@@ -165,5 +165,5 @@ def left_behind(
     view = DepthView.of_frame(frame)
     view = replace(view, nearest_m=np.where(moved, view.nearest_m, np.float32(0.0)))
     rows = np.flatnonzero(view.classify(means_m)[1])
-    behind: Int64[ndarray, " m"] = rows[seen_through(means_m[rows], map(DepthView.of_frame, others), min_views=2)]
-    return behind
+    moved_away: Int64[ndarray, " m"] = rows[seen_through(means_m[rows], map(DepthView.of_frame, others), min_views=2)]
+    return moved_away

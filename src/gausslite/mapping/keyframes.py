@@ -19,6 +19,7 @@ from gausslite.domain.frame import Frame, FrameId, without_depth_edges
 from gausslite.domain.pose import Twist, inverse, orthonormal
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, get_floats, int_array, select_prefix
+from gausslite.mapping.moving import without_pixels
 from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, Rasterizer, Subset, TrainingView
 
@@ -119,6 +120,17 @@ class Keyframe:
         """Return the keyframe evaluated with this relevance; what has moved since is not relevant."""
         shown = relevance if self.hidden is None else relevance.without(self.hidden)
         return replace(self, relevance=shown, evaluated=True)
+
+    def hide(self, pixels: Bool[ndarray, "h w"], rendered_rgb: Float32[ndarray, "h w 3"]) -> Keyframe:
+        """Return the keyframe with these pixels out of training; rendered_rgb: the map from its pose."""
+        recorded = None if self.recorded is None else without_pixels(self.recorded, pixels, rendered_rgb)
+        return replace(
+            self,
+            frame=without_pixels(self.frame, pixels, rendered_rgb),
+            recorded=recorded,
+            relevance=self.relevance.without(pixels),
+            hidden=pixels if self.hidden is None else self.hidden | pixels,
+        )
 
     @property
     def as_recorded(self) -> Frame:

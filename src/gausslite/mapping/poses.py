@@ -14,8 +14,16 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera, CameraMotion
 from gausslite.domain.errors import MapFileError
-from gausslite.domain.frame import MAX_COORDINATE_M, Frame
-from gausslite.domain.pose import CorrectionTrack, PoseCorrection, Trajectory, inverse, require_rigid, transform_of
+from gausslite.domain.frame import MAX_COORDINATE_M, Frame, FrameId
+from gausslite.domain.pose import (
+    CorrectionTrack,
+    PoseCorrection,
+    Trajectory,
+    inverse,
+    orthonormal,
+    require_rigid,
+    transform_of,
+)
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.state import State, add_prefix, get_array, get_counts, int_array, select_prefix
 from gausslite.mapping.keyframes import Keyframe, WindowView
@@ -57,35 +65,51 @@ class _Pose(NamedTuple):
 _POSES = ("T_world_odometry", "T_world_prior", "T_world_map")
 
 
-class PoseHistory:
-    """Poses by frame, in the order of their first mapping; a frame that is refined again replaces its pose."""
+class PoseTable:
+    """The poses of each frame by its id, in the order of mapping.
+
+    T_corrected_odometry: how the loops so far correct poses of the odometry; None without one.
+    """
 
     def __init__(self) -> None:
-        self._poses: dict[tuple[int, int], _Pose] = {}
+        self.T_corrected_odometry: Float64[ndarray, "4 4"] | None = None
+        self._poses: dict[FrameId, _Pose] = {}
         self._correction_sum = np.zeros(6)
-        self._current: tuple[Frame, int] | None = None
+        self._odometry: tuple[FrameId, Float64[ndarray, "4 4"]] | None = None
+        self._new: tuple[FrameId, _Pose] | None = None
 
     def __len__(self) -> int:
         return len(self._poses)
 
-    def begin(self, odometry: Frame, anchor: int) -> None:
-        """Set the frame that is recorded next, with the odometry's pose, and the keyframe that it follows."""
-        self._current = odometry, anchor
+    def add_odometry(self, frame: Frame) -> Frame:
+        """Keep the odometry's pose of the frame that is mapped next; return the frame with it as loops correct it."""
+        self._odometry = frame.id, frame.T_world_camera
+        T = self.T_corrected_odometry
+        return frame if T is None else replace(frame, T_world_camera=orthonormal(T @ frame.T_world_camera))
 
-    def record(self, prior: Frame, T_world_map: Float64[ndarray, "4 4"]) -> None:
-        """Store the pose in the map of a frame, whose own pose is the one before refinement."""
-        key = (prior.index, prior.capture_time_ns)
-        earlier = self._poses.get(key)
-        if earlier is None:
-            odometry, anchor = self._current or (prior, 0)
-            if (odometry.index, odometry.capture_time_ns) != key:
-                return  # an earlier frame that has been removed
-            pose = _Pose(odometry.T_world_camera, prior.T_world_camera, T_world_map, anchor)
-        else:
+    def add(self, frame: Frame, anchor: int) -> None:
+        """Add the frame that is mapped now with its pose before refinement, and the keyframe that it follows.
+
+        It counts from its first refined pose on, and replaces an earlier frame with its id.
+        """
+        prior = frame.T_world_camera
+        known, odometry = self._odometry or (frame.id, prior)
+        self._new = frame.id, _Pose(odometry if known == frame.id else prior, prior, prior, anchor)
+        if earlier := self._poses.pop(frame.id, None):
+            self._correction_sum -= earlier.correction
+
+    def refine(self, frame: FrameId, T_world_map: Float64[ndarray, "4 4"]) -> None:
+        """Replace the refined pose of a frame."""
+        earlier = self._poses.get(frame)
+        if earlier is not None:
             pose = earlier._replace(T_world_map=T_world_map)
             self._correction_sum -= earlier.correction
+        elif self._new is not None and self._new[0] == frame:
+            pose = self._new[1]._replace(T_world_map=T_world_map)
+        else:
+            return  # an earlier frame that has been removed
         self._correction_sum += pose.correction
-        self._poses[key] = pose
+        self._poses[frame] = pose
         if len(self._poses) > _MAX_POSES:
             self._thin()
 
@@ -95,7 +119,9 @@ class PoseHistory:
         return max((pose.anchor for pose in self._poses.values()), default=-1)
 
     def move(self, T_corrected_earlier: Float64[ndarray, "k 4 4"]) -> None:
-        """Move all poses in the map with their keyframes, given by keyframe number."""
+        """Move all poses in the map with their keyframes, given by keyframe number; later ones of the odometry too."""
+        T_earlier = np.eye(4) if self.T_corrected_odometry is None else self.T_corrected_odometry
+        self.T_corrected_odometry = orthonormal(T_corrected_earlier[-1] @ T_earlier)
         self._poses = {key: pose.moved(T_corrected_earlier) for key, pose in self._poses.items()}
         self._correction_sum = self._sum_corrections()
 
@@ -157,7 +183,7 @@ class PoseHistory:
             if np.abs(T[:3, 3]).max() > MAX_COORDINATE_M:
                 raise MapFileError(f"state poses: expected positions within {MAX_COORDINATE_M:g} m of the origin")
         self._poses = {
-            (int(index), int(time_ns)): _Pose(odometry.copy(), prior.copy(), in_map.copy(), anchor)
+            FrameId(int(index), int(time_ns)): _Pose(odometry.copy(), prior.copy(), in_map.copy(), anchor)
             for (index, time_ns), odometry, prior, in_map, anchor in zip(frames, *poses, anchors, strict=True)
         }
         # the stored sum has the rounding errors of its history, which a bit-identical continuation needs
@@ -200,17 +226,17 @@ class RefinementSettings:
 
 
 class ViewRefiner:
-    """Refines views under the prior. It owns the pose history, the last pose correction and its place in the window.
+    """Refines views under the prior. It owns the last pose correction and its place in the window.
 
     Each frame is aligned to the map, and the map is trained on the aligned frames, so both could drift from the
     odometry together. After each fit, the refined pose moves back by a share of the mission's mean correction.
     """
 
-    def __init__(self, settings: RefinementSettings, render: RenderMap) -> None:
+    def __init__(self, settings: RefinementSettings, render: RenderMap, poses: PoseTable) -> None:
         self._prior = settings.prior
         self._settings = settings
         self._render = render
-        self._history = PoseHistory()
+        self._poses = poses
         self._T_odometry_refined = np.eye(4)
         self._position = 0
 
@@ -219,17 +245,12 @@ class ViewRefiner:
         """False if poses and colours are used as recorded."""
         return not self._prior.is_exact
 
-    @property
-    def history(self) -> PoseHistory:
-        """The poses of all mapped frames."""
-        return self._history
-
     def state(self) -> State:
-        """Return the pose history, the last pose correction and the position of the last refined keyframe."""
+        """Return the pose table, the last pose correction and the position of the last refined keyframe."""
         return {
             "T_odometry_refined": self._T_odometry_refined,
             "position": int_array(self._position),
-            **add_prefix("history", self._history.state()),
+            **add_prefix("history", self._poses.state()),
         }
 
     def restore(self, state: State) -> None:
@@ -238,7 +259,7 @@ class ViewRefiner:
         require_rigid("state T_odometry_refined", T_odometry_refined)
         self._T_odometry_refined = T_odometry_refined.copy()
         [self._position] = get_counts(state, "position", 1)
-        self._history.restore(select_prefix(state, "history"))
+        self._poses.restore(select_prefix(state, "history"))
 
     def refine(self, recorded: Frame) -> Frame:
         """Return a new frame with refined pose and exposure. The search starts at the last frame's pose correction."""
@@ -275,11 +296,11 @@ class ViewRefiner:
         return replace(recorded, rgb=exposure.to_map(recorded.rgb), T_world_camera=T_world_camera)
 
     def _anchored(self, recorded: Frame, T_world_camera: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
-        """Return the pose moved back by a share of the mean correction, and store it in the history."""
-        self._history.record(recorded, T_world_camera)
-        back = -self._settings.anchor_share * self._history.mean_correction
+        """Return the pose moved back by a share of the mean correction, and store it in the table."""
+        self._poses.refine(recorded.id, T_world_camera)
+        back = -self._settings.anchor_share * self._poses.mean_correction
         anchored = T_world_camera.copy()
         anchored[:3, :3] = transform_of(back)[:3, :3] @ T_world_camera[:3, :3]
         anchored[:3, 3] += back[:3]
-        self._history.record(recorded, anchored)
+        self._poses.refine(recorded.id, anchored)
         return anchored

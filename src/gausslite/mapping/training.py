@@ -372,11 +372,12 @@ class Trainer:
         """
         for _ in range(_HALF_SIZE_VIEWS):
             view = next(turns)
-            half_size = view.half_view is not None
-            image, adam = (view.half_view, self._half_size_adam) if half_size else (view.training_view, self._adam)
-            self._rasterizer.step(*binding.tables, image, view.T_camera_world, self._loss, adam)
-            if not half_size:
+            if view.half_view is None:
+                self._rasterizer.step(*binding.tables, view.training_view, view.T_camera_world, self._loss, self._adam)
                 break
+            self._rasterizer.step(
+                *binding.tables, view.half_view, view.T_camera_world, self._loss, self._half_size_adam
+            )
 
     def _train_roi(self, binding: _Binding, view: WindowView) -> None:
         report = self._rasterizer.step(

@@ -30,7 +30,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import CorrectionTrack, UpAxis, pose_at, unit_up_axis
 from gausslite.domain.relevance import largest_roi_per_segment
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.poses import PoseHistory
+from gausslite.mapping.poses import PoseTable
 
 _PHOTOGRAPHS = 4
 
@@ -158,7 +158,7 @@ def write_results(folder: Path, gaussians: Gaussians, report: Mapping[str, objec
     write_json(folder / _REPORT, report)
 
 
-def write_poses(folder: Path, poses: PoseHistory, T_map_sequence: Float64[ndarray, "4 4"] | None = None) -> None:
+def write_poses(folder: Path, poses: PoseTable, T_map_sequence: Float64[ndarray, "4 4"] | None = None) -> None:
     """Write map_to_odom.txt and trajectory.txt, in TUM's format, if any frame was mapped. Raises StorageError.
 
     T_map_sequence: the motion by which the odometry's poses were moved before they were mapped; None without one.

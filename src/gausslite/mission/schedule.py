@@ -22,7 +22,7 @@ from gausslite.domain.objects import match_warnings
 from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.state import EvenHistory
 from gausslite.domain.task import TaskGraph
-from gausslite.mapping.poses import PoseHistory
+from gausslite.mapping.poses import PoseTable
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 
@@ -35,7 +35,7 @@ class MapRecorder:
 
     _snapshots: EvenHistory[MapSnapshot] = field(default_factory=lambda: EvenHistory(_MAX_SNAPSHOTS, _LEAST_GAP_NS))
 
-    def record(self, poses: PoseHistory, gaussians: Callable[[], Gaussians]) -> None:
+    def record(self, poses: PoseTable, gaussians: Callable[[], Gaussians]) -> None:
         """Take a snapshot of the map after a frame, if one is due."""
         latest = poses.latest()
         if latest is None or not self._snapshots.is_due(latest.capture_time_ns):

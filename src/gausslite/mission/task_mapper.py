@@ -21,11 +21,9 @@ from gausslite.domain.relevance import CameraView, DetectedImage, PointedObject,
 from gausslite.domain.state import State, add_prefix, get_array, select_prefix
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
 from gausslite.mapping.keyframes import Keyframe
-from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.moving import MovingSettings, moving_pixels
+from gausslite.mapping.mapper import FrameView, GaussianMapper
 from gausslite.mapping.pose_corrector import LoopCounts
-from gausslite.mapping.poses import PoseHistory
-from gausslite.mapping.seeding import RenderedView
+from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.task_change import Reevaluation
 from gausslite.mapping.tracking import CameraTracker
 from gausslite.mapping.training import SkippableStage, Stage
@@ -205,7 +203,7 @@ class TaskMapper:
         )
 
     @property
-    def poses(self) -> PoseHistory:
+    def poses(self) -> PoseTable:
         """The poses of all mapped frames."""
         return self._mapper.poses
 
@@ -253,19 +251,17 @@ class TaskMapper:
         repeats = self._last_image.is_repeated_by(frame)
         if defect := frame.defect or (REPEATED if repeats else ""):
             return self._skip_defect(frame, defect)
-        odometry, tracked = frame, self._track(frame)
-        if tracked is None:
+        posed = self._track(self._mapper.poses.add_odometry(frame))
+        if posed is None:
             return self._skip(frame, TRACKING_LOST)
-        frame = tracked if self._tracker is not None else self._mapper.corrected(frame)
-        frame = self._without_moving(frame)
-        if frame.defect:
+        view = self._mapper.look(posed, self._scheduler)
+        if view.frame.defect:
             return self._skip_defect(frame, MOVING)
-        view = self._render(frame)
-        estimate = self._estimate_relevance(frame, view)
+        estimate = self._estimate_relevance(view)
         self._detected = estimate.detected or self._detected
         lag_frames = self._apply_delayed(estimate.delayed)
         reevaluation = self._reevaluate_keyframes()
-        mapped = self._mapper.map_frame(frame, estimate.relevance, self._scheduler, view, odometry)
+        mapped = self._mapper.map_view(view, estimate.relevance, self._scheduler)
         if self._tracker is not None and mapped.T_world_camera is not None:
             if mapped.T_corrected_earlier is not None:
                 self._tracker.move(mapped.T_corrected_earlier)
@@ -289,7 +285,11 @@ class TaskMapper:
 
     def changed_roi(self) -> VoxelBatch | None:
         """Return the voxels of the task's region that changed since the last call; None without a tracker."""
-        return None if self._sent_voxels is None else self._sent_voxels.collect_changes(self._mapper.roi_gaussians())
+        return (
+            None
+            if self._sent_voxels is None
+            else self._sent_voxels.collect_changes(self._mapper.gaussians(active_only=True))
+        )
 
     @property
     def loops(self) -> LoopCounts:
@@ -309,21 +309,6 @@ class TaskMapper:
             T_world_camera = self._tracker.track(frame)
         return None if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
 
-    def _without_moving(self, frame: Frame) -> Frame:
-        """Return the frame without the things that move; hide in an earlier keyframe what has moved since."""
-        if not self._mapper.settings.leaves_out_moving:
-            return frame
-        keyframes = self._mapper.keyframes()[-MovingSettings().references :]
-        frames = [keyframe.frame for keyframe in keyframes]
-        if keyframes:
-            chosen = self._mapper.revision % len(keyframes)
-            later = [*frames[chosen + 1 :], frame]
-            moved = moving_pixels(frames[chosen], later)
-            if moved.any():
-                self._mapper.hide(moved, keyframes[chosen], [*frames[:chosen], *later])
-        moving = moving_pixels(frame, frames)
-        return self._mapper.without(moving, frame) if moving.any() else frame
-
     def _skip_defect(self, frame: Frame, defect: str) -> FrameOutcome:
         """Return the outcome of a frame with a defect, and note the first one."""
         self._defects.setdefault(defect, frame.index)
@@ -333,16 +318,9 @@ class TaskMapper:
         """Return the outcome of a frame that is not mapped."""
         return FrameOutcome(frame.index, 0, self._mapper.count, 0.0, self._scheduler.end(), reason)
 
-    def _render(self, frame: Frame) -> RenderedView | None:
-        """Render the map from the frame's pose, for the depth of the relevance estimate and for seeding."""
-        if self._scheduler.skips(SkippableStage.SEEDING):
-            return None
-        with self._scheduler.timing(Stage.RENDERING):
-            return self._mapper.render_view(frame)
-
-    def _estimate_relevance(self, frame: Frame, view: RenderedView | None) -> RelevanceEstimate:
+    def _estimate_relevance(self, view: FrameView) -> RelevanceEstimate:
         with self._scheduler.timing(Stage.RELEVANCE):
-            return self._estimator.estimate(frame, None if view is None else view.depth_m)
+            return self._estimator.estimate(view.frame, None if view.rendered is None else view.rendered.depth_m)
 
     def _apply_delayed(self, delayed: DelayedRelevance | None) -> int | None:
         """Update an earlier keyframe with its delayed relevance, and return the delay in frames."""
@@ -358,7 +336,7 @@ class TaskMapper:
         One per frame, more if there is time, up to a fixed number.
         """
         keyframes = seeded = 0
-        while (keyframe := self._mapper.next_unevaluated) is not None:
+        while (keyframe := self._mapper.store.next_unevaluated) is not None:
             if not self._may_evaluate(keyframes):
                 break
             with self._scheduler.timing(Stage.REEVALUATION):
@@ -369,7 +347,7 @@ class TaskMapper:
                 keyframes += 1
         completed = 0
         while self._may_evaluate(keyframes + completed):
-            keyframe = self._mapper.next_incomplete(self._estimator.known_objects)
+            keyframe = self._mapper.store.next_incomplete(self._estimator.known_objects)
             if keyframe is None:
                 break
             with self._scheduler.timing(Stage.REEVALUATION):
@@ -389,7 +367,7 @@ class TaskMapper:
         try:
             return self._estimator.evaluate_past(keyframe.as_recorded)
         except Exception:
-            self._mapper.mark_unavailable(keyframe)
+            self._mapper.evaluate_keyframe(keyframe, None)
             raise
 
     def _publish_changed_roi(self) -> VoxelBatch | None:

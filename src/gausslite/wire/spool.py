@@ -99,7 +99,7 @@ ON CONFLICT (frame_index) DO UPDATE SET enqueue_count = enqueue_count + 1, value
 """
 _SELECT_KEYFRAMES = "SELECT frame_index, value, coverage, data, enqueue_count FROM keyframes"
 _DUE_KEYFRAMES = """
-SELECT -value / length(data), frame_index, length(data) FROM keyframes WHERE pending = 1 ORDER BY 1, 2
+SELECT -value / length(data), frame_index, length(data), 1 FROM keyframes WHERE pending = 1 ORDER BY 1, 2
 """
 
 
@@ -338,7 +338,7 @@ class Spool:
 
     def _due_keyframes(self) -> list[_Due]:
         with self._transaction():
-            return [_Due(*row, is_keyframe=True) for row in self._database.execute(_DUE_KEYFRAMES)]
+            return [_Due(*row) for row in self._database.execute(_DUE_KEYFRAMES)]
 
     def _rows(self, query: str, keys: Sequence[int]) -> list[tuple[Any, ...]]:
         """Return the row of each key that has one, read in slices."""

@@ -14,7 +14,7 @@ from gausslite.domain.voxels import VoxelGrid
 from gausslite.mapping.anchors import move_with_anchors
 from gausslite.mapping.density import densify
 from gausslite.mapping.keyframes import Keyframe, KeyframeStore, window_view
-from gausslite.mapping.poses import PoseHistory
+from gausslite.mapping.poses import PoseTable
 from gausslite.mapping.seeding import Seeds, insert_seeds
 from gausslite.mapping.settings import DensitySettings, KeyframeSettings
 from gausslite.mapping.splat_table import NO_ANCHOR, SplatTable
@@ -113,11 +113,11 @@ def test_moved_voxels_are_sent_once_and_their_old_places_become_tombstones() -> 
 
 def test_keyframes_and_poses_move_with_their_anchors() -> None:
     settings = KeyframeSettings(every=2)
-    store, history, rasterizer = KeyframeStore(settings), PoseHistory(), CpuRasterizer(1)
+    store, history, rasterizer = KeyframeStore(settings), PoseTable(), CpuRasterizer(1)
     for index in range(4):
         frame = wall_frame(index)
-        history.begin(frame, store.next_anchor)
-        history.record(frame, frame.T_world_camera)
+        history.add(frame, store.next_anchor)
+        history.refine(frame.id, frame.T_world_camera)
         keyframe = Keyframe(frame, middle_relevance(frame), anchor=store.next_anchor)
         store.add(window_view(keyframe, rasterizer, settings))
     before = {keyframe.frame.index: keyframe.frame.T_world_camera for keyframe in store.kept}

@@ -12,7 +12,7 @@ from sample_gaussians import plain_gaussians
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import RelevanceMap
 from gausslite.domain.voxels import VoxelGrid, group_by_voxel
-from gausslite.mapping.free_space import DepthView, guessed_far, seen_through, view_counts
+from gausslite.mapping.free_space import DepthView, has_guessed_depth, seen_through, view_counts
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
@@ -64,11 +64,11 @@ def test_a_distant_point_at_an_unmeasured_pixel_is_a_guess_unless_another_frame_
     depth_m[:, 32:] = 0.0
     hole = replace(wall_frame(), depth_m=depth_m)
     points_m = np.array([[1.0, 0.0, 5.0], [-1.0, 0.0, 5.0], [-1.0, 0.0, 7.0], [1.0, 0.0, 3.9]], np.float32)
-    assert guessed_far(points_m, [hole]).tolist() == [True, False, False, False]
+    assert has_guessed_depth(points_m, [hole]).tolist() == [True, False, False, False]
     measured = replace(wall_frame(), depth_m=np.full_like(depth_m, 5.0))
     near = replace(hole, T_world_camera=np.array([[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1.0]]))
     for frames in ([hole, measured], [measured, hole], [hole, near], [near, hole], []):
-        assert not guessed_far(points_m, frames).any()
+        assert not has_guessed_depth(points_m, frames).any()
 
 
 def test_only_untrained_guesses_are_kept_from_others() -> None:
@@ -131,9 +131,9 @@ def test_a_new_map_removes_nothing() -> None:
 
 def test_removed_gaussians_become_tombstones() -> None:
     mapper, tracker = _continued(_prior()), SentVoxelTracker(VoxelGrid())
-    sent = tracker.collect_changes(mapper.roi_gaussians())
+    sent = tracker.collect_changes(mapper.gaussians(active_only=True))
     _map(mapper, 5)
-    changes = tracker.collect_changes(mapper.roi_gaussians())
+    changes = tracker.collect_changes(mapper.gaussians(active_only=True))
     ghosts = np.unique(VoxelGrid().keys(GHOST_M))
     assert np.isin(ghosts, sent.keys).all()
     assert set(ghosts) <= set(changes.keys[changes.counts == 0])

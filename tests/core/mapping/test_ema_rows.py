@@ -144,4 +144,4 @@ def test_training_is_independent_of_the_ema() -> None:
     current, smoothed = without_ema.gaussians(), with_ema.gaussians()
     assert len(current) == len(smoothed)
     assert np.abs(current.rgb - smoothed.rgb).max() > 1e-3
-    assert_array_equal(with_ema.roi_gaussians().rgb, smoothed.rgb[smoothed.active])
+    assert_array_equal(with_ema.gaussians(active_only=True).rgb, smoothed.rgb[smoothed.active])

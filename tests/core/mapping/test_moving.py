@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,14 @@ from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Camera
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.frame import Frame
+from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.moving import moving_pixels
+from gausslite.mapping.settings import MapperSettings, OptimizationSettings
 from gausslite.mission.build import build_mapper, region_estimator
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import MOVING, TaskMapper
+from gausslite.render.cpu import CpuRasterizer
+from gausslite.render.rasterizer import Rendering
 from gausslite_sim.home_settings import HomeSettings
 
 CAMERA = Camera(160.0, 160.0, 80.0, 60.0, 160, 120)
@@ -90,6 +95,31 @@ def test_a_keyframe_loses_what_has_left_its_place_later() -> None:
     assert first.index == 0
     assert not first.depth_m[32:88, 82:118].any()
     assert (mapper.gaussians().means_m[:, 2] > (WALL_M + BOX_M) / 2).all(), "a thing left Gaussians behind"
+
+
+class CountingRasterizer(CpuRasterizer):
+    """Counts the renderings of the map."""
+
+    def __init__(self) -> None:
+        super().__init__(threads=1)
+        self.renderings = 0
+
+    def forward(self, *arguments: Any, **options: Any) -> Rendering:
+        self.renderings += 1
+        return super().forward(*arguments, **options)
+
+
+def test_a_moving_thing_costs_at_most_two_renderings_in_a_frame() -> None:
+    rasterizer = CountingRasterizer()
+    settings = MapperSettings(max_gaussians=3000, optimization=OptimizationSettings().with_iterations(1))
+    mapper = TaskMapper(region_estimator([]), GaussianMapper(settings, rasterizer))
+    renderings = []
+    for index in range(18):
+        rasterizer.renderings = 0
+        mapper.process(frame(index, 80 if index == 0 else None if index < 6 else 10 * (index - 6)))
+        renderings.append(rasterizer.renderings)
+    assert any(keyframe.hidden is not None for keyframe in mapper.keyframes())
+    assert max(renderings) == 2
 
 
 def test_a_simulated_home_has_a_box_that_moves() -> None:

@@ -17,6 +17,7 @@ from gausslite.mapping.keyframes import frame_from_state, frame_state
 from gausslite.mapping.mapper import GaussianMapper
 from gausslite.mapping.seeding import Seeder, SeedingContext
 from gausslite.mapping.settings import Components, MapperSettings, SeedingSettings
+from gausslite.mapping.training import CountedScheduler
 
 _APPROACH = CameraMotion(Twist(np.array([0.0, 0.0, 2.0]), np.zeros(3)), readout_s=0.05)
 
@@ -43,7 +44,7 @@ def test_the_map_renders_what_the_moving_camera_sees() -> None:
     frame = approaching_frame()
     mapper = GaussianMapper(MapperSettings(max_gaussians=4000), ReferenceRasterizer(), seed=0)
     mapper.map_frame(frame, middle_relevance(frame))
-    rendered = mapper.render_view(frame)
+    rendered = mapper.look(frame, CountedScheduler()).rendered
     assert rendered is not None
     seen = rendered.alpha > 0.8
     assert seen.mean() > 0.5

@@ -65,8 +65,10 @@ def test_a_correction_moves_keyframes_and_the_odometry_to_come() -> None:
     for moved, own in zip(mapper.keyframes(), plain.keyframes(), strict=True):
         np.testing.assert_allclose(moved.frame.T_world_camera, MOTION @ own.frame.T_world_camera, atol=1e-9)
     frame = wall_frame(2)
-    np.testing.assert_allclose(mapper.corrected(frame).T_world_camera, MOTION @ frame.T_world_camera, atol=1e-9)
-    assert plain.corrected(frame) is frame
+    np.testing.assert_allclose(
+        mapper.poses.add_odometry(frame).T_world_camera, MOTION @ frame.T_world_camera, atol=1e-9
+    )
+    assert plain.poses.add_odometry(frame) is frame
 
 
 def test_a_corrector_is_part_of_a_saved_mapper() -> None:

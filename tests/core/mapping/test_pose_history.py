@@ -12,7 +12,7 @@ from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import CorrectionTrack, inverse, transform_of, translation_m, twist_of
 from gausslite.domain.recording import PoseExposurePrior
-from gausslite.mapping.poses import PoseHistory, RefinementSettings, ViewRefiner
+from gausslite.mapping.poses import PoseTable, RefinementSettings, ViewRefiner
 from gausslite.render.rasterizer import Rendering
 
 SMALL = wall_frame(size=(4, 3))
@@ -23,15 +23,22 @@ def odometry(index: int, x_m: float = 0.0) -> Frame:
     return replace(SMALL, index=index, capture_time_ns=index * 100_000_000, T_world_camera=shift(x_m))
 
 
+def record(table: PoseTable, frame: Frame, T_world_map: np.ndarray) -> None:
+    """Map a frame with the odometry's pose, or refine it again."""
+    if list(frame.id) not in table.state()["frames"].tolist():
+        table.add(frame, 0)
+    table.refine(frame.id, T_world_map)
+
+
 def shift(x_m: float) -> np.ndarray:
     return transform_of(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
 def test_a_frame_refined_again_replaces_its_pose_and_counts_once() -> None:
-    history = PoseHistory()
+    history = PoseTable()
     for x_m in (0.1, 0.3):
-        history.record(odometry(0), shift(x_m))
-    history.record(odometry(1), shift(0.1))
+        record(history, odometry(0), shift(x_m))
+    record(history, odometry(1), shift(0.1))
     assert len(history) == 2
     np.testing.assert_allclose(history.mean_correction, [0.2, 0, 0, 0, 0, 0], atol=1e-12)
     corrections = history.corrections()
@@ -39,12 +46,21 @@ def test_a_frame_refined_again_replaces_its_pose_and_counts_once() -> None:
     np.testing.assert_allclose(corrections.T_map_odometry[:, 0, 3], [0.3, 0.1])
 
 
+def test_a_frame_that_comes_again_gets_a_new_row() -> None:
+    table = PoseTable()
+    record(table, odometry(0), shift(0.1))
+    table.add(odometry(0, x_m=1.0), 0)
+    table.refine(odometry(0).id, shift(1.2))
+    assert len(table) == 1
+    np.testing.assert_allclose(table.mean_correction, [0.2, 0, 0, 0, 0, 0], atol=1e-12)
+
+
 def test_the_correction_maps_the_odometrys_pose_to_the_maps() -> None:
     rng = np.random.default_rng(0)
-    history, pairs = PoseHistory(), []
+    history, pairs = PoseTable(), []
     for index in range(5):
         T_odometry, T_map = (transform_of(rng.normal(0, 1, 6)) for _ in range(2))
-        history.record(replace(odometry(index), T_world_camera=T_odometry), T_map)
+        record(history, replace(odometry(index), T_world_camera=T_odometry), T_map)
         pairs.append((T_odometry, T_map))
     corrections, latest = history.corrections(), history.latest()
     assert corrections is not None
@@ -56,9 +72,9 @@ def test_the_correction_maps_the_odometrys_pose_to_the_maps() -> None:
 
 
 def test_the_uncertainty_is_the_change_between_successive_frames() -> None:
-    history = PoseHistory()
+    history = PoseTable()
     for index in range(10):
-        history.record(odometry(index), shift(0.03 * (index % 2)))
+        record(history, odometry(index), shift(0.03 * (index % 2)))
     latest = history.latest()
     assert latest is not None
     assert latest.translation_std_m == pytest.approx(0.03 / np.sqrt(3))  # the change is along one of three axes
@@ -67,9 +83,9 @@ def test_the_uncertainty_is_the_change_between_successive_frames() -> None:
 
 def test_a_long_mission_keeps_the_newest_poses_and_thins_older_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gausslite.mapping.poses._MAX_POSES", 20)
-    history = PoseHistory()
+    history = PoseTable()
     for index in range(100):
-        history.record(odometry(index), shift(0.01))
+        record(history, odometry(index), shift(0.01))
         assert len(history) <= 20
     corrections = history.corrections()
     assert corrections is not None
@@ -81,26 +97,26 @@ def test_a_long_mission_keeps_the_newest_poses_and_thins_older_ones(monkeypatch:
 
 def test_a_restored_history_continues_with_the_same_bits() -> None:
     rng = np.random.default_rng(1)
-    first, second = PoseHistory(), PoseHistory()
+    first, second = PoseTable(), PoseTable()
     poses = [transform_of(rng.normal(0, 0.1, 6)) for _ in range(30)]
     for index, T in enumerate(poses[:20]):
-        first.record(odometry(index % 13), T)
+        record(first, odometry(index % 13), T)
     second.restore(first.state())
     for index, T in enumerate(poses[20:]):
-        first.record(odometry(index), T)
-        second.record(odometry(index), T)
+        record(first, odometry(index), T)
+        record(second, odometry(index), T)
     assert first.mean_correction.tobytes() == second.mean_correction.tobytes()
 
 
 @pytest.mark.parametrize("name", ["correction_sum", "T_world_map", "T_world_odometry"])
 @pytest.mark.parametrize("value", [np.nan, 1e30])
 def test_a_forged_state_is_refused(name: str, value: float) -> None:
-    history = PoseHistory()
-    history.record(odometry(0), shift(0.1))
+    history = PoseTable()
+    record(history, odometry(0), shift(0.1))
     state = {key: array.copy() for key, array in history.state().items()}
     state[name].flat[3] = value
     with pytest.raises(GaussLiteError, match="state"):
-        PoseHistory().restore(state)
+        PoseTable().restore(state)
 
 
 def test_corrections_between_frames_are_interpolated_and_live_ones_are_the_last() -> None:
@@ -122,11 +138,13 @@ def mean_drift_m(anchor_share: float) -> float:
         shown = wall_frame(size=(96, 72), shift_m=float(T_world_camera[0, 3]) - drift_m)
         return Rendering(shown.rgb / np.float32(255.0), shown.depth_m, np.ones_like(shown.depth_m), None)
 
-    refiner = ViewRefiner(RefinementSettings(PoseExposurePrior(1.0, 0.01), 0, anchor_share), render)
+    poses = PoseTable()
+    refiner = ViewRefiner(RefinementSettings(PoseExposurePrior(1.0, 0.01), 0, anchor_share), render, poses)
     for index in range(40):
         frame = replace(wall_frame(index, (96, 72)), T_world_camera=np.eye(4))
+        poses.add(frame, 0)
         drift_m = float(refiner.refine(frame).T_world_camera[0, 3]) + 0.002
-    return float(refiner.history.mean_correction[0])
+    return float(poses.mean_correction[0])
 
 
 def test_an_anchored_map_stays_near_the_odometry() -> None:

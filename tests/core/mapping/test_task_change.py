@@ -152,14 +152,14 @@ def test_keyframes_that_show_the_new_region_return_to_the_window() -> None:
         # the camera leaves the new region behind
         task_mapper.process(wall_frame(index, SIZE, shift_m=-0.1 * index))
     task_mapper.assign(B)
-    assert not any(view.shows_roi for view in mapper._keyframes.window)
+    assert not any(view.shows_roi for view in mapper.store.window)
     trained = []
     for index in range(12, 18):
         trained.append(task_mapper.process(wall_frame(index, SIZE, shift_m=-1.1)))
-        assert len(mapper._keyframes.window) <= 3 + 2 * 2
-    assert mapper.next_unevaluated is None
+        assert len(mapper.store.window) <= 3 + 2 * 2
+    assert mapper.store.next_unevaluated is None
     assert sum(outcome.reevaluation.seeded for outcome in trained) > 0
-    assert any(view.shows_roi for view in mapper._keyframes.window)
+    assert any(view.shows_roi for view in mapper.store.window)
     for keyframe in mapper.keyframes():
         np.testing.assert_array_equal(keyframe.relevance.roi, RIGHT.mask(keyframe.frame))
 
@@ -183,13 +183,13 @@ def test_seeds_of_the_new_region_evict_gaussians_of_the_old_region_first() -> No
 def test_sent_voxels_of_the_old_region_get_no_tombstones() -> None:
     task_mapper = make_task_mapper()
     map_frames(task_mapper, 0, 6)
-    sent = set(GRID.keys(task_mapper._mapper.roi_gaussians().means_m).tolist())
+    sent = set(GRID.keys(task_mapper._mapper.gaussians(active_only=True).means_m).tolist())
     task_mapper.assign(B)
     counts: dict[int, int] = {}
     for outcome in map_frames(task_mapper, 6, 14):
         assert outcome.changed_roi is not None
         counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
-    new = set(GRID.keys(task_mapper._mapper.roi_gaussians().means_m).tolist())
+    new = set(GRID.keys(task_mapper._mapper.gaussians(active_only=True).means_m).tolist())
     assert new <= set(counts) | sent
     assert not {key for key in sent - new if counts.get(key) == 0}
 

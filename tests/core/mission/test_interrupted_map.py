@@ -16,7 +16,7 @@ from gausslite.cli.main import main
 from gausslite.codec.state_file import read_state
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.domain.frame import Frame
-from gausslite.mapping.poses import PoseHistory
+from gausslite.mapping.poses import PoseTable
 from gausslite.mission.runner import FrameStream, OnCorrupt
 from gausslite.process import DeferredInterrupt
 
@@ -66,7 +66,7 @@ def test_a_signal_while_results_are_written_loses_none_of_them(
     sequence = write_seven_scenes(tmp_path / "kitchen")
     write = map_command.write_poses
 
-    def write_and_raise_signal(folder: Path, poses: PoseHistory, motion: np.ndarray | None) -> None:
+    def write_and_raise_signal(folder: Path, poses: PoseTable, motion: np.ndarray | None) -> None:
         signal.raise_signal(signal.SIGTERM)
         write(folder, poses, motion)
 

@@ -16,7 +16,7 @@ from gausslite.domain.pose import inverse, rotation_angle_deg, translation_m
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.mapping.keyframes import Keyframe, window_view
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.poses import RefinementSettings, ViewRefiner
+from gausslite.mapping.poses import PoseTable, RefinementSettings, ViewRefiner
 from gausslite.mapping.settings import KeyframeSettings, MapperSettings, OptimizationSettings
 from gausslite.pose_fit.exposure import AffineExposure, fit_exposure
 from gausslite.pose_fit.photometric import fit_pose
@@ -137,7 +137,7 @@ def test_keyframes_are_refined_equally_often(pose_updates_per_frame: int) -> Non
     keyframes = [Keyframe(frame, middle_relevance(frame), recorded=frame if frame.index else None) for frame in frames]
     window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
     refinement = RefinementSettings(LOOSE, pose_updates_per_frame, anchor_share=0.1)
-    refiner = ViewRefiner(refinement, lambda camera, T_world_camera, motion: rendering_like(frames[0]))
+    refiner = ViewRefiner(refinement, lambda camera, T_world_camera, motion: rendering_like(frames[0]), PoseTable())
     rounds = [list(refiner.next_keyframes(window)) for _ in range(4)]
     assert [len(turn) for turn in rounds] == [min(pose_updates_per_frame, 4)] * 4
     fitted = Counter(keyframe.frame.index for turn in rounds for keyframe in turn)
@@ -148,7 +148,9 @@ def test_a_keyframe_for_which_a_frame_has_no_time_is_refined_with_the_next_one()
     rasterizer, settings = CpuRasterizer(threads=1), KeyframeSettings()
     keyframes = [Keyframe(f, middle_relevance(f), recorded=f) for f in (wall_frame(i, SIZE) for i in range(3))]
     window = [window_view(keyframe, rasterizer, settings) for keyframe in keyframes]
-    refiner = ViewRefiner(RefinementSettings(LOOSE, 2, anchor_share=0.1), lambda *_: rendering_like(keyframes[0].frame))
+    refiner = ViewRefiner(
+        RefinementSettings(LOOSE, 2, anchor_share=0.1), lambda *_: rendering_like(keyframes[0].frame), PoseTable()
+    )
     assert next(refiner.next_keyframes(window)) is next(refiner.next_keyframes(window))
 
 

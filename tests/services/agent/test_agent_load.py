@@ -208,7 +208,7 @@ def test_after_a_full_spool_all_changes_are_published_again(tmp_path: Path) -> N
             list(a.client.ingest([frame(2, CAMERA)]))
             assert not any("disk full" in note for note in a.client.status().notes)
             assert uplink.drain(20.0)
-            active = a.worker.run(lambda mapper: mapper.roi_gaussians()).result()
+            active = a.worker.run(lambda mapper: mapper.gaussians(active_only=True)).result()
         uplink.close()
     assert int(store.batches()["robot"].counts.sum()) == len(active) > 0
 

@@ -408,9 +408,8 @@ def test_frames_are_mapped_while_the_map_is_compared_for_a_watcher(monkeypatch: 
         watching = a.stub.WatchMap(pb.WatchMapRequest())
         try:
             assert begun.wait(20)
-            [answer] = a.stub.IngestFrames(
-                iter([pb.IngestFramesRequest(frame=convert.frame_to_message(frame(1)))]), timeout=20
-            )
+            request = pb.IngestFramesRequest(frame=convert.frame_to_message(frame(1)))
+            [answer] = a.stub.IngestFrames(iter([request]), timeout=20)
             assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
         finally:
             continued.set()

@@ -131,7 +131,7 @@ def map_of(worker: MappingWorker) -> Gaussians:
 
 
 def region_batch(worker: MappingWorker) -> VoxelBatch:
-    return group_by_voxel(worker.run(lambda mapper: mapper.roi_gaussians()).result(), GRID)
+    return group_by_voxel(worker.run(lambda mapper: mapper.gaussians(active_only=True)).result(), GRID)
 
 
 def totals(batch: VoxelBatch) -> dict[int, tuple[int, int]]:
