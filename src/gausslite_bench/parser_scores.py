@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from gausslite.codec.json import graph_from_json
-from gausslite.config.command_parser import CommandParser
-from gausslite.config.program import Program
-from gausslite.config.task_parser import chosen_parser, parser_options
 from gausslite.domain.errors import InvalidInputError, TaskError
 from gausslite.domain.task import TargetRole, TaskGraph, TaskParser
-from gausslite_bench.report import Report
 
 SENTENCES = Path(__file__).with_name("parser_sentences.json")
 
@@ -43,21 +38,6 @@ class ParserScore:
     slowest_ms: float
     by_fallback: int
     wrong: tuple[str, ...]
-
-
-def configure_parser(parser: CommandParser) -> None:
-    """Add the options of `bench parser`."""
-    sentences_help = "sentences with their expected graphs (default: the set in the package)"
-    parser.add_argument("--sentences", type=Path, default=SENTENCES, metavar="FILE.json", help=sentences_help)
-    parser.add_argument("--json", action="store_true", help="print JSON for scripts")
-    Program.of(*parser_options(), flags="backend llm-model llm-url").add_to(parser)
-    parser.set_defaults(run=_run_parser)
-
-
-def _run_parser(options: argparse.Namespace) -> int:
-    score = score_parser(chosen_parser(options).open(), load_sentences(options.sentences))
-    print(Report({"backend": options.backend, **asdict(score)}).text(options.json))
-    return 0
 
 
 def load_sentences(path: Path = SENTENCES) -> list[TaskGraph]:

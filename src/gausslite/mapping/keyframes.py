@@ -23,6 +23,9 @@ from gausslite.mapping.moving import without_pixels
 from gausslite.mapping.settings import KeyframeSettings
 from gausslite.render.rasterizer import DILATION_PX2, TILE_PX, Rasterizer, Subset, TrainingView
 
+_ROI_MARGIN_PX = 5
+"""Margin around the ROI within which tiles are rendered in the active phase: SSIM's window needs it."""
+
 
 def frame_state(frame: Frame) -> dict[str, NDArray[Any]]:
     """Return a frame with its camera and pose as named arrays."""
@@ -208,7 +211,7 @@ class WindowView:
 def window_view(keyframe: Keyframe, rasterizer: Rasterizer, settings: KeyframeSettings) -> WindowView:
     """Prepare a keyframe for training. The margin gives the SSIM window its neighbours at the ROI's border."""
     frame, relevance = keyframe.frame, keyframe.relevance
-    tiles, pixel_weights = tiles_touching(relevance.roi, settings.roi_margin_px), relevance.pixel_weights
+    tiles, pixel_weights = tiles_touching(relevance.roi, _ROI_MARGIN_PX), relevance.pixel_weights
     if settings.roi_context_weight > 0:
         context = np.float32(settings.roi_context_weight) * _pixels_inside(tiles, pixel_weights.shape)
         pixel_weights = np.maximum(pixel_weights, context)

@@ -30,6 +30,10 @@ _CELL_PX = 8
 _MAX_RELATIVE_DEPTH_ERROR = 0.05
 """A Gaussian within this fraction of the measured depth lies on the visible surface."""
 _MEDIAN_STEP_PX = 4
+_RESERVED_VIEWS = 4.0
+"""Background seeds leave free slots for this many more images."""
+_EDGE_EPSILON = 0.01
+"""ε of GFD (Sec. III-C.3)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -326,13 +330,13 @@ class Seeder:
         return _Pool(pixels, min(budget, max_count), stratified=False)
 
     def _background_pool(self, pixels: Bool[ndarray, "h w"], budget: int, free_slots: int) -> _Pool:
-        """Limit the density of seeds so that `reserved_views` more full images would fit under the cap.
+        """Limit the density of seeds so that _RESERVED_VIEWS more full images would fit under the cap.
 
         Otherwise the first views would fill the map. With fewer free slots, seeds are sparser and start larger.
         """
         settings = self._settings
         max_density = settings.first_frame_seeds / _REFERENCE_PIXELS
-        affordable = free_slots / (settings.reserved_views * pixels.size)
+        affordable = free_slots / (_RESERVED_VIEWS * pixels.size)
         density = min(max_density, max(affordable, settings.min_density_ratio * max_density))
         count = min(budget, int(np.ceil(density * np.count_nonzero(pixels))))
         return _Pool(pixels, count, stratified=self._components.sis)
@@ -347,7 +351,7 @@ class Seeder:
         if not self._components.gfd:
             return np.ones(frame.depth_m.shape, np.float32)
         edges = edge_magnitude(frame.rgb)
-        return edges + np.float32(self._settings.edge_epsilon)
+        return edges + np.float32(_EDGE_EPSILON)
 
     def _draw(
         self, frame: Frame, relevance: RelevanceMap, pool: _Pool, pixel_weights: Float32[ndarray, "h w"]

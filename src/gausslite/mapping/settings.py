@@ -65,13 +65,12 @@ class SeedingSettings:
     min_alpha, roi_min_alpha: background and ROI pixels of lower rendered alpha are seeded. depth_error_factor: pixels
     rendered behind the measured depth by this multiple of the median depth error are seeded. roi_pixels_per_gaussian:
     ROI pixels per active Gaussian, below which the ROI is dense enough. fill_sparse_roi: seed ROI pixels with fewer
-    active Gaussians too. reserved_views: background seeds leave free slots for this many more images.
-    min_density_ratio: lowest density of background seeds relative to a first frame's. background_share: share of the
-    cap that ROI seeds leave to the background; they become sparser as the region fills the rest. opacity, roi_scale,
-    background_scale: opacity and the multipliers m of s0 (Sec. III-C.2); init_scale: m without SIS. edge_epsilon: ε of
-    GFD (Sec. III-C.3). fill_depth: blocks without a measured depth are seeded too, at `with_filled_depth`. Sensors have
-    none on dark, glossy or distant surfaces and at the border of registered images; without seeds, the colours there
-    distort the Gaussians around.
+    active Gaussians too. min_density_ratio: lowest density of background seeds relative to a first frame's.
+    background_share: share of the cap that ROI seeds leave to the background; they become sparser as the region fills
+    the rest. opacity, roi_scale, background_scale: opacity and the multipliers m of s0 (Sec. III-C.2); init_scale: m
+    without SIS. fill_depth: blocks without a measured depth are seeded too, at `with_filled_depth`. Sensors have none
+    on dark, glossy or distant surfaces and at the border of registered images; without seeds, the colours there distort
+    the Gaussians around.
     """
 
     first_frame_seeds: int = 60_000
@@ -81,7 +80,6 @@ class SeedingSettings:
     roi_min_alpha: float = 0.9
     roi_pixels_per_gaussian: float = 4.0
     fill_sparse_roi: bool = True
-    reserved_views: float = 4.0
     min_density_ratio: float = 0.1
     background_share: float = 0.3
     depth_error_factor: float = 40.0
@@ -90,7 +88,6 @@ class SeedingSettings:
     roi_scale: float = 0.5
     background_scale: float = 0.7
     init_scale: float = 1.0
-    edge_epsilon: float = 0.01
     fill_depth: bool = True
 
     def __post_init__(self) -> None:
@@ -101,13 +98,11 @@ class SeedingSettings:
         _require(0 < self.opacity < 1, "seeding opacity", "more than 0 and less than 1", self.opacity)
         for name in (
             "roi_pixels_per_gaussian",
-            "reserved_views",
             "depth_error_factor",
             "max_depth_m",
             "roi_scale",
             "background_scale",
             "init_scale",
-            "edge_epsilon",
         ):
             _require(getattr(self, name) > 0, f"seeding {name}", "more than 0", getattr(self, name))
 
@@ -119,10 +114,9 @@ class KeyframeSettings:
     every: every `every`th mapped frame is a keyframe. window: most recent keyframes to train on. buffer: keyframes of
     the whole mission to keep. long_term_keyframes: more frames to train on, spread over the mission: this number that
     show the ROI and as many others; 0 is the paper's window. Each needs as much memory as a keyframe of the window.
-    roi_margin_px: margin around the ROI within which tiles are rendered in the active phase. roi_context_weight: weight
-    in the active phase's loss of pixels outside the ROI but inside its tiles, 0 to 1; 0 is the paper's binary mask.
-    pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame if
-    `MapperSettings.pose_prior` allows an error. depth_edge_px: depth within this distance of a depth jump is not
+    roi_context_weight: weight in the active phase's loss of pixels outside the ROI but inside its tiles, 0 to 1; 0 is
+    the paper's binary mask. pose_updates_per_frame: keyframes whose pose and exposure are refined again with each frame
+    if `MapperSettings.pose_prior` allows an error. depth_edge_px: depth within this distance of a depth jump is not
     trained; 0 trains all depth, as the paper. rotates: views train in turn (`ViewRotation`); False draws them
     uniformly, as the paper. half_size_from_px: an iteration on whole images of at least this many pixels trains four of
     them in half size, with the pixels of one; inf trains one in full size, as the paper. max_pixels: cap on the pixels
@@ -134,7 +128,6 @@ class KeyframeSettings:
     window: int = 24
     buffer: int = 96
     long_term_keyframes: int = 24
-    roi_margin_px: int = 5
     roi_context_weight: float = 0.3
     pose_updates_per_frame: int = 2
     depth_edge_px: int = 2
@@ -145,7 +138,7 @@ class KeyframeSettings:
     def __post_init__(self) -> None:
         for name in ("every", "window", "buffer", "half_size_from_px", "max_pixels"):
             _require(getattr(self, name) >= 1, f"keyframes {name}", "at least 1", getattr(self, name))
-        for name in ("long_term_keyframes", "roi_margin_px", "pose_updates_per_frame", "depth_edge_px"):
+        for name in ("long_term_keyframes", "pose_updates_per_frame", "depth_edge_px"):
             _require(getattr(self, name) >= 0, f"keyframes {name}", "at least 0", getattr(self, name))
         weight = self.roi_context_weight
         _require(0 <= weight <= 1, "keyframes roi_context_weight", "0 to 1", weight)

@@ -12,11 +12,11 @@ from gausslite.config.option import build
 from gausslite.config.program import add_flags
 from gausslite_bench.chaos.run import ChaosSettings, run_chaos
 from gausslite_bench.cli.loop import configure_loop
+from gausslite_bench.cli.parser import configure_parser
 from gausslite_bench.cli.perception import configure_perception
 from gausslite_bench.cli.quality import configure_ablation, configure_quality
 from gausslite_bench.cli.team import configure_team
 from gausslite_bench.fuzz.run import FuzzSettings, run_fuzz
-from gausslite_bench.parser_scores import configure_parser
 from gausslite_bench.raster.operation_costs import GpuSettings, RasterSettings, run_gpu, run_raster
 from gausslite_bench.report import Report
 from gausslite_bench.server.bench import ServerBenchSettings, run_server

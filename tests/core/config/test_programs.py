@@ -47,6 +47,8 @@ def program_parsers() -> Iterator[CommandParser]:
     yield from (commands["bench"].commands[name] for name in BENCHMARKS)
 
 
+POSITIONAL = {"gausslite eval": ["map.ply"], "gausslite parse": ["Find the mug"]}
+"""What these commands need, which is no setting."""
 PARSERS = {parser.prog: parser for parser in program_parsers()}
 every_program = pytest.mark.parametrize("name", PARSERS)
 
@@ -57,7 +59,7 @@ def program_of(name: str) -> Program:
 
 
 def read(name: str, *arguments: str, environment: Mapping[str, str] | None = None) -> Namespace:
-    return parse_options(PARSERS[name], arguments, environment or {}, warn=print)
+    return parse_options(PARSERS[name], [*POSITIONAL.get(name, ()), *arguments], environment or {}, warn=print)
 
 
 def required(program: Program, *, except_for: str = "") -> list[str]:
