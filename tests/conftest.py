@@ -16,11 +16,32 @@ BESIDE_THE_CORE = ("gausslite_calibration", "gausslite_sim", "gausslite_bench")
 shape_checks.install([*(f"gausslite.{name}" for name in WITH_SHAPES.split()), *BESIDE_THE_CORE])
 
 # a busy machine is no failure: no test depends on a time
-hypothesis.settings.register_profile("untimed", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
-hypothesis.settings.load_profile("untimed")
+for _profile, _examples in (("not slow", 40), ("slow", 200)):
+    hypothesis.settings.register_profile(
+        _profile, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow], max_examples=_examples
+    )
 
 # a shell starts background jobs with SIGINT ignored; the tests of interrupts need Python's handler
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Check properties on few examples, and on many with the slow tests."""
+    hypothesis.settings.load_profile("not slow" if config.option.markexpr == "not slow" else "slow")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out modules of slow tests before they are imported, which takes each process seconds."""
+    is_module = collection_path.suffix == ".py" and config.option.markexpr == "not slow"
+    return (is_module and "\npytestmark = pytest.mark.slow" in collection_path.read_text()) or None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Run all properties with the slow tests too, where they have many examples."""
+    for item in items:
+        if config.option.markexpr == "slow" and getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")

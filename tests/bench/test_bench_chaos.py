@@ -17,6 +17,7 @@ from gausslite_bench.chaos.acknowledged import AgentAcknowledgements, StoreCompa
 from gausslite_bench.chaos.journal import Journal, JournalRecord, RecordKind
 
 
+@pytest.mark.slow
 def test_nothing_acknowledged_is_lost_in_a_short_run(capsys: pytest.CaptureFixture[str]) -> None:
     # the faults of this seed: a kill of the server, and one of an agent
     assert main(["bench", "chaos", "--kills", "2", "--agents", "2", "--seed", "9", "--json"]) == 0

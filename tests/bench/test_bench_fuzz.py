@@ -17,6 +17,7 @@ from gausslite_bench.fuzz.mutations import Mutator
 from gausslite_bench.fuzz.protobuf_fields import change_field, encode_fields, parse_fields
 
 
+@pytest.mark.slow
 def test_no_mutated_message_crashes_or_blocks_a_program(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "fuzz", "--messages", "1000", "--seed", "5", "--json"]) == 0
     results = json.loads(capsys.readouterr().out)["targets"]

@@ -169,6 +169,7 @@ def test_the_ablation_table_has_one_row_per_component_and_both_budgets() -> None
     assert "ROI PSNR↑, fitted, equal time" in table
 
 
+@pytest.mark.slow
 def test_the_command_computes_caches_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
@@ -212,6 +213,7 @@ def test_a_task_independent_map_is_built_once_for_all_tasks(tmp_path: Path, monk
     assert results[-1].result.scores == last.result.scores
 
 
+@pytest.mark.slow
 def test_the_ablation_uses_the_requested_budget(tmp_path: Path) -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")

@@ -12,6 +12,7 @@ from gausslite.cli.main import main
 from gausslite_bench.service_process import FUSION_SERVER, ServiceProcess
 
 
+@pytest.mark.slow
 def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.CaptureFixture[str]) -> None:
     command = f"{FUSION_SERVER} --set frame-alignment=trust"
     arguments = ("bench", "server", "--held", "20000", "--agents", "2,3", "--seconds", "1", "--server", command)
@@ -26,6 +27,7 @@ def test_every_message_is_acknowledged_and_the_figures_are_there(capsys: pytest.
     assert min(result[name] for name in ("snapshot_s", "status_ms", "restart_s", "rss_mib")) > 0
 
 
+@pytest.mark.slow
 def test_good_agents_are_measured_beside_an_attack(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("bench", "server", "--held", "0", "--seconds", "1", "--hostile", "tombstones,half-open")
     assert main([*arguments, "--json"]) == 0

@@ -14,6 +14,7 @@ from gausslite.cli.main import main
 from gausslite_bench.team.scenes import HomeTeamPlan
 
 
+@pytest.mark.slow
 def test_a_team_is_mapped_fused_and_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     size = ("--size", "80x60", "--frames", "4", "--views", "2", "--max-gaussians", "3000", "--iterations", "2")
     arguments = ("bench", "team", "--homes", "4", "--policies", "task,uniform", "--refine-iterations", "3")
@@ -45,6 +46,7 @@ def test_four_agents_of_a_home_see_different_views() -> None:
         assert np.median(distances_m.min(axis=1)) > 0.01
 
 
+@pytest.mark.slow
 def test_parts_of_a_recording_make_a_team(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_seven_scenes(tmp_path / "wall", tuple(range(18)))
     voxels = np.stack(np.meshgrid(range(-4, 4), range(-4, 4), [19, 20], indexing="ij"), axis=-1).reshape(-1, 3)

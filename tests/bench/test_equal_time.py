@@ -32,6 +32,7 @@ def test_a_rate_of_another_trial_is_not_used(tmp_path: Path, content: str) -> No
     assert stored_rate(tmp_path, study(TIMED).trials(PLAN)) is None
 
 
+@pytest.mark.slow
 def test_the_rate_of_uniform_mapping_is_measured_and_reused_on_resume(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

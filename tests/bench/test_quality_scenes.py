@@ -111,6 +111,7 @@ def test_regions_of_another_sequence_are_refused(tmp_path: Path, capsys: pytest.
     assert not (tmp_path / "out" / "quality.md").exists()
 
 
+@pytest.mark.slow
 def test_regions_that_no_frame_shows_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
     kitchen, roi = write_kitchen(tmp_path, mug_1=WALL, lamp_1=[(500, 500, 500)])

@@ -74,6 +74,7 @@ def test_an_exact_home_needs_no_estimate(capsys: pytest.CaptureFixture[str]) -> 
     require_same_report(HOME, mapped, capsys)
 
 
+@pytest.mark.slow
 def test_the_prior_of_a_drifting_home_is_estimated(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     sequence, mapped = require_same(f"{HOME}&drift=5%", capsys)
@@ -82,6 +83,7 @@ def test_the_prior_of_a_drifting_home_is_estimated(capsys: pytest.CaptureFixture
     require_same_report(f"{HOME}&drift=5%", mapped, capsys)
 
 
+@pytest.mark.slow
 def test_the_camera_of_a_home_with_a_real_one_is_estimated() -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     source = open_source("sim:home-1?frames=60&size=96x72&noise=0&exposure=0&speed=60&shutter=30ms")
@@ -93,6 +95,7 @@ def test_the_camera_of_a_home_with_a_real_one_is_estimated() -> None:
     assert [evidence.option for evidence in stated.evidence] == ["register-depth", "pose-prior"]
 
 
+@pytest.mark.slow
 def test_a_real_clip_gets_all_three_estimates(
     shared_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

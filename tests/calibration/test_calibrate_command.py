@@ -17,6 +17,7 @@ pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`"
 TURNING = "sim:home-1?frames=60&size=96x72&noise=0&exposure=0&speed=60&shutter=30ms"
 
 
+@pytest.mark.slow
 def test_an_agent_takes_the_lines_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "camera.toml"
     assert main(["calibrate", TURNING, "--lens", "radtan:0,0,0,0", "--out", str(path)]) == 0
@@ -32,6 +33,7 @@ def test_an_agent_takes_the_lines_as_they_are(tmp_path: Path, capsys: pytest.Cap
     assert settings.mission.pose_prior.is_exact
 
 
+@pytest.mark.slow
 def test_json_has_every_estimate_and_its_evidence(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", "sim:home-1?frames=8&size=64x48&speed=1&blur=1ms&drift=1%", "--json"]) == 0
     stored = json.loads(capsys.readouterr().out)
@@ -51,6 +53,7 @@ def test_depth_of_a_layout_that_states_nothing_is_not_called_unregistered(
     assert evidence["camera_correction"] == ["needs depth that is known to be registered to colour"]
 
 
+@pytest.mark.slow
 def test_the_published_lens_is_kept_and_the_readout_of_a_real_clip_is_found(
     shared_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

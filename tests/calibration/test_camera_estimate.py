@@ -23,6 +23,7 @@ HOME = "sim:home-1?frames=90&size=160x120&noise=0&exposure=0"
 PINHOLE = Lens(LensModel.RADTAN, (0.0, 0.0, 0.0, 0.0))
 
 
+@pytest.mark.slow
 def test_lens_and_readout_of_a_turning_camera_are_estimated() -> None:
     source = open_source(f"{HOME}&speed=60&shutter=30ms&lens=radtan:-0.2,0,0,0")
     estimate = estimate_camera(source, CameraCorrection())
@@ -36,6 +37,7 @@ def test_lens_and_readout_of_a_turning_camera_are_estimated() -> None:
     assert [line.partition(":")[0] for line in estimate.evidence] == ["lens", "readout and offset", "exposure"]
 
 
+@pytest.mark.slow
 def test_the_exposure_time_is_estimated_from_blur() -> None:
     spec = "sim:home-1?frames=90&size=240x180&exposure=0&speed=60&blur=10ms"
     exposure_s, evidence = estimate_exposure_time(open_source(spec), CameraCorrection())
@@ -43,12 +45,14 @@ def test_the_exposure_time_is_estimated_from_blur() -> None:
     assert "pairs of a fast and a slower frame" in evidence
 
 
+@pytest.mark.slow
 def test_an_ideal_camera_is_left_alone() -> None:
     estimate = estimate_camera(open_source(f"{HOME}&speed=60"), CameraCorrection())
     assert estimate.correction.is_identity
     assert all("not used" in line or "expected at least" in line for line in estimate.evidence), estimate.evidence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout_ms", [0, 30])
 def test_drifting_poses_neither_hide_nor_feign_a_readout_time_and_a_known_lens_is_kept(
     tmp_path: Path, readout_ms: int
@@ -78,6 +82,7 @@ def test_black_images_give_no_estimate(tmp_path: Path) -> None:
     assert estimate.evidence == ("0 pairs of frames can be compared, expected at least 4",)
 
 
+@pytest.mark.slow
 def test_no_lens_is_estimated_from_tiny_images() -> None:
     home = "sim:home-1?frames=40&size=96x72&noise=0&exposure=0&speed=60&lens=radtan:-0.2,0,0,0"
     estimate = estimate_camera(open_source(home), CameraCorrection())

@@ -131,6 +131,7 @@ def test_poses_of_another_recording_are_refused(recording: Recording) -> None:
         calibrate(recording, NOTHING_ESTIMATED)
 
 
+@pytest.mark.slow
 def test_right_poses_agree_also_with_their_usual_errors(recording: Recording) -> None:
     assert find_contradiction(recording) is None
     rng = np.random.default_rng(0)
@@ -169,6 +170,7 @@ def test_a_wrong_unit_that_the_files_do_not_state_is_noted(recording: Recording)
         calibrate(recording)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tum_fr1", "redkitchen", "hololens_kitchenette"])
 def test_real_recordings_agree(shared_dir, name: str) -> None:
     assert find_contradiction(open_source(str(shared_dir / "data" / name))) is None
@@ -185,6 +187,7 @@ def with_camera(recording: Recording, **changed_px: float) -> None:
     recording.frames = [replace(frame, camera=replace(frame.camera, **changed_px)) for frame in recording.frames]
 
 
+@pytest.mark.slow
 def test_another_principal_point_or_ratio_of_focal_lengths_is_named(home: Source) -> None:
     recording = Recording(home, list(range(0, 48, 2)))
     camera = recording.frames[0].camera
@@ -211,6 +214,7 @@ def test_mirrored_depth_images_are_named(recording: Recording) -> None:
         calibrate(recording, NOTHING_ESTIMATED)
 
 
+@pytest.mark.slow
 def test_depth_images_with_swapped_bytes_are_refused(recording: Recording) -> None:
     swapped = [np.round(1000 * frame.depth_m).astype(np.uint16).byteswap() / 1000 for frame in recording.frames]
     recording.frames = [

@@ -21,6 +21,7 @@ def moving() -> MovingPairs:
     return MovingPairs.read(open_source(f"{HOME}&shutter=30ms&lens=radtan:-0.2,0.03,0,0"), SIZE)
 
 
+@pytest.mark.slow
 def test_both_radial_coefficients_and_the_readout_time_are_fitted_together(moving: MovingPairs) -> None:
     fit = fit_camera(moving, CameraCorrection(Lens.parse("radtan:-0.15,0,0,0"), readout_s=0.02), fits_lens=True)
     assert fit is not None

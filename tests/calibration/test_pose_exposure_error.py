@@ -19,6 +19,8 @@ from gausslite_calibration.pose_errors import estimate_pose_exposure_prior
 FRAMES = 40
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
+pytestmark = pytest.mark.slow
+
 
 class Recording(WrappedSource):
     """A trajectory through a simulated home with pose errors and automatic exposure."""

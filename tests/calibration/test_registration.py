@@ -45,6 +45,7 @@ def test_a_known_colour_camera_is_estimated() -> None:
     assert found.registration.intrinsics.cy == pytest.approx(truth.intrinsics.cy, abs=1.0)
 
 
+@pytest.mark.slow
 def test_a_colour_camera_of_another_focal_length_is_estimated() -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     home = open_source("sim:home?seed=0&trajectory=0&frames=6&size=320x240&noise=0")
@@ -84,6 +85,7 @@ class EnlargedSource(WrappedSource):
         return replace(frame, rgb=image.rgb, depth_m=image.depth_m, camera=image.camera)
 
 
+@pytest.mark.slow
 def test_the_camera_of_large_images_is_estimated() -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     k = open_source("sim:home?frames=6&size=320x240").camera
@@ -115,6 +117,7 @@ class UnregisteredSource(WrappedSource):
         return unregister(self._source.frame(i), self._T_colour_depth)
 
 
+@pytest.mark.slow
 def test_unregistered_depth_gets_the_estimated_registration() -> None:
     pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
     k = open_source("sim:home?frames=6&size=320x240").camera

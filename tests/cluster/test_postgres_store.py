@@ -9,7 +9,7 @@ from threading import Thread
 import numpy as np
 import pytest
 from support.postgres_running import PASSWORD, PostgresServer, postgres_server
-from test_fusion_stores import make_subset
+from support.sample_batches import random_subset
 
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import InvalidInputError, StorageError, UnavailableError
@@ -19,6 +19,8 @@ psycopg = pytest.importorskip("psycopg", reason="the extra `postgres` is not ins
 
 from gausslite_cluster.postgres_regions import SharedSlots  # noqa: E402
 from gausslite_cluster.postgres_store import SCHEMA_VERSION, PostgresStore  # noqa: E402
+
+pytestmark = pytest.mark.slow
 
 
 def execute(url: str, *statements: str) -> None:
@@ -48,9 +50,9 @@ def one_line(act: Callable[[], object]) -> str:
 def test_a_lost_connection_is_opened_again_without_an_error(postgres: PostgresServer) -> None:
     url = postgres.new_database()
     store = PostgresStore(url)
-    store.put(make_subset("ant", 1, {11: 2}))
+    store.put(random_subset("ant", 1, {11: 2}))
     end_connections(url)
-    assert store.put(make_subset("ant", 2, {11: 3, 22: 1})).accepted.tolist() == [11, 22]
+    assert store.put(random_subset("ant", 2, {11: 3, 22: 1})).accepted.tolist() == [11, 22]
     end_connections(url)
     assert store.batch("ant").counts.tolist() == [3, 1]
     store.save_record("ant", "objects", b"mug")
@@ -61,15 +63,15 @@ def test_a_lost_connection_is_opened_again_without_an_error(postgres: PostgresSe
 def test_a_store_that_another_server_used_meanwhile_refuses_to_go_on(postgres: PostgresServer) -> None:
     url = postgres.new_database()
     store = PostgresStore(url)
-    store.put(make_subset("ant", 1, {11: 2}))
+    store.put(random_subset("ant", 1, {11: 2}))
     end_connections(url)
     other = PostgresStore(url)
-    assert "in use by another server" in one_line(lambda: store.put(make_subset("ant", 2, {11: 3})))
-    other.put(make_subset("ant", 5, {11: 4}))
+    assert "in use by another server" in one_line(lambda: store.put(random_subset("ant", 2, {11: 3})))
+    other.put(random_subset("ant", 5, {11: 4}))
     other.close()
     # the pause after the failed attempt
     time.sleep(0.2)
-    assert "changed by another server" in one_line(lambda: store.put(make_subset("ant", 2, {11: 3})))
+    assert "changed by another server" in one_line(lambda: store.put(random_subset("ant", 2, {11: 3})))
     store.close()
     again = PostgresStore(url)
     assert again.batch("ant").counts.tolist() == [4]
@@ -86,13 +88,13 @@ def test_a_database_is_used_by_one_server_alone_or_shared_with_one_owner_of_each
     assert two.owners().server_of == {1: "one:1", 2: "one:1", 3: "one:1", 4: "two:1"}
     store = one.open_store()
     key = next(key for key in range(0, 1 << 40, 1 << 26) if slots_of(np.array([key]))[0] == 1)
-    store.put(make_subset("ant", 1, {key: 2}))
+    store.put(random_subset("ant", 1, {key: 2}))
     one.release({2, 3})
     assert two.take({2, 3}) == {2, 3}
     end_connections(url)
     # the locks are gone, so its rows are not its own any more
     with pytest.raises(UnavailableError, match="was lost"):
-        store.put(make_subset("ant", 2, {key: 3}))
+        store.put(random_subset("ant", 2, {key: 3}))
     store.close()
     assert two.owners().servers == ("one:1", "two:1")
     assert two.take({1, 2, 3, 4}) == {1, 2, 3, 4}
@@ -120,7 +122,7 @@ def test_a_killed_database_loses_nothing_acknowledged(postgres: PostgresServer) 
         while time.monotonic() < deadline_s and not (errors and len(acknowledged) >= 60):
             update_seq += 1
             try:
-                store.put(make_subset("ant", update_seq, {11: 2, 1000 + update_seq: 1}))
+                store.put(random_subset("ant", update_seq, {11: 2, 1000 + update_seq: 1}))
                 acknowledged.append(update_seq)
             except StorageError as error:
                 errors.append(str(error))
@@ -153,15 +155,15 @@ def test_a_standby_that_takes_over_is_used_only_if_it_has_all_commits(is_synchro
         with primary.standby(is_synchronous) as standby:
             url = f"{url},{standby.socket_folder}&target_session_attrs=read-write"
             store = PostgresStore(url)
-            store.put(make_subset("ant", 1, {11: 2}))
+            store.put(random_subset("ant", 1, {11: 2}))
             incarnation_id = store.incarnation_id
             primary.kill()
             standby.promote()
             if is_synchronous:
-                store.put(make_subset("ant", 2, {22: 3}))
+                store.put(random_subset("ant", 2, {22: 3}))
                 assert store.batch("ant").counts.tolist() == [2, 3]
             else:
-                assert "acknowledged data is missing" in one_line(lambda: store.put(make_subset("ant", 2, {22: 3})))
+                assert "acknowledged data is missing" in one_line(lambda: store.put(random_subset("ant", 2, {22: 3})))
             store.close()
             again = PostgresStore(url)
             assert again.batch("ant").counts.tolist() == ([2, 3] if is_synchronous else [])
@@ -173,12 +175,12 @@ def test_a_standby_that_takes_over_is_used_only_if_it_has_all_commits(is_synchro
 def test_a_refused_message_changes_nothing_and_later_ones_are_stored(postgres: PostgresServer) -> None:
     url = postgres.new_database()
     store = PostgresStore(url)
-    store.put(make_subset("ant", 1, {11: 3}))
+    store.put(random_subset("ant", 1, {11: 3}))
     execute(url, "ALTER TABLE gausslite.voxel_updates ADD CONSTRAINT few CHECK (octet_length(voxels) < 4000)")
-    group = [StoredSubset.exact(make_subset(*own)) for own in (("bee", 2, {11: 5}), ("ant", 2, {11: 1, 22: 100}))]
+    group = [StoredSubset.exact(random_subset(*own)) for own in (("bee", 2, {11: 5}), ("ant", 2, {11: 1, 22: 100}))]
     assert 'violates check constraint "few"' in one_line(lambda: store.put_all(group))
     assert {name: batch.counts.tolist() for name, batch in store.batches().items()} == {"ant": [3]}
-    store.put(make_subset("ant", 3, {11: 2}))
+    store.put(random_subset("ant", 3, {11: 2}))
     assert store.batch("ant").counts.tolist() == [2]
     store.close()
 
@@ -186,7 +188,7 @@ def test_a_refused_message_changes_nothing_and_later_ones_are_stored(postgres: P
 def test_damaged_rows_are_one_clear_error(postgres: PostgresServer) -> None:
     url = postgres.new_database()
     store = PostgresStore(url)
-    store.put(make_subset("ant", 1, {11: 2}))
+    store.put(random_subset("ant", 1, {11: 2}))
     store.save_keyframe("ant", 3, b"image")
     store.save_record("ant", "objects", b"mug")
     execute(url, "UPDATE gausslite.keyframes SET data = 'other'", "UPDATE gausslite.records SET data = 'other'")

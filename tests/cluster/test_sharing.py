@@ -15,11 +15,10 @@ import grpc
 import numpy as np
 import pytest
 from certificates import identity, make_certificates
-from fusion_running import CAMERA, COMMAND, GRID, frame, fusion_server, request
+from fusion_running import CAMERA, COMMAND, GRAPH, GRID, MUG, frame, fusion_server, request
 from sample_gaussians import plain_gaussians
 from sharing_running import SharingServer, sharing_server, sharing_servers, wait_until_settled
 from support.postgres_running import PostgresServer
-from test_fusion_objects import GRAPH, MUG
 from waiting import wait_until
 
 from gausslite.codec.ply import gaussians_from_ply, ply_bytes
@@ -60,6 +59,8 @@ from gausslite_bench.async_calls import UpdateStreams
 from gausslite_cluster.regions import ALL_SLOTS, slots_of, wanted_slots
 
 pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
+
+pytestmark = pytest.mark.slow
 
 AGENTS = ("ant", "bee", "cat")
 

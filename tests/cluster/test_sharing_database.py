@@ -15,6 +15,8 @@ from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
 
+pytestmark = pytest.mark.slow
+
 psycopg = pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
 
 __all__ = ["folder"]

@@ -50,6 +50,7 @@ BACKENDS: dict[str, Callable[[], Rasterizer]] = {
     "cuda": lambda: _cuda(is_emulated=False),
     "cuda emulation": lambda: _cuda(is_emulated=True),
 }
+SLOW_BACKENDS = ("reference", "cuda emulation")
 
 
 @pytest.fixture(scope="session", params=BACKENDS)

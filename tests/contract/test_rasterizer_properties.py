@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 from splat_scenes import random_rows, rotated_pose
 
@@ -11,7 +12,6 @@ from gausslite.domain.camera import Camera
 from gausslite.render.rasterizer import OPACITY_LOGIT, Rasterizer, Subset
 
 CAMERA = Camera(30.0, 30.0, 16.0, 12.0, 33, 25)
-few_examples = settings(max_examples=20)
 seeds = st.integers(0, 2**32 - 1)
 counts = st.integers(0, 80)
 sizes_m = st.sampled_from([1e-3, 0.03, 0.2, 1.0])

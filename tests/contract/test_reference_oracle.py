@@ -28,6 +28,7 @@ def exp_twist(twist: np.ndarray) -> np.ndarray:
     return torch.linalg.matrix_exp(torch.from_numpy(generator)).numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["medium splats", "large splats", "outside the view", "needles and sheets"])
 def test_row_gradients_match_finite_differences_along_random_directions(oracle: Rasterizer, name: str) -> None:
     scene = named_scene(name)

@@ -22,6 +22,8 @@ from gausslite.domain.recording import DepthRegistration
 
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
+pytestmark = pytest.mark.slow
+
 SMALL = ("--size", "128x96", "--max-gaussians", "5000", "--iterations", "3", "--set", "refine-iterations=20")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_grounding import VOCABULARY, TinyTokenizer, write_tiny_grounding
 from tiny_yolo import write_tiny_yolo
@@ -129,7 +129,6 @@ def test_a_phrase_is_padded_to_the_networks_length():
     assert len(read.is_noun) == 7
 
 
-@settings(max_examples=50)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 40), st.integers(1, 40))
 def test_an_image_keeps_its_proportions_and_fills_one_side(height, width, to_height, to_width):
     values, mask = preprocess(np.full((height, width, 3), 255, np.uint8), (to_height, to_width), keep_proportions=True)

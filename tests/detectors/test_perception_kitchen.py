@@ -18,6 +18,8 @@ from gausslite_detectors.model_file import open_model
 from gausslite_detectors.yolo import YoloDetector, load_yolo
 from gausslite_language.rules import RuleParser
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def kitchen(shared_dir: Path) -> Source:

@@ -24,6 +24,8 @@ pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`"
 pytest.importorskip("rosbags", reason="the bag needs the extra `ros`")
 pytest.importorskip("gsply", reason="exports need the extra `export`")
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if "<!-- test" in path.read_text(encoding="utf-8"))
 LIMIT_S = 120

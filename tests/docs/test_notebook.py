@@ -15,6 +15,8 @@ pytest.importorskip("nbclient", reason="the extra `test` is not installed")
 pytest.importorskip("ipykernel", reason="the extra `test` is not installed")
 pytest.importorskip("embreex", reason="the simulated home needs the extra `sim`")
 
+pytestmark = pytest.mark.slow
+
 NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "first_map.ipynb"
 
 

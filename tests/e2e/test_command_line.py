@@ -53,6 +53,7 @@ def mug_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_map_writes_a_map_of_the_task_and_a_report(mug_map: Path) -> None:
     report = json.loads((mug_map / "report.json").read_text())
     gaussians = read_ply(mug_map / "map.ply")
@@ -67,6 +68,7 @@ def test_map_writes_a_map_of_the_task_and_a_report(mug_map: Path) -> None:
     assert first.total < last.total <= len(gaussians)
 
 
+@pytest.mark.slow
 def test_eval_prints_lpips_with_a_file_of_it(mug_map: Path, shared_dir: Path) -> None:
     file = shared_dir / "models" / "lpips_squeeze.onnx"
     ball = ("--size", "160x120", "--test-every", "4", "--set", "target-at=2,2,0.8,0.5")

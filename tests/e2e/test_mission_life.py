@@ -11,6 +11,8 @@ import pytest
 from mission_life import Life, encoded_frames, live
 from tiny_yolo import write_tiny_yolo
 
+pytestmark = pytest.mark.slow
+
 _SHARED = Path(__file__).resolve().parents[3] / "shared"
 _KITCHEN, _DETECTOR = _SHARED / "data" / "redkitchen", _SHARED / "models" / "yolo11n-seg_int8.onnx"
 _FRAMES = 24

@@ -98,6 +98,7 @@ def test_coverage_is_the_share_of_measured_pixels_that_the_map_covers() -> None:
     assert evaluate(whole, [unmeasured], ReferenceRasterizer()).roi_covered is None
 
 
+@pytest.mark.slow
 def test_a_view_with_few_roi_pixels_counts_for_the_whole_image_only() -> None:
     gaussians = wall()
     frame = frame_of(gaussians)

@@ -63,6 +63,7 @@ def test_ply_of_the_region_holds_exactly_its_gaussians(tmp_path):
     assert (written.kappa == gaussians.kappa[gaussians.active]).all()
 
 
+@pytest.mark.slow
 def test_spz_is_read_by_gsply_within_its_resolution(tmp_path):
     gaussians = random_map()
     data = gsply.read_spz(str(export(tmp_path, "spz", gaussians)))

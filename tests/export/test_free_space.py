@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pyoctomap
+import pytest
 import yaml
 
 from gausslite.codec.run_files import KeyframeView
@@ -69,6 +70,7 @@ def test_a_rooms_inside_is_free_its_walls_are_occupied_and_behind_them_is_unknow
     assert all(at(x, y) == 205 for x in (2.45, 2.95) for y in (-1.45, 0.05, 1.45))
 
 
+@pytest.mark.slow
 def test_free_cells_change_neither_size_nor_origin_nor_obstacles_and_need_keyframes(tmp_path):
     gaussians = room()
     bare, bare_origin = grid(export(tmp_path, "nav2", MapContent(gaussians, gaussians)))

@@ -43,6 +43,7 @@ def mapped(rasterizer: Rasterizer, seed: int = 0) -> GaussianMapper:
     return mapper
 
 
+@pytest.mark.slow
 def test_mapping_error_matches_the_oracle() -> None:
     """The maps differ: Adam amplifies rounding of a first gradient to a whole step, which also changes clones."""
     from torch_oracle.rasterizer import ReferenceRasterizer

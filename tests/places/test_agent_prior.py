@@ -82,6 +82,7 @@ def test_an_agent_continues_a_map_from_any_start_and_after_a_restart(earlier: Pa
         assert restarted.run(lambda mapper: mapper.gaussians()).result().means_m.tobytes() == whole.means_m.tobytes()
 
 
+@pytest.mark.slow
 def test_an_agent_in_another_place_maps_on_its_own(earlier: Path) -> None:
     prior = PriorRun(earlier, SETTINGS, {})
     with _worker(prior) as worker:

@@ -49,6 +49,7 @@ def corner(seed: int, shift_m: float = 0.0) -> SurfaceSamples:
     return SurfaceSamples(gaussians.means_m.astype(np.float64) + shift_m, gaussians.rgb[:, 0].astype(np.float64))
 
 
+@pytest.mark.slow
 def test_a_killed_process_starts_again_and_every_fit_has_the_bits_of_the_function() -> None:
     source, target = corner(1, 0.05), corner(0)
     expected = fit_frame(source, target)

@@ -49,6 +49,7 @@ def test_frames_of_look_alike_rooms_are_refused(other: Gaussians) -> None:
     assert [places.localise(camera.frame(looking(*pose))) for pose in FRAMES] == [None] * 4
 
 
+@pytest.mark.slow
 def test_a_frame_that_fits_two_rooms_is_refused() -> None:
     shift = np.eye(4)
     shift[0, 3] = 2 * ROOM_M[0]
@@ -61,6 +62,7 @@ def test_a_frame_that_fits_two_rooms_is_refused() -> None:
     assert both.localise(frame) is None
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not can_match_without_guess(), reason="kiss-matcher comes with the extra slam")
 @pytest.mark.parametrize(("texture_seed", "is_known"), [(3, False), (9, True)], ids=["alike", "other colours"])
 def test_a_frame_that_fits_another_room_whose_keyframes_are_not_tried_is_refused(

@@ -52,6 +52,7 @@ def corrected() -> tuple[TaskMapper, State]:
     return mapped(mapper, range(FRAMES * 2 // 3, FRAMES)), state
 
 
+@pytest.mark.slow
 def test_loops_halve_the_error_of_the_trajectory(corrected: tuple[TaskMapper, State]) -> None:
     mapper, _ = corrected
     true = open_reference(SPEC)
@@ -67,6 +68,7 @@ def test_loops_halve_the_error_of_the_trajectory(corrected: tuple[TaskMapper, St
     assert found.rmse_m < 0.5 * given.rmse_m
 
 
+@pytest.mark.slow
 def test_a_resumed_run_has_the_same_bits(corrected: tuple[TaskMapper, State]) -> None:
     mapper, state = corrected
     resumed = new_mapper()

@@ -39,6 +39,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_a_run_continues_a_saved_map_in_its_frame(
     saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -60,6 +61,7 @@ def test_a_run_continues_a_saved_map_in_its_frame(
         np.testing.assert_allclose(change["before_m"], (3.75, 1.55, 0.45), atol=0.2)
 
 
+@pytest.mark.slow
 def test_another_place_is_said_to_be_one(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = _map("sim:home-4?frames=8&size=160x120&noise=0", tmp_path / "other", "--prior", str(saved))
     assert "this run begins a map of its own" in capsys.readouterr().err
@@ -68,6 +70,7 @@ def test_another_place_is_said_to_be_one(saved: Path, tmp_path: Path, capsys: py
     assert "expected a map of the place of" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_resumed_run_with_a_prior_gives_the_same_map(saved: Path, tmp_path: Path) -> None:
     state = tmp_path / "run.state"
     prior = ("--prior", str(saved))

@@ -162,6 +162,7 @@ def test_look_alike_rooms_are_not_aligned(source, target, reason: str) -> None:
     assert reason in found.reason
 
 
+@pytest.mark.slow
 def test_a_room_that_the_team_has_twice_is_found_with_the_rooms_beside_it() -> None:
     east, north = (transform_of(np.array([*shift_m, 0.0, 0.0, 0.0, 0.0])) for shift_m in ((4.0, 0.0), (0.0, 3.0)))
     beside = Gaussians.concatenate([move_gaussians(room(8), east), move_gaussians(room(5), north)])
@@ -173,6 +174,7 @@ def test_a_room_that_the_team_has_twice_is_found_with_the_rooms_beside_it() -> N
     assert (error_m < 0.03, error_deg < 0.5) == (True, True)
 
 
+@pytest.mark.slow
 def test_without_a_known_frame_the_first_agent_defines_it_until_one_that_knows_its_own_joins() -> None:
     engine = aligning()
     T_ant_room = transform_of(np.array([1.0, 2.0, 0.0, 0.0, 0.0, -1.0]))
@@ -192,6 +194,7 @@ def test_without_a_known_frame_the_first_agent_defines_it_until_one_that_knows_i
         assert won(engine, name) > 0 or name == "ant"
 
 
+@pytest.mark.slow
 def test_a_found_frame_that_newer_data_contradict_is_taken_back() -> None:
     wrong = transform_of(np.array([0.6, 0.4, 0.0, 0.0, 0.0, 0.2])) @ inverse(T_BEE_ROOM)
     fit = FrameFit(wrong, Misfit(0.1, 0.25), Misfit(0.0, 0.0), 9.0, 149.0, 500, True, False)
@@ -225,6 +228,7 @@ def test_an_agent_that_knows_its_frame_now_is_used_as_sent() -> None:
     assert won(engine, "ant") == len(group_by_voxel(scan(0), GRID))
 
 
+@pytest.mark.slow
 def test_a_search_that_fails_is_made_twice_and_then_with_more_data_or_after_the_agent_has_left() -> None:
     sizes: list[int] = []
 

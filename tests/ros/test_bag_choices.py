@@ -236,6 +236,7 @@ def test_tf_of_a_namespace_is_used(tmp_path: Path, namespace: str) -> None:
     require_small_bag(frames_of(write_small_bag(tmp_path / "b.mcap", namespace=namespace)))
 
 
+@pytest.mark.slow
 def test_tf_of_several_robots_is_that_of_the_camera_or_a_question(tmp_path: Path) -> None:
     def other(bag: Writer) -> None:
         bag.write("/robot2/tf_static", TF, START_NS, link(START_NS, "base_link", OPTICAL, 5.0))
@@ -248,6 +249,7 @@ def test_tf_of_several_robots_is_that_of_the_camera_or_a_question(tmp_path: Path
     require_small_bag(frames_of(f"bag:{bag}?tf=/robot1/tf&tf_static=/robot1/tf_static"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odom", ["odom", "robot1/odom", "robot1_odom", "odom_frame"])
 def test_odometry_of_any_name_goes_before_the_map(tmp_path: Path, odom: str) -> None:
     def jumps(bag: Writer) -> None:

@@ -43,6 +43,7 @@ def test_a_lens_that_cannot_be_inverted_is_refused() -> None:
         open_source("sim:home?size=80x60&lens=radtan:-3,0,0,0").frame(0)
 
 
+@pytest.mark.slow
 def test_without_the_ray_caster_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     with pytest.raises(DatasetError, match=r"pip install 'gausslite\[sim\]'"):

@@ -36,6 +36,7 @@ def poses_at(seconds: np.ndarray) -> np.ndarray:
     return home().trajectories[1](FRAMES, FRAME + seconds / INTERVAL_S)
 
 
+@pytest.mark.slow
 def test_each_row_shows_the_scene_from_the_pose_at_its_time(scene: HomeScene) -> None:
     camera = RecordingCamera(CAMERA, readout_s=0.03)
     recorded = render_recorded_view(scene, camera, poses_at)

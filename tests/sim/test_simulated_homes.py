@@ -73,6 +73,7 @@ def workshop_source(options: str = "", trajectory: int = 0) -> Source:
     return open_source(f"sim:home-8?trajectory={trajectory}&frames=10&size=80x60{options}")
 
 
+@pytest.mark.slow
 def test_the_workshop_shows_its_main_objects() -> None:
     pytest.importorskip("embreex", reason="the simulated homes need the extra `sim`")
     source = workshop_source("&noise=0", trajectory=2)
@@ -115,6 +116,7 @@ def test_the_seed_moves_movable_objects_only() -> None:
     np.testing.assert_array_equal(middle("workbench", 0), middle("workbench", 1))
 
 
+@pytest.mark.slow
 def test_objects_can_be_shifted_or_left_out() -> None:
     pytest.importorskip("embreex", reason="simulated homes come with the extra sim")
     small = "sim:home-2?size=64x48&noise=0"

@@ -43,6 +43,7 @@ def test_a_frame_does_not_depend_on_the_order_of_requests() -> None:
     assert later.rgb.tobytes() == first.frame(7).rgb.tobytes()
 
 
+@pytest.mark.slow
 def test_two_homes_of_one_seed_are_the_same_and_another_seed_differs() -> None:
     a, b, other = furnish(0), furnish(0), furnish(1)
     for one, two in zip(a, b, strict=True):

@@ -21,7 +21,17 @@ from torch_oracle.rasterizer import ReferenceRasterizer
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.camera import Camera
 from gausslite.domain.frame import Frame
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
+from gausslite.domain.objects import ObjectLandmark, ObjectRole
+from gausslite.domain.task import TaskGraph
+from gausslite.domain.voxels import (
+    AxisAlignedBox,
+    RoiSubset,
+    VoxelBatch,
+    VoxelGrid,
+    group_by_voxel,
+    merge_batches,
+    tombstones,
+)
 from gausslite.fusion.alignment import FrameAligner
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import FusionSettings
@@ -39,6 +49,10 @@ from gausslite_fusion_server.servicer import FusionServicer
 GRID = VoxelGrid(0.10)
 COMMAND = [sys.executable, "-m", "gausslite_fusion_server"]
 CAMERA = Camera(40.0, 40.0, 16.0, 12.0, 32, 24)
+GRAPH = TaskGraph("t", "Pick up the mug", ("mug",), (), ())
+MUG = ObjectLandmark(
+    "mug-1", "mug", ObjectRole.TARGET, (1.0, 2.0, 3.0), AxisAlignedBox((0.9, 1.9, 2.9), (1.1, 2.1, 3.1)), 0.5, 7, 9
+)
 
 
 @dataclass(frozen=True)

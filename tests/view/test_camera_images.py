@@ -61,6 +61,7 @@ def test_a_slider_set_back_shows_the_image_of_that_time_until_it_is_at_its_end_a
     assert (shown.label, int(shown.image[0, 0, 0])) == ("Newest keyframe: frame 59", 59)
 
 
+@pytest.mark.slow
 def test_the_kept_images_are_bounded(page: MapPage) -> None:
     images = images_of(page)
     play(page, images, range(200))

@@ -6,7 +6,8 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.objects import ObjectLandmark, ObjectRole, OrientedBox
@@ -67,7 +68,7 @@ def test_no_objects_have_no_labels() -> None:
     assert positions_m([]).shape == (0, 3)
 
 
-@settings(max_examples=60)
+@few_examples
 @given(st.lists(st.tuples(*[st.floats(-0.8, 0.8)] * 3, st.sampled_from(["mug", "chair", "coffee table"])), max_size=8))
 def test_names_are_apart_in_the_start_view_and_only_moved_up(places: list[tuple[float, float, float, str]]) -> None:
     objects = [landmark(noun, (x, y, z), 0.1) for x, y, z, noun in places]

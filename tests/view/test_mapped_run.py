@@ -45,6 +45,7 @@ def test_map_writes_photographs_of_keyframes_and_a_row_for_each_frame(kitchen: P
     np.testing.assert_allclose(timeline["roi_share"].mean(), report["roi_share"], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_saved_scores_are_in_the_report_until_the_map_is_replaced(
     kitchen: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import gsply
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from sample_gaussians import random_gaussians
 
@@ -125,7 +125,6 @@ def test_a_missing_map_is_a_map_file_error(tmp_path: Path) -> None:
 
 
 @given(st.data())
-@settings(max_examples=200)
 def test_a_flipped_byte_raises_only_map_file_error(data: st.DataObject) -> None:
     file = bytearray(ply_bytes(random_gaussians(2)))
     for _ in range(data.draw(st.integers(1, 3))):

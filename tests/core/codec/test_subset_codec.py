@@ -9,7 +9,7 @@ import google_crc32c
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.sample_batches import make_batch
 
@@ -53,7 +53,6 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 
 @given(CASES)
-@settings(max_examples=150)
 def test_decoding_is_within_the_stated_bounds(case: tuple[float, float, int, int]) -> None:
     subset, grid = build(case)
     # the codec sorts the Gaussians of a voxel, so kappa numbers them
@@ -82,7 +81,6 @@ def test_decoding_is_within_the_stated_bounds(case: tuple[float, float, int, int
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(1.0, 20.0))
-@settings(max_examples=100)
 def test_the_shape_of_a_gaussian_is_kept(seed: int, ratio: float) -> None:
     grid = VoxelGrid()
     batch = make_batch(seed, 30, grid)
@@ -99,7 +97,6 @@ def test_the_shape_of_a_gaussian_is_kept(seed: int, ratio: float) -> None:
 
 
 @given(CASES)
-@settings(max_examples=100)
 def test_a_lossless_message_holds_every_bit(case: tuple[float, float, int, int]) -> None:
     subset, grid = build(case)
     message = encode_subset(subset, grid, SubsetCoding.LOSSLESS)
@@ -125,7 +122,6 @@ def test_a_small_map_takes_at_most_twelve_bytes_a_gaussian() -> None:
 
 
 @given(CASES)
-@settings(max_examples=150)
 def test_encoding_a_decoded_message_gives_the_same_bytes(case: tuple[float, float, int, int]) -> None:
     for coding in SubsetCoding:
         message = encode_subset(*build(case), coding)
@@ -133,7 +129,6 @@ def test_encoding_a_decoded_message_gives_the_same_bytes(case: tuple[float, floa
 
 
 @given(CASES, st.data())
-@settings(max_examples=150)
 def test_any_damage_is_detected(case: tuple[float, float, int, int], data: st.DataObject) -> None:
     message = bytearray(encode_subset(*build(case), data.draw(st.sampled_from(SubsetCoding))))
     place = data.draw(st.integers(0, len(message) - 1))
@@ -145,14 +140,12 @@ def test_any_damage_is_detected(case: tuple[float, float, int, int], data: st.Da
 
 
 @given(st.binary(max_size=300))
-@settings(max_examples=200)
 def test_random_bytes_are_refused(noise: bytes) -> None:
     with pytest.raises((CodecError, ChecksumError)):
         decode_subset(noise)
 
 
 @given(CASES, st.data())
-@settings(max_examples=200)
 def test_a_changed_message_with_a_valid_checksum_is_refused_or_gives_a_valid_batch(
     case: tuple[float, float, int, int], data: st.DataObject
 ) -> None:
@@ -244,7 +237,6 @@ def test_invalid_values_are_not_encoded(column: str, value: float) -> None:
 
 
 @given(st.integers(0, 1000), st.integers(0, 400), st.integers(1100, 6000))
-@settings(max_examples=60)
 def test_split_parts_fit_and_contain_the_whole_batch(seed: int, n: int, max_bytes: int) -> None:
     grid = VoxelGrid()
     batch = make_batch(seed, n, grid, spread_m=0.5)

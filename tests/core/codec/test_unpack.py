@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.reference_unpack import reference_unpack
 from support.sample_batches import make_batch
@@ -51,7 +51,6 @@ def both(body: Body, update_seq: int, adds_stated: bool) -> tuple[Unpacked, Unpa
 
 
 @given(CASES, st.integers(0, 2**64 - 1), st.booleans())
-@settings(max_examples=200)
 def test_every_bit_is_that_of_the_oracle(case: tuple[float, int, int], update_seq: int, adds_stated: bool) -> None:
     native, oracle = both(body_of(case), update_seq, adds_stated)
     assert native is not None
@@ -59,7 +58,6 @@ def test_every_bit_is_that_of_the_oracle(case: tuple[float, int, int], update_se
 
 
 @given(CASES, st.data())
-@settings(max_examples=600)
 def test_a_damaged_body_is_refused_as_by_the_oracle(case: tuple[float, int, int], data: st.DataObject) -> None:
     layout, frame, fields = body_of(case)
     for _ in range(data.draw(st.integers(1, 3))):

@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.config.command_parser import CommandParser
@@ -241,7 +241,6 @@ def test_a_child_process_inherits_no_option_variables() -> None:
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 
 
-@settings(max_examples=200)
 @given(st.one_of(TEXTS, st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.lists(TEXTS)))
 def test_tomllib_reads_what_to_toml_writes(value: str | bool | int | float | list[str]) -> None:
     assert tomllib.loads(to_toml({"a-key": value, "unset": None})) == {"a-key": value}

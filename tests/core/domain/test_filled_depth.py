@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.frame import with_filled_depth
@@ -20,7 +20,6 @@ def test_blocks_without_a_measurement_get_the_larger_depth_around_and_single_pix
 
 
 @given(seed=st.integers(0, 1000), height=st.integers(1, 20), width=st.integers(1, 20), share=st.floats(0.0, 1.0))
-@settings(max_examples=50, deadline=None)
 def test_measured_depth_stays_and_a_filled_one_is_measured_somewhere(
     seed: int, height: int, width: int, share: float
 ) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 from sample_gaussians import plain_gaussians
 from test_fusion_properties import assert_same_batch
@@ -36,7 +37,7 @@ def make_batch(counts: dict[int, int]) -> VoxelBatch:
     return VoxelBatch(np.array(sorted(counts), np.int64), per_voxel.astype(np.uint64), per_voxel, gaussians)
 
 
-@settings(max_examples=60)
+@few_examples
 @given(STEPS)
 def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
     store = SqliteStore()

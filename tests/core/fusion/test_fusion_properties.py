@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.gaussians import Gaussians
@@ -60,7 +61,6 @@ WORDS = st.tuples(
 """(voxel, kappa) of few Gaussians in few voxels, so that ties are common; tombstone voxels; a seed."""
 TABLES = st.dictionaries(st.sampled_from(AGENTS), WORDS, max_size=4)
 HISTORIES = st.dictionaries(st.sampled_from(AGENTS), st.lists(WORDS, max_size=4), max_size=4)
-few_examples = settings(max_examples=40)
 
 
 def batch_from(spec: Spec) -> VoxelBatch:

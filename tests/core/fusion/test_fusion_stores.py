@@ -16,14 +16,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.sample_batches import make_batch
+from opened_stores import OpenStore, opener
+from support.sample_batches import make_batch, random_subset
 
 from gausslite.codec.stored import to_records
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
-from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, select_keys
+from gausslite.domain.voxels import RoiSubset, VoxelGrid, gather_rows, select_keys
 from gausslite.fusion.keyframe_pool import KeyframePool
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
@@ -31,44 +31,6 @@ from gausslite.fusion.store import FusionStore
 from gausslite.fusion.store_values import AgentTotals, MissionConfig, SessionRecord
 
 KEYS = (11, 22, 33)
-
-
-def make_subset(agent_id: str, update_seq: int, counts: dict[int, int], kappa: int = 1, seed: int = 0) -> RoiSubset:
-    """A subset with these numbers of Gaussians, all of one kappa, by voxel key."""
-    n = sum(counts.values())
-    numbers = np.random.default_rng(seed).random((n, 14), np.float32)
-    gaussians = Gaussians(
-        numbers[:, :3],
-        numbers[:, 3:7],
-        numbers[:, 7:10],
-        numbers[:, 10],
-        numbers[:, 11:14],
-        np.arange(n) % 2 == 0,
-        np.full(n, kappa, np.uint32),
-        np.full(n, -1, np.int16),
-    )
-    keys = sorted(counts)
-    per_voxel = np.array([counts[key] for key in keys], np.uint32)
-    batch = VoxelBatch(np.array(keys, np.int64), per_voxel.astype(np.uint64) * np.uint64(kappa), per_voxel, gaussians)
-    return RoiSubset(agent_id, "session", update_seq, update_seq, batch)
-
-
-OpenStore = Callable[[], FusionStore]
-
-
-def opener(kind: str, request: pytest.FixtureRequest) -> OpenStore:
-    """Return a function that opens the test's store of this kind, again after it was closed."""
-    match kind:
-        case "memory":
-            return SqliteStore
-        case "sqlite":
-            path = request.getfixturevalue("tmp_path") / "store.sqlite"
-            return lambda: SqliteStore(path)
-        case _:
-            url = request.getfixturevalue("postgres").new_database()
-            from gausslite_cluster.postgres_store import PostgresStore
-
-            return lambda: PostgresStore(url)
 
 
 @pytest.fixture(params=["memory", "sqlite", "postgres"])
@@ -84,7 +46,7 @@ def open_durable(request: pytest.FixtureRequest) -> OpenStore:
 
 
 def test_stored_updates_are_read_back(store: FusionStore) -> None:
-    message = make_subset("ant", 1, {11: 2, 22: 0, 33: 5})
+    message = random_subset("ant", 1, {11: 2, 22: 0, 33: 5})
     outcome = store.put(message)
     assert outcome.accepted.tolist() == list(KEYS)
     assert outcome.stale.tolist() == []
@@ -109,10 +71,10 @@ def test_received_updates_are_stored_compactly_and_read_back_exactly(store: Fusi
 
 
 def test_the_highest_update_seq_wins(store: FusionStore) -> None:
-    store.put(make_subset("ant", 5, {11: 2, 22: 2}))
-    assert store.put(make_subset("ant", 5, {11: 2, 22: 2})).stale.tolist() == [11, 22]
-    assert store.put(make_subset("ant", 4, {11: 4})).stale.tolist() == [11]
-    later = store.put(make_subset("ant", 6, {11: 1, 33: 1}))
+    store.put(random_subset("ant", 5, {11: 2, 22: 2}))
+    assert store.put(random_subset("ant", 5, {11: 2, 22: 2})).stale.tolist() == [11, 22]
+    assert store.put(random_subset("ant", 4, {11: 4})).stale.tolist() == [11]
+    later = store.put(random_subset("ant", 6, {11: 1, 33: 1}))
     assert later.accepted.tolist() == [11, 33]
     assert store.batch("ant").counts.tolist() == [1, 2, 1]
     assert store.totals("ant") == AgentTotals(3, 3, 4, 4, 6)
@@ -123,7 +85,7 @@ def test_the_highest_update_seq_wins(store: FusionStore) -> None:
 def test_of_equal_update_seqs_the_larger_content_wins_in_every_order(
     store: FusionStore, contents: list[tuple[int, int]]
 ) -> None:
-    messages = {content: make_subset("ant", 5, {11: content[0]}, seed=content[1]) for content in contents}
+    messages = {content: random_subset("ant", 5, {11: content[0]}, seed=content[1]) for content in contents}
     for content in contents:
         store.put(messages[content])
     largest = max(messages[4, seed].batch.gaussians.means_m[0, 0].tobytes() for seed in (0, 1))
@@ -132,24 +94,24 @@ def test_of_equal_update_seqs_the_larger_content_wins_in_every_order(
 
 
 def test_messages_of_several_agents_are_stored_together(store: FusionStore) -> None:
-    messages = [make_subset(name, 1, {11: 2, 22: index}) for index, name in enumerate(("ant", "bee"))]
+    messages = [random_subset(name, 1, {11: 2, 22: index}) for index, name in enumerate(("ant", "bee"))]
     assert [each.accepted.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
     assert [each.stale.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
     assert store.scores().scores["counts"].tolist() == [2, 0, 2, 1]
     with pytest.raises(InvalidInputError):
-        store.put_all([StoredSubset.exact(make_subset(*own, {33: 1})) for own in (("ant", 2), ("bee", 2**63))])
+        store.put_all([StoredSubset.exact(random_subset(*own, {33: 1})) for own in (("ant", 2), ("bee", 2**63))])
     assert 33 not in store.scores().scores["keys"]
 
 
 def test_a_tombstone_is_kept_and_makes_older_updates_stale(store: FusionStore) -> None:
-    store.put(make_subset("ant", 2, {11: 0}))
-    assert store.put(make_subset("ant", 1, {11: 3})).stale.tolist() == [11]
+    store.put(random_subset("ant", 2, {11: 0}))
+    assert store.put(random_subset("ant", 1, {11: 3})).stale.tolist() == [11]
     assert store.batch("ant").counts.tolist() == [0]
 
 
 def test_agents_do_not_change_each_others_data(store: FusionStore) -> None:
-    store.put(make_subset("ant", 9, {11: 2}))
-    store.put(make_subset("bee", 1, {11: 1, 22: 1}))
+    store.put(random_subset("ant", 9, {11: 2}))
+    store.put(random_subset("bee", 1, {11: 1, 22: 1}))
     scores = store.scores()
     assert scores.agents == ("ant", "bee")
     assert scores.agent_index.tolist() == [0, 1, 1]
@@ -163,8 +125,8 @@ def test_agents_do_not_change_each_others_data(store: FusionStore) -> None:
 
 
 def test_reading_some_voxels_equals_selecting_from_all(store: FusionStore) -> None:
-    store.put(make_subset("ant", 1, {11: 2, 22: 3, 33: 0}))
-    store.put(make_subset("bee", 1, {22: 1}))
+    store.put(random_subset("ant", 1, {11: 2, 22: 3, 33: 0}))
+    store.put(random_subset("bee", 1, {22: 1}))
     keys = np.array([33, 22, 99, 22], np.int64)
     for agent_id, batch in store.batches(keys).items():
         expected = select_keys(store.batch(agent_id), keys)
@@ -175,13 +137,13 @@ def test_reading_some_voxels_equals_selecting_from_all(store: FusionStore) -> No
 
 
 def test_an_empty_message_changes_nothing(store: FusionStore) -> None:
-    assert len(store.put(make_subset("ant", 1, {})).accepted) == 0
+    assert len(store.put(random_subset("ant", 1, {})).accepted) == 0
     assert store.agents() == ()
 
 
 def test_a_message_with_too_large_an_update_seq_is_refused_completely(store: FusionStore) -> None:
     with pytest.raises(InvalidInputError, match="update_seq"):
-        store.put(make_subset("ant", 2**63, {11: 1}))
+        store.put(random_subset("ant", 2**63, {11: 1}))
     assert store.agents() == ()
 
 
@@ -202,7 +164,7 @@ def test_an_agent_has_one_session_and_the_mission_config_is_stored(store: Fusion
 def test_threads_can_put_concurrently(store: FusionStore) -> None:
     def put_updates(agent_id: str) -> None:
         for update_seq in range(20):
-            store.put(make_subset(agent_id, update_seq, {11: 1, 22: update_seq % 3}))
+            store.put(random_subset(agent_id, update_seq, {11: 1, 22: update_seq % 3}))
 
     threads = [Thread(target=put_updates, args=(name,)) for name in ("ant", "bee", "cat")]
     for thread in threads:
@@ -235,7 +197,7 @@ def test_a_large_keyframe_takes_several_transactions_and_replaces_the_earlier_on
 
     def write_between(_: float) -> None:
         seen.append((store.keyframe("ant", 1), store.keyframe_sizes()))
-        store.put(make_subset("bee", len(seen), {11: 1}))
+        store.put(random_subset("bee", len(seen), {11: 1}))
 
     monkeypatch.setattr("gausslite.fusion.store.time", SimpleNamespace(monotonic=time.monotonic, sleep=write_between))
     store.save_keyframe("ant", 1, b"small")
@@ -291,7 +253,7 @@ def unfinished(store: FusionStore) -> int:
 
 def test_a_reopened_store_has_the_same_content(open_durable: OpenStore) -> None:
     store = open_durable()
-    store.put(make_subset("ant", 3, {11: 2}))
+    store.put(random_subset("ant", 3, {11: 2}))
     store.save_session(SessionRecord("one", "ant"))
     store.set_mission_config(MissionConfig("m", "w", 0.1))
     store.save_keyframe("ant", 4, b"image")
@@ -310,20 +272,20 @@ def test_a_reopened_store_has_the_same_content(open_durable: OpenStore) -> None:
 CHILD = """
 import sys
 from pathlib import Path
-sys.path[:0] = sys.argv[2:]
-from test_fusion_stores import make_subset
+sys.path.insert(0, sys.argv[2])
+from support.sample_batches import random_subset
 from gausslite.fusion.sqlite_store import SqliteStore
 store = SqliteStore(Path(sys.argv[1]))
 for revision in range(1, 1_000_000):
-    store.put(make_subset("ant", revision, {11: 3, 100 + revision: 2}, seed=revision))
+    store.put(random_subset("ant", revision, {11: 3, 100 + revision: 2}, seed=revision))
     print(revision, flush=True)
 """
 
 
 def test_acknowledged_updates_survive_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
-    folders = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-    child = subprocess.Popen([sys.executable, "-c", CHILD, str(path), *folders], stdout=subprocess.PIPE, text=True)
+    folder = Path(__file__).parents[2]
+    child = subprocess.Popen([sys.executable, "-c", CHILD, path, folder], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None
     acknowledged = 0
     for line in child.stdout:
@@ -362,7 +324,7 @@ def test_a_foreign_file_is_one_clear_error(tmp_path: Path, content: bytes | None
 
 def _damaged(path: Path) -> None:
     store = SqliteStore(path)
-    store.put(make_subset("ant", 1, dict.fromkeys(range(60), 40)))
+    store.put(random_subset("ant", 1, dict.fromkeys(range(60), 40)))
     store.close()
     data = bytearray(path.read_bytes())
     data[4096 : len(data) // 2] = bytes(len(data) // 2 - 4096)
@@ -411,7 +373,7 @@ def test_links_do_not_let_a_second_server_open_the_store(tmp_path: Path) -> None
     symbolic.symlink_to(path)
     # the first one begins behind the link
     first = SqliteStore(symbolic)
-    first.put(make_subset("ant", 1, {11: 3}))
+    first.put(random_subset("ant", 1, {11: 3}))
     for name in (path, symbolic):
         with pytest.raises(StorageError, match="in use by another server"):
             SqliteStore(name)
@@ -428,11 +390,11 @@ def test_links_do_not_let_a_second_server_open_the_store(tmp_path: Path) -> None
 
 def test_a_full_disk_refuses_the_message_and_keeps_earlier_ones(tmp_path: Path) -> None:
     store = SqliteStore(tmp_path / "store.sqlite", max_bytes=200_000)
-    store.put(make_subset("ant", 1, {11: 3}))
+    store.put(random_subset("ant", 1, {11: 3}))
     with pytest.raises(StorageError, match="no space left"):
-        store.put(make_subset("ant", 2, {11: 1, 22: 10_000}))
+        store.put(random_subset("ant", 2, {11: 1, 22: 10_000}))
     assert store.batch("ant").counts.tolist() == [3]
-    store.put(make_subset("ant", 3, {11: 2}))
+    store.put(random_subset("ant", 3, {11: 2}))
     assert store.batch("ant").counts.tolist() == [2]
     store.close()
 

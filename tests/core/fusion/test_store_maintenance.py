@@ -9,7 +9,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from test_fusion_stores import make_subset
+from support.sample_batches import random_subset
 
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -23,7 +23,7 @@ def path(tmp_path: Path) -> Path:
     """A closed store with 40 voxels, a keyframe and a record."""
     path = tmp_path / "store.sqlite"
     store = SqliteStore(path)
-    store.put(make_subset("ant", 7, dict.fromkeys(VOXELS, 3)))
+    store.put(random_subset("ant", 7, dict.fromkeys(VOXELS, 3)))
     store.save_keyframe("ant", 1, b"image")
     store.save_record("ant", "objects", b"mug")
     store.close()
@@ -111,7 +111,7 @@ def test_a_torn_log_is_cut_at_the_last_whole_message(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     store = SqliteStore(path)
     for update_seq in range(1, 6):
-        store.put(make_subset("ant", update_seq, {update_seq: 30}))
+        store.put(random_subset("ant", update_seq, {update_seq: 30}))
     files = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
     store.close()
     for cut in (1, 3000, 9000):
@@ -131,11 +131,11 @@ def test_a_torn_log_is_cut_at_the_last_whole_message(tmp_path: Path) -> None:
 def test_a_backup_of_a_running_store_is_restored_as_another_incarnation(tmp_path: Path) -> None:
     path, backup = tmp_path / "store.sqlite", tmp_path / "backup.sqlite"
     store = SqliteStore(path)
-    store.put(make_subset("ant", 1, {11: 2}))
+    store.put(random_subset("ant", 1, {11: 2}))
     assert back_up(path, backup).voxels == 1
     with pytest.raises(StorageError, match="the file exists"):
         back_up(path, backup)
-    store.put(make_subset("ant", 2, {22: 2}))
+    store.put(random_subset("ant", 2, {22: 2}))
     with pytest.raises(StorageError, match="in use by another server"):
         restore(backup, path)
     incarnation_id = store.incarnation_id

@@ -7,8 +7,8 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from support.sample_batches import make_batch
-from test_fusion_stores import OpenStore, make_subset, opener
+from opened_stores import OpenStore, opener
+from support.sample_batches import make_batch, random_subset
 
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.codec.subset_codec import decode_stored, decode_subset, encode_subset
@@ -32,7 +32,9 @@ def random_update(rng: np.random.Generator, agent_id: str) -> tuple[StoredSubset
     """A message of a few voxels in several tiles, as codes or exact, and its Gaussians as floats."""
     if rng.random() < 0.3:
         counts = {int(key): int(rng.integers(0, 4)) for key in rng.integers(0, 60, 6)}
-        subset = make_subset(agent_id, int(rng.integers(1, 30)), counts, int(rng.integers(1, 4)), int(rng.integers(9)))
+        subset = random_subset(
+            agent_id, int(rng.integers(1, 30)), counts, int(rng.integers(1, 4)), int(rng.integers(9))
+        )
         return StoredSubset.exact(subset), subset
     grid = VoxelGrid(float(rng.choice([0.5, 0.25])))
     seq = int(rng.integers(1, 30))
@@ -112,7 +114,7 @@ def test_outdated_rows_are_deleted(open_store: OpenStore) -> None:
     store = open_store()
     log = store._log
     for seq in range(1, 80):
-        store.put(make_subset("ant", seq, dict.fromkeys(range(seq % 3, 60, 3), 2), seed=seq))
+        store.put(random_subset("ant", seq, dict.fromkeys(range(seq % 3, 60, 3), 2), seed=seq))
     held = sum(sum(tile.sizes.values()) for tile in log._tiles.values())
     in_use = sum(2 + 2 for _ in range(60))
     assert held < 4 * in_use + 4 * 60

@@ -9,7 +9,8 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.codec.json import decode_object_report, encode_object_report
@@ -104,7 +105,7 @@ def merge_all_pairs(reports: dict[str, ObjectReport]) -> set[frozenset[tuple[str
 
 
 @pytest.mark.parametrize("largest_group", [4, 64])
-@settings(max_examples=40)
+@few_examples
 @given(
     seed=st.integers(0, 2**32 - 1), side_m=st.sampled_from([0.3, 1.0, 5.0]), largest_m=st.sampled_from([0.1, 0.5, 3.0])
 )

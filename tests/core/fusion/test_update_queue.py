@@ -6,11 +6,12 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 from sample_gaussians import plain_gaussians
+from support.sample_batches import random_subset
 from test_fusion_properties import assert_same_batch
-from test_fusion_stores import make_subset
 
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.codec.subset_codec import encode_subset
@@ -58,7 +59,7 @@ def test_a_large_message_does_not_delay_the_messages_of_other_agents() -> None:
     order = served(queue, 1)
     for _ in range(20):
         for agent_id in ("ant", "bee"):
-            queue.add(pending(agent_id, StoredSubset.exact(make_subset(agent_id, 1, {11: 1}))))
+            queue.add(pending(agent_id, StoredSubset.exact(random_subset(agent_id, 1, {11: 1}))))
         order += served(queue, 1) + served(queue, 1) + served(queue, 1)
     assert order.count("ant") == order.count("bee") == 20
     # the small messages together cost less than one slice, so the hog gets the rest
@@ -73,12 +74,12 @@ def test_a_small_message_comes_before_the_equal_large_ones_of_many_agents() -> N
     for turn in range(1, 6):
         for _ in range(turn):
             served(queue, 1)
-        queue.add(pending("ant", StoredSubset.exact(make_subset("ant", turn, {11: 1}))))
+        queue.add(pending("ant", StoredSubset.exact(random_subset("ant", turn, {11: 1}))))
         assert served(queue, 1) == ["ant"]
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 3 * SLICE_VOXELS)), max_size=12), st.integers(1, 9000))
-@settings(max_examples=30)
+@few_examples
 def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tuple[str, int]], group: int) -> None:
     queue = UpdateQueue()
     updates = [pending(name, many_tombstones(name, voxels)) for name, voxels in messages]
@@ -191,7 +192,7 @@ def test_concurrent_agents_and_an_eviction_give_the_map_of_the_stored_updates() 
         session_id = engine.join(agent_id, ANY).session.session_id
         for update_seq in range(1, 30):
             engine.contribute(
-                session_id, make_subset(agent_id, update_seq, {11: 1 + update_seq % 3, 22: 1}), engine.grid
+                session_id, random_subset(agent_id, update_seq, {11: 1 + update_seq % 3, 22: 1}), engine.grid
             )
 
     threads = [threading.Thread(target=contribute, args=(name,)) for name in ("ant", "bee", "cat")]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.gaussians import Gaussians
@@ -50,7 +51,7 @@ def apply(table: SplatTable, action: str, seed: int, amount: int) -> None:
         table.keep(rng.random(table.count) < 0.7)
 
 
-@settings(max_examples=60)
+@few_examples
 @given(ACTIONS)
 def test_the_cap_holds_and_active_kappa_and_target_stay_together(actions: list[tuple[str, int, int]]) -> None:
     table = SplatTable(CAPACITY)
@@ -88,7 +89,7 @@ class CheckedTable(SplatTable):
         assert self._rows.shape == self._first_moment.shape == self._second_moment.shape == (CAPACITY, 16)
 
 
-@settings(max_examples=40)
+@few_examples
 @given(st.integers(CAPACITY - 12, CAPACITY), st.integers(0, 2**31))
 def test_cap_holds_after_each_change_in_seeding_and_densification(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -100,7 +101,7 @@ def test_cap_holds_after_each_change_in_seeding_and_densification(count: int, se
     assert table.changes > 3
 
 
-@settings(max_examples=60)
+@few_examples
 @given(st.integers(1, 40), st.integers(0, 2**31), st.integers(0, 40))
 def test_roi_seeds_always_fit_and_evict_active_gaussians_last(count: int, seed: int, seed_count: int) -> None:
     rng = np.random.default_rng(seed)

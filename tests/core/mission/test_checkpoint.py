@@ -191,6 +191,7 @@ def forgeries(array: np.ndarray) -> Iterator[np.ndarray]:
         yield same
 
 
+@pytest.mark.slow
 def test_a_forged_array_is_rejected_or_mapping_continues(state: State) -> None:
     saved = select_prefix(state, "mapper")
     rejected = 0

@@ -71,6 +71,7 @@ def test_earlier_keyframes_get_the_mask_and_their_gaussians_become_active() -> N
     assert (gaussians.active[seen] == MUG.mask(frame_at(0))[rows, columns]).mean() > 0.85
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [KNOWN, KNOWN + 1])
 def test_a_run_saved_before_all_keyframes_are_complete_resumes_bit_identically(cut: int) -> None:
     whole = make_task_mapper()

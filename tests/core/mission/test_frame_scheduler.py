@@ -7,7 +7,8 @@ from collections import deque
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from few_examples import few_examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.domain.errors import InvalidInputError
@@ -200,7 +201,7 @@ def timings_with_view_costs(views_s: list[float], deadline_slack: float = SLACK_
     return [run_frame(scheduler, clock, {**costs, Stage.VIEW_PREPARATION: view_s})[0] for view_s in views_s]
 
 
-@settings(max_examples=40)
+@few_examples
 @given(st.lists(st.floats(0.0, 3 * FRAME_S), min_size=1, max_size=8), st.floats(0.0, 1.0))
 def test_frames_overrun_by_the_deadline_slack_at_most(views_s: list[float], deadline_slack: float) -> None:
     behind_s = 0.0
@@ -211,7 +212,7 @@ def test_frames_overrun_by_the_deadline_slack_at_most(views_s: list[float], dead
         behind_s = min(max(0.0, behind_s + timing.seconds - FRAME_S), deadline_slack * FRAME_S)
 
 
-@settings(max_examples=40)
+@few_examples
 @given(st.data())
 def test_no_frame_is_under_trained_if_the_time_suffices_over_a_few_frames(data: st.DataObject) -> None:
     behind_s, views_s = 0.0, []

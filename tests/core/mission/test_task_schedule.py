@@ -27,6 +27,7 @@ def test_an_invalid_task_switch_is_refused(text: str, tmp_path: Path, capsys: py
     assert "task-at" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_mission_with_a_task_change_resumes_bit_identically(tmp_path: Path) -> None:
     def map_home(name: str, *more: str) -> tuple[bytes, dict[str, object]]:
         common = ["--size", "64x48", "--max-gaussians", "500", "--iterations", "2", "--set", "threads=1"]

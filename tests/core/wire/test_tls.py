@@ -112,6 +112,7 @@ def test_the_health_check_works_over_tls(certs: Path) -> None:
     assert ask_health([server.address, options[0]]) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["gausslite_parser", "gausslite_fusion_server", "gausslite_agent"])
 def test_each_service_listens_encrypted_and_never_prints_its_key(module: str, certs: Path, tmp_path: Path) -> None:
     listen = f"unix:{tmp_path}/s.sock"

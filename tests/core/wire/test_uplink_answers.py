@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from few_examples import few_examples
 from fusion_running import fusion_server, make_batch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from serving import serving
 from uplink_running import WAIT_S, ScriptedServer, accepted, expected_kappas, rejected, scripted, stored_kappas, uplink
@@ -169,7 +170,7 @@ ENQUEUED_BATCHES = st.lists(
 
 
 @given(enqueued=ENQUEUED_BATCHES, faults=FAULTS, together=st.booleans())
-@settings(max_examples=25)
+@few_examples
 def test_after_any_losses_the_server_has_the_latest_updates(
     enqueued: list[dict[int, list[int]]], faults: list[str], together: bool
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from pathlib import Path
 
+import pytest
 from fusion_running import GRID, fusion_server, make_batch
 from waiting import wait_until
 
@@ -85,6 +86,7 @@ def test_after_a_restore_only_the_tiles_that_differ_are_sent_again(tmp_path: Pat
     second.close()
 
 
+@pytest.mark.slow
 def test_after_a_restore_of_an_equal_store_nothing_is_sent_again(tmp_path: Path) -> None:
     address, store, backup = f"unix:{tmp_path}/fusion.sock", tmp_path / "store.sqlite", tmp_path / "backup.sqlite"
     spool = Spool(tmp_path / "spool.sqlite", "ant", GRID)

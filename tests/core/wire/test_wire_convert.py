@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from google.protobuf.message import DecodeError
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.codec.json import graph_as_json, graph_from_json
@@ -211,7 +211,6 @@ def test_a_wrong_lens_or_motion_is_refused_by_name(change: dict[str, object], ex
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=8, max_size=8), st.sampled_from(["radtan", "fisheye"]))
-@settings(max_examples=100)
 def test_any_lens_gives_a_frame_or_an_error_about_it(coefficients: list[float], model: str) -> None:
     lens = Lens(LensModel(model), tuple(coefficients[: 8 if model == "radtan" else 4]))
     with contextlib.suppress(InvalidInputError):
@@ -224,7 +223,6 @@ FRAME_BYTES = convert.live_frame_to_message(replace(sample_frame(), motion=MOTIO
 
 
 @given(st.data())
-@settings(max_examples=200)
 def test_changed_frame_bytes_give_a_valid_frame_or_a_gausslite_error(data: st.DataObject) -> None:
     noisy = bytearray(FRAME_BYTES)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -247,7 +245,6 @@ def test_changed_frame_bytes_give_a_valid_frame_or_a_gausslite_error(data: st.Da
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=200)
 def test_image_sizes_are_read_from_any_bytes(noise: bytes) -> None:
     for head in (b"", b"\xff\xd8", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"):
         size = image_size(head + noise)

@@ -298,6 +298,7 @@ def test_a_wrong_file_is_one_line_before_the_agent_listens(tmp_path: Path, capsy
         assert expected in line
 
 
+@pytest.mark.slow
 def test_a_real_agent_resumes_its_mission(tmp_path: Path) -> None:
     model = write_tiny_yolo(tmp_path / "tiny.onnx", ["cup"], [(32, 32, 20, 20, 0, 0.9)])
     address, store = f"unix:{tmp_path}/agent.sock", SqliteStore()

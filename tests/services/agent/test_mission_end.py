@@ -162,6 +162,7 @@ def agent_process(folder: Path, fusion: str, *more: str) -> Iterator[tuple[subpr
             process.kill()
 
 
+@pytest.mark.slow
 def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
     options = (
         "--set",
@@ -187,6 +188,7 @@ def test_sigterm_hands_over_within_the_grace_period(tmp_path: Path) -> None:
     assert stored.keyframes == 12  # each shows the region
 
 
+@pytest.mark.slow
 def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> None:
     options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(tmp_path / "x.state"), "--set", "handover=true")
     with agent_process(tmp_path, "127.0.0.1:1", *options, "--set", "grace-period=0.1") as (process, client):
@@ -207,6 +209,7 @@ def test_what_sigterm_leaves_is_sent_after_the_next_start(tmp_path: Path) -> Non
     assert stored.gaussians == ended.gaussians
 
 
+@pytest.mark.slow
 def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> None:
     with agent_process(tmp_path, "127.0.0.1:1", "--set", "grace-period=0.1") as (process, client):
         client.assign_task("Pick up the cup")
@@ -219,6 +222,7 @@ def test_what_is_lost_without_a_spool_is_one_line_and_code_1(tmp_path: Path) -> 
     assert re.search(r"lost [1-9]\d* voxels and 0 keyframes that were not sent; --set spool=FILE keeps them", line)
 
 
+@pytest.mark.slow
 def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:
     state = tmp_path / "x.state"
     options = ("--set", f"spool={tmp_path / 'x.spool'}", "--state", str(state), "--set", "save-interval=0.05")
@@ -245,6 +249,7 @@ def test_a_killed_agent_continues_from_its_last_save(tmp_path: Path) -> None:
     assert answer.outcome == pb.FRAME_OUTCOME_MAPPED
 
 
+@pytest.mark.slow
 def test_an_agent_without_a_detector_says_so_at_the_start_and_to_assign_task(tmp_path: Path) -> None:
     address = f"unix:{tmp_path}/agent.sock"
     command = [sys.executable, "-m", "gausslite_agent", "--listen", address, "--set", "threads=1"]
@@ -260,6 +265,7 @@ def test_an_agent_without_a_detector_says_so_at_the_start_and_to_assign_task(tmp
     assert any("every AssignTask will fail" in line and "--detector" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_an_agent_with_a_page_takes_a_task_without_a_detector(tmp_path: Path) -> None:
     pytest.importorskip("viser")
     address = f"unix:{tmp_path}/agent.sock"

@@ -77,6 +77,7 @@ def test_stop_cancels_a_call_that_the_service_does_not_answer() -> None:
             silent.end.set()
 
 
+@pytest.mark.slow
 def test_a_real_agent_that_waits_for_its_parser_ends_on_sigterm(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "gausslite_agent", "--listen", f"unix:{tmp_path}/agent.sock"]
     command += ["--source", "sim:home", "--task", TASK, "--parser", "127.0.0.1:1"]

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import grpc
 import pytest
+from few_examples import few_examples
 from fusion_running import GRID, frame, make_subset, request, server_process
 from google.protobuf.message import DecodeError, Message
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -28,7 +29,6 @@ KNOWN = {
     grpc.StatusCode.RESOURCE_EXHAUSTED,
     grpc.StatusCode.DATA_LOSS,
 }
-fuzz = settings(max_examples=50)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def target() -> Iterator[Target]:
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-@fuzz
+@few_examples
 @given(blob=st.binary(max_size=300))
 def test_any_bytes_as_a_subset_are_rejected(target: Target, blob: bytes) -> None:
     [outcome] = target.send(pb.ContributeSubsetsRequest(session_id=target.session_id, sequence=1, subset=blob))
@@ -76,7 +76,7 @@ def test_any_bytes_as_a_subset_are_rejected(target: Target, blob: bytes) -> None
     assert outcome.reason in {"CODEC", "CHECKSUM"}
 
 
-@fuzz
+@few_examples
 @given(seed=SEEDS)
 def test_a_mutated_subset_gives_an_outcome_and_the_stream_continues(target: Target, seed: int) -> None:
     good = request(target.session_id, make_subset("ant", 1, {0: [1, 2], 3: []}))
@@ -87,7 +87,7 @@ def test_a_mutated_subset_gives_an_outcome_and_the_stream_continues(target: Targ
     assert outcomes[-1].status != pb.SUBSET_STATUS_REJECTED
 
 
-@fuzz
+@few_examples
 @given(seed=SEEDS)
 def test_a_mutated_keyframe_is_reported_and_the_stream_continues(target: Target, seed: int) -> None:
     whole = frame_to_message(frame(1)).SerializeToString()
@@ -100,7 +100,7 @@ def test_a_mutated_keyframe_is_reported_and_the_stream_continues(target: Target,
     target.assert_alive()
 
 
-@fuzz
+@few_examples
 @given(
     blob=st.binary(max_size=200),
     method=st.sampled_from([method.name for method in pb.DESCRIPTOR.services_by_name["FusionService"].methods]),
@@ -114,7 +114,7 @@ NUMBERS = st.one_of(st.sampled_from([0, 1, 2**32 - 1]), st.integers(0, 2**32 - 1
 NAMES = st.one_of(st.sampled_from(["", "ant", "mission"]), st.text(max_size=20))
 
 
-@fuzz
+@few_examples
 @given(
     message=st.one_of(
         st.builds(

@@ -6,19 +6,13 @@ from dataclasses import replace
 
 import grpc
 import pytest
-from fusion_running import GRID, fusion_server
+from fusion_running import GRAPH, GRID, MUG, fusion_server
 
 from gausslite.domain.errors import InvalidInputError, SessionUnknownError, TaskError
-from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
+from gausslite.domain.objects import ObjectReport, ObjectRole
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert_task import object_from_message, object_to_message, report_to_message
-
-GRAPH = TaskGraph("t", "Pick up the mug", ("mug",), (), ())
-MUG = ObjectLandmark(
-    "mug-1", "mug", ObjectRole.TARGET, (1.0, 2.0, 3.0), AxisAlignedBox((0.9, 1.9, 2.9), (1.1, 2.1, 3.1)), 0.5, 7, 9
-)
 
 
 @pytest.mark.parametrize("role", ObjectRole)

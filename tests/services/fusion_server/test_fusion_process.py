@@ -30,6 +30,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return str(request.getfixturevalue("postgres").new_database())
 
 
+@pytest.mark.slow
 def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(
     store: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -45,6 +46,7 @@ def test_after_a_kill_acknowledged_updates_exist_and_a_resend_is_stale(
         assert sorted(gaussians_from_ply(client.export(Export())).kappa.tolist()) == [2, 2, 4]
 
 
+@pytest.mark.slow
 def test_sigterm_ends_open_streams_and_the_process_with_code_0(tmp_path: Path) -> None:
     log = tmp_path / "log"
     with server_process("--store", str(tmp_path / "team.sqlite"), log=log) as (process, client):
@@ -69,6 +71,7 @@ def children(pid: int) -> list[int]:
     return found
 
 
+@pytest.mark.slow
 def test_frames_are_compared_in_a_process_that_ends_with_the_server(tmp_path: Path) -> None:
     log = tmp_path / "log"
     with server_process(log=log) as (process, client):
@@ -130,6 +133,7 @@ class Hasty(FusionClient):
     keepalive_s = 0.5
 
 
+@pytest.mark.slow
 def test_a_watcher_detects_a_server_that_stopped_answering() -> None:
     with server_process() as (process, client), Hasty(client.address) as hasty:
         watch = hasty.watch()
@@ -180,6 +184,7 @@ def test_an_error_that_the_operator_can_fix_is_one_line_and_code_2(
             assert expected in ends_with_one_line(capsys, *arguments)
 
 
+@pytest.mark.slow
 def test_the_server_shows_itself_on_a_page(tmp_path: Path) -> None:
     pytest.importorskip("viser")
     command = [*COMMAND, "--listen", f"unix:{tmp_path}/fusion.sock", "--view", "0"]

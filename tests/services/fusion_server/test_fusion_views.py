@@ -152,6 +152,7 @@ def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the
     assert not shown.rgb.any()
 
 
+@pytest.mark.slow
 def test_frames_that_could_not_be_compared_are_compared_later_without_another_message(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

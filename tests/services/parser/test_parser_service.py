@@ -98,6 +98,7 @@ def test_an_invalid_address_is_refused(listen: str) -> None:
         asyncio.run(start_server(listen, []))
 
 
+@pytest.mark.slow
 def test_an_impossible_socket_is_one_line_and_code_2(tmp_path: Path) -> None:
     (tmp_path / "notes").write_text("mine")
     sockets = {
