@@ -188,7 +188,7 @@ class TaskMapper:
         if not keyframes:
             return None
         newest, trajectory = keyframes[-1], self._mapper.poses.trajectory()
-        if not self._shown or self._shown[-1].index != newest.frame.index:
+        if not self._shown or self._shown[-1].id != newest.frame.id:
             self._shown.append(newest.as_recorded)
         return CameraView(
             rgb=newest.as_recorded.rgb,
