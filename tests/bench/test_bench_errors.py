@@ -33,7 +33,7 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "raster", "server")
         (("quality", "--max-gaussians", "0"), "--max-gaussians: expected at least 1, got 0"),
         (("ablation", "--pair", "kitchen"), "pairs: expected names"),
         (("ablation", "--lpips-weights", "none.onnx"), "model none.onnx: expected an ONNX file, found nothing"),
-        (("raster", "--sizes", "32x"), "expected sizes such as 320x240"),
+        (("raster", "--sizes", "32x"), "expected WIDTHxHEIGHT"),
         (("server", "--held", "many"), "--held"),
         (("server", "--agents", "0"), "--agents"),
         (("server", "--seconds", "0"), "--seconds"),

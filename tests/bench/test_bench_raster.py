@@ -40,9 +40,11 @@ def test_every_case_is_measured_on_every_instruction_set(capsys: pytest.CaptureF
 
 def test_another_backend_is_measured_alike() -> None:
     pytest.importorskip("torch", reason="torch is not installed")
-    from gausslite_gpu import CudaRasterizer
+    from torch_oracle.emulated_kernels import TorchKernels
 
-    times = operation_times(CudaRasterizer("cpu"), 60, held_out_view(48, 32), 1)
+    from gausslite_gpu.rasterizer import CudaRasterizer
+
+    times = operation_times(CudaRasterizer(TorchKernels()), 60, held_out_view(48, 32), 1)
     assert set(times) == OPERATIONS
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import sitecustomize
 
-PACKAGES = ("gausslite", "gausslite_view", "gausslite_ros", "gausslite_sim", "gausslite_bench")
+PACKAGES = ("gausslite", *(f"gausslite_{name}" for name in ("bench", "cluster", "gpu", "ros", "sim", "view")))
 PROGRAMS = ("gausslite_agent", "gausslite_fusion_server", "gausslite_parser")
 TASK = "Pick up the mug on the table"
 SOURCE, FRAMES = "sim:home", ("--frames", "0:3", "--size", "160x120")
