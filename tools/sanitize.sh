@@ -62,4 +62,4 @@ run_checked -c "import sys, gausslite.render._kernels as kernels; sys.exit(not k
   fail "Python does not import the instrumented kernels; nothing was checked"
 [ $# -gt 0 ] || set -- "${tests[@]}"
 # Uncaptured: a sanitizer writes its report and ends the process; pytest would lose the report.
-run_checked -m pytest -q --capture=no -p no:cacheprovider "$@"
+run_checked -m pytest -m "" -q --capture=no -p no:cacheprovider "$@"

@@ -146,7 +146,7 @@ def machine_checks(out: Path) -> Iterator[Check]:
     yield _memory()
     yield from _disk_and_clock(_existing(out))
     for program, address in _SERVICES.items():
-        yield _port(program, address)
+        yield check_port(program, address)
 
 
 def _memory() -> Check:
@@ -195,10 +195,10 @@ def _disk_and_clock(folder: Path) -> Iterator[Check]:
         yield Check("disk", "error", f"{folder}: {error.strerror}", advice)
         return
     yield Check("disk", status, f"{free / _GIB:.1f} GiB free in {folder}", advice if status != "ok" else "")
-    yield _clock(lead_s)
+    yield check_clock(lead_s)
 
 
-def _clock(lead_s: float) -> Check:
+def check_clock(lead_s: float) -> Check:
     """Compare the clock with the time stamps of files. lead_s: clock minus the stamp of a file just written."""
     installed_s = Path(gausslite.__file__).stat().st_mtime
     if time.time() < installed_s - _CLOCK_TOLERANCE_S:
@@ -212,7 +212,7 @@ def _clock(lead_s: float) -> Check:
     return Check("clock", "ok", time.strftime("%Y-%m-%d %H:%M:%S UTC, as the file system", time.gmtime()))
 
 
-def _port(program: str, address: str) -> Check:
+def check_port(program: str, address: str) -> Check:
     """Check that the default port is free, by taking it for a moment; nothing is sent."""
     host, _, port = address.rpartition(":")
     with socket.socket() as probe:

@@ -40,7 +40,7 @@ class FusionPanel:
         self._keyframes, self._cameras = TeamKeyframes(client), TeamCameras(page, client)
         with gui.add_folder("History", expand_by_default=False):
             self._plots = TeamPlots(gui, client)
-        self._refine.on_click(lambda _: self._run_refinement())
+        self._refine.on_click(lambda _: self.refine())
 
     def poll(self) -> None:
         """Read the server's status and draw what changed. Raises GaussLiteError."""
@@ -75,6 +75,20 @@ class FusionPanel:
         self._page.show(fused if layer == _FUSED else self._download(layer, targets, fused))
         self._shown = shown
 
+    def refine(self) -> None:
+        """Refine the fused map; runs on a thread of the page's server."""
+        self._refine.disabled = True
+        try:
+            for progress in self._client.refine():
+                self._message.content = text_html(
+                    [f"refinement: iteration {progress.iteration} of {progress.iterations}, loss {progress.loss:.4f}"]
+                )
+            self._message.content = text_html(["refinement complete: choose the refined map above"])
+        except GaussLiteError as error:
+            self._message.content = text_html([str(error)])
+        finally:
+            self._refine.disabled = False
+
     def close(self) -> None:
         """Close the client and end the follower."""
         self._client.close()
@@ -103,20 +117,6 @@ class FusionPanel:
             ),
         ]
         self._status.content = text_html(lines)
-
-    def _run_refinement(self) -> None:
-        """Refine the fused map; runs on a thread of the page's server."""
-        self._refine.disabled = True
-        try:
-            for progress in self._client.refine():
-                self._message.content = text_html(
-                    [f"refinement: iteration {progress.iteration} of {progress.iterations}, loss {progress.loss:.4f}"]
-                )
-            self._message.content = text_html(["refinement complete: choose the refined map above"])
-        except GaussLiteError as error:
-            self._message.content = text_html([str(error)])
-        finally:
-            self._refine.disabled = False
 
 
 def _task_text(agent: Any) -> str:

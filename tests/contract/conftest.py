@@ -97,5 +97,9 @@ def oracle() -> RememberingOracle:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave out the comparisons of the oracle with itself."""
+    """Leave out the comparisons of the oracle with itself; backends and scenes that take long are slow tests."""
+    for item in items:
+        chosen = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+        if chosen.get("rasterizer") in SLOW_BACKENDS or chosen.get("name") == "many":
+            item.add_marker(pytest.mark.slow)
     items[:] = [item for item in items if not ("oracle" in item.originalname and "[reference" in item.name)]

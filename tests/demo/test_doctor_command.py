@@ -105,10 +105,10 @@ def test_a_taken_port_is_a_warning() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        check = doctor_command._port("gausslite-agent", f"127.0.0.1:{port}")
+        check = doctor_command.check_port("gausslite-agent", f"127.0.0.1:{port}")
         assert (check.status, check.name) == ("warning", f"port {port}")
         assert "--listen" in check.advice
-    assert doctor_command._port("gausslite-agent", f"127.0.0.1:{port}").status == "ok"
+    assert doctor_command.check_port("gausslite-agent", f"127.0.0.1:{port}").status == "ok"
 
 
 def test_the_checked_ports_are_those_that_the_services_take_by_default() -> None:
@@ -123,12 +123,12 @@ def test_the_checked_ports_are_those_that_the_services_take_by_default() -> None
 
 @pytest.mark.parametrize(("lead_s", "status"), [(0.01, "ok"), (30.0, "warning"), (-30.0, "warning")])
 def test_the_clock_is_compared_with_the_file_system(lead_s: float, status: str) -> None:
-    assert doctor_command._clock(lead_s).status == status
+    assert doctor_command.check_clock(lead_s).status == status
 
 
 def test_a_clock_from_before_the_installation_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor_command.time, "time", lambda: 0.0)
-    assert doctor_command._clock(0.0).status == "error"
+    assert doctor_command.check_clock(0.0).status == "error"
 
 
 def test_no_connection_is_opened(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 from browser import open_browser
+from page_controls import control
 from sample_gaussians import plain_gaussians
 
 from gausslite_view import splats as browser_detail
@@ -53,6 +54,7 @@ def drawn_counts(browser, page, until):
     return set(tab.evaluate("window.drawn"))
 
 
+@pytest.mark.slow
 def test_a_browser_that_answers_like_a_gpu_goes_from_the_first_level_to_all_splats(monkeypatch):
     monkeypatch.setattr(browser_detail, "HARDWARE_RESPONSE_S", 1000.0)
     monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
@@ -65,6 +67,7 @@ def test_a_browser_that_answers_like_a_gpu_goes_from_the_first_level_to_all_spla
         page.close()
 
 
+@pytest.mark.slow
 def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_more_when_it_is_fast(monkeypatch):
     monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 0.0)
     monkeypatch.setattr(browser_detail, "_RETRY_S", 0.01)
@@ -78,9 +81,9 @@ def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_mor
             tab.get_by_text(f"This browser draws them merged to {PREVIEW_COUNT:,}").wait_for()
             tab.wait_for_function("window.drawn.length > 0")
             assert set(tab.evaluate("window.drawn")) == {PREVIEW_COUNT}
-            page._adapts.value = False
+            control(page, "Adapt to browser").value = False
             tab.wait_for_function(f"window.drawn.at(-1) == {3 * PREVIEW_COUNT}")
-            page._adapts.value = True
+            control(page, "Adapt to browser").value = True
             tab.wait_for_function(f"window.drawn.at(-1) == {PREVIEW_COUNT}")
             # the next trial finds that the browser has become fast
             monkeypatch.setattr(browser_detail, "RESPONSE_LIMIT_S", 1000.0)
@@ -91,6 +94,7 @@ def test_a_slow_browser_keeps_the_small_set_unless_all_is_asked_for_and_gets_mor
         page.close()
 
 
+@pytest.mark.slow
 def test_a_browser_that_leaves_while_its_answer_is_used_ends_the_thread_quietly(monkeypatch):
     measured, has_left = threading.Event(), threading.Event()
     failures: list[object] = []

@@ -54,6 +54,7 @@ def test_the_range_holds_all_values_in_coarse_steps(values, expected):
     assert _range_of([np.array(values)]) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_an_open_browser_draws_lines_that_begin_later(page):
     plot = HistoryPlot(page.server.gui, "rate")
     with open_browser((900, 500)) as browser:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import open_browser
+from page_controls import SeenPage, control, text
 from run_folders import write_team
 from sample_gaussians import plain_gaussians
 
@@ -67,7 +68,7 @@ def run_folder(tmp_path):
 
 @pytest.fixture
 def page(run_folder):
-    page = open_page(0, "test")
+    page = SeenPage()
     contents = read_contents(run_folder)
     page.show_run(contents, read_past(run_folder, contents))
     yield page
@@ -80,6 +81,7 @@ def columns_near(tab, rgb, tolerance=70):
     return np.nonzero(np.abs(image - rgb).max(axis=2) < tolerance)[1]
 
 
+@pytest.mark.slow
 def test_a_browser_draws_the_map_and_asks_no_other_machine(page):
     with open_browser() as browser:
         tab = browser.new_page()
@@ -97,12 +99,13 @@ def test_a_browser_draws_the_map_and_asks_no_other_machine(page):
         assert hosts == {urlsplit(page.url).netloc}
 
 
+@pytest.mark.slow
 def test_each_choice_of_colour_is_drawn_in_a_browser(page):
     with open_browser() as browser:
         tab = browser.new_page()
         tab.goto(page.url)
         wait_until(lambda: min(len(columns_near(tab, RED)), len(columns_near(tab, YELLOW))) > 2000)
-        contents = page._contents
+        contents = page.contents
         left, right = (int(np.argmax(contents.gaussians.target == target)) for target in (0, -1))
         for mode in (ColourMode.KAPPA, ColourMode.OBJECT, ColourMode.AGENT, ColourMode.RGB):
             tab.get_by_label("Colour").first.click()
@@ -113,6 +116,7 @@ def test_each_choice_of_colour_is_drawn_in_a_browser(page):
                 wait_until(lambda rgb=rgb: len(columns_near(tab, rgb, 40)) > 2000)
 
 
+@pytest.mark.slow
 def test_the_time_slider_shows_the_earlier_map_in_a_browser(page):
     with open_browser() as browser:
         tab = browser.new_page()
@@ -135,11 +139,10 @@ def wait_until(condition):
 
 
 def test_the_time_slider_ends_the_trajectory_and_leaves_out_later_objects(page):
-    page._scrub._seconds.value = 1.0
-    points = [handle for handle in page._markers._drawn["trajectory"] if handle.name == "/trajectory"]
-    assert points[0].points.shape[0] == 1
-    assert "after 1.0 s" in page._scrub._note.content
-    assert len(page._drawn_past.load().gaussians) == len(page._contents.gaussians) // 2
+    control(page, "Seconds").value = 1.0
+    assert page.server.scene.get_handle_by_name("/trajectory").points.shape[0] == 1
+    assert "after 1.0 s" in text(page)
+    assert f"{len(page.contents.gaussians) // 2} Gaussians" in text(page)
 
 
 def test_a_live_page_set_back_keeps_the_earlier_map_and_follows_again_at_the_end():
@@ -151,14 +154,13 @@ def test_a_live_page_set_back_keeps_the_earlier_map_and_follows_again_at_the_end
             page.remember(contents)
             page.show(contents)
             if second == 50:
-                page._scrub._seconds.value = 20.0
-        assert page._scrub._seconds.max == pytest.approx(99.0)
+                control(page, "Seconds").value = 20.0
+        assert control(page, "Seconds").max == pytest.approx(99.0)
         # the state after 20 s, or the one kept before it
-        assert len(page._drawn_past.load().gaussians) in (20, 21)
-        assert len(page._scrub._history) == 64
-        page._scrub._seconds.value = 99.0
-        assert page._drawn_past is None
-        assert "newest map" in page._scrub._note.content
+        assert any(f">{count} Gaussians" in text(page) for count in (20, 21))
+        control(page, "Seconds").value = 99.0
+        assert ">100 Gaussians" in text(page)
+        assert "newest map" in text(page)
     finally:
         page.close()
 
@@ -169,8 +171,8 @@ def test_a_run_without_a_history_says_so(run_folder):
     page = open_page(0, "test")
     try:
         page.show_run(contents, read_past(run_folder, contents))
-        page._scrub._seconds.value = 1.0
-        assert "no earlier map is known" in page._scrub._note.content
+        control(page, "Seconds").value = 1.0
+        assert "no earlier map is known" in text(page)
     finally:
         page.close()
 
@@ -221,6 +223,7 @@ def test_a_box_has_twelve_edges_along_its_axes():
     assert sorted(lengths_m.max(axis=1).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
 
 
+@pytest.mark.slow
 def test_the_page_of_a_demo_shows_one_map_at_a_time_and_what_it_is_for(tmp_path):
     team = write_team(tmp_path / "team")
     with show_files(Namespace(place=str(team), port=0, max_shown=10_000)) as url, open_browser() as browser:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from browser import open_browser, point
 from mapping_scenes import wall_frame
+from page_controls import control
 from tiny_sequences import write_seven_scenes
 
 from gausslite.cli.main import main
@@ -82,6 +83,7 @@ def wait_until(condition: Callable[[], bool], tab: Any) -> None:
         tab.wait_for_timeout(100)
 
 
+@pytest.mark.slow
 def test_a_click_on_the_camera_image_is_a_target_until_it_is_left_out() -> None:
     with open_browser((1200, 900)) as browser:
         searched = mission()
@@ -101,7 +103,7 @@ def test_a_click_on_the_camera_image_is_a_target_until_it_is_left_out() -> None:
                 assert (searched.graph.targets, searched.graph.pointed) == (("mug", "wall"), ("wall",))
                 tab.get_by_role("button", name="Not this one").click()
                 tab.get_by_text("is left out").wait_for()
-                view._task.text.value = "Find the lamp"
+                control(page, "Task").value = "Find the lamp"
                 tab.get_by_role("button", name="Assign task").click()
                 tab.get_by_text("assigned: targets lamp").wait_for()
             assert searched.process(wall_frame(len(shares))).roi_share == 0

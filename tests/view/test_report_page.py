@@ -237,6 +237,7 @@ def test_only_an_earlier_page_is_replaced(tmp_path, capsys):
     assert main(["report", str(run)]) == 0
 
 
+@pytest.mark.slow
 def test_a_browser_shows_the_page_without_requests_or_refusals(tmp_path):
     report(write_run(tmp_path / "a", task=TASK), write_run(tmp_path / "b"), out=tmp_path / "page.html")
     requests: list[str] = []
@@ -268,6 +269,7 @@ def test_the_views_of_several_agents_take_turns(tmp_path):
     assert sorted((view.image.index, view.recorder) for view in views) == [(10, "a"), (10, "b"), (11, "a"), (11, "b")]
 
 
+@pytest.mark.slow
 def test_a_narrow_window_cuts_no_column(tmp_path):
     runs = [write_run(tmp_path / f"a-rather-long-name-{number}", task=TASK, objects=[MUG]) for number in range(4)]
     report(*runs, out=tmp_path / "page.html")

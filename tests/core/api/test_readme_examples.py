@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
-
 README = Path(__file__).resolve().parents[3] / "README.md"
 MAX_LINES = 10
 

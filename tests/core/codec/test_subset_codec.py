@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import fields, replace
 
 import google_crc32c
@@ -181,41 +182,35 @@ def forge(body: bytes, voxels: int, gaussians: int, size_m: float = 0.1, version
     return message + struct.pack("<I", google_crc32c.value(message))
 
 
-def test_other_versions_and_codings_are_refused() -> None:
-    with pytest.raises(CodecError, match=r"expected b'GLSB' version 2, got b'GLSB' version 1"):
-        decode_subset(forge(b"", 0, 0, version=1))
-    with pytest.raises(CodecError, match="expected coding 0 or 1, got 2"):
-        decode_subset(forge(b"", 0, 0, coding=2))
+def packed(data: bytes, declares_size: bool = True) -> bytes:
+    return zstandard.ZstdCompressor(level=3, write_content_size=declares_size).compress(data)
 
 
-def test_a_decompression_bomb_is_refused_by_its_declared_size() -> None:
-    bomb = zstandard.ZstdCompressor(level=3).compress(bytes(1 << 28))
-    unsized = zstandard.ZstdCompressor(level=3, write_content_size=False).compress(bytes(1 << 28))
-    for frame in (bomb, unsized):
-        with pytest.raises(CodecError, match="expected a body of 20 bytes"):
-            decode_subset(forge(frame, voxels=1, gaussians=0))
-        with pytest.raises(CodecError, match="expected a body of 20 bytes"):
-            decode_subset(forge(struct.pack("<I", len(frame)) + frame, voxels=1, gaussians=0, coding=0))
-    with pytest.raises(CodecError, match="a longer one"):
-        decode_subset(forge(struct.pack("<I", 2**32 - 1), voxels=1, gaussians=0, coding=0))
+def sized(frame: bytes) -> bytes:
+    return struct.pack("<I", len(frame)) + frame
 
 
-def test_counts_and_sizes_above_the_limits_are_refused() -> None:
-    with pytest.raises(CodecError, match="at most 200000 voxels"):
-        decode_subset(forge(b"", voxels=2**32 - 1, gaussians=0))
-    with pytest.raises(CodecError, match="at most 10 bytes"):
-        decode_subset(bytes(11), CodecLimits(max_bytes=10))
-
-
-def test_counts_that_disagree_are_refused() -> None:
-    body = zstandard.ZstdCompressor().compress(struct.pack("<qQI", 5, 0, 1))
-    with pytest.raises(CodecError, match="voxel counts sum to 1"):
-        decode_subset(forge(body, voxels=1, gaussians=0))
-    negative = zstandard.ZstdCompressor().compress(struct.pack("<qQI", -5, 0, 0))
-    with pytest.raises(CodecError, match="negative"):
-        decode_subset(forge(negative, voxels=1, gaussians=0))
-    with pytest.raises(CodecError, match="size_m"):
-        decode_subset(forge(zstandard.ZstdCompressor().compress(bytes(20)), voxels=1, gaussians=0, size_m=float("nan")))
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: forge(b"", 0, 0, version=1), r"expected b'GLSB' version 2, got b'GLSB' version 1"),
+        (lambda: forge(b"", 0, 0, coding=2), "expected coding 0 or 1, got 2"),
+        # a decompression bomb, with its size and without
+        (lambda: forge(packed(bytes(1 << 28)), 1, 0), "expected a body of 20 bytes"),
+        (lambda: forge(packed(bytes(1 << 28), False), 1, 0), "expected a body of 20 bytes"),
+        (lambda: forge(sized(packed(bytes(1 << 28))), 1, 0, coding=0), "expected a body of 20 bytes"),
+        (lambda: forge(sized(packed(bytes(1 << 28), False)), 1, 0, coding=0), "expected a body of 20 bytes"),
+        (lambda: forge(struct.pack("<I", 2**32 - 1), 1, 0, coding=0), "a longer one"),
+        (lambda: forge(b"", 2**32 - 1, 0), "at most 200000 voxels"),
+        (lambda: bytes(CodecLimits().max_bytes + 1), "at most 1048576 bytes"),
+        (lambda: forge(packed(struct.pack("<qQI", 5, 0, 1)), 1, 0), "voxel counts sum to 1"),
+        (lambda: forge(packed(struct.pack("<qQI", -5, 0, 0)), 1, 0), "negative"),
+        (lambda: forge(packed(bytes(20)), 1, 0, size_m=float("nan")), "size_m"),
+    ],
+)
+def test_a_forged_message_is_refused_before_anything_is_allocated(call: Callable[[], bytes], message: str) -> None:
+    with pytest.raises(CodecError, match=message):
+        decode_subset(call())
 
 
 @pytest.mark.parametrize(

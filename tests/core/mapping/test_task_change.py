@@ -180,16 +180,21 @@ def test_seeds_of_the_new_region_evict_gaussians_of_the_old_region_first() -> No
     assert int((~old.active & (old.kappa == 0)).sum()) == 20
 
 
+def roi_voxels(task_mapper: TaskMapper) -> set[int]:
+    gaussians = task_mapper.gaussians()
+    return set(GRID.keys(gaussians.means_m[gaussians.active]).tolist())
+
+
 def test_sent_voxels_of_the_old_region_get_no_tombstones() -> None:
     task_mapper = make_task_mapper()
     map_frames(task_mapper, 0, 6)
-    sent = set(GRID.keys(task_mapper._mapper.gaussians(active_only=True).means_m).tolist())
+    sent = roi_voxels(task_mapper)
     task_mapper.assign(B)
     counts: dict[int, int] = {}
     for outcome in map_frames(task_mapper, 6, 14):
         assert outcome.changed_roi is not None
         counts.update(zip(outcome.changed_roi.keys.tolist(), outcome.changed_roi.counts.tolist(), strict=True))
-    new = set(GRID.keys(task_mapper._mapper.gaussians(active_only=True).means_m).tolist())
+    new = roi_voxels(task_mapper)
     assert new <= set(counts) | sent
     assert not {key for key in sent - new if counts.get(key) == 0}
 

@@ -14,6 +14,7 @@ from gausslite.datasets.open import open_source
 from gausslite.domain.errors import GaussLiteError
 from gausslite.domain.frame import Frame
 from gausslite.domain.pose import Trajectory, inverse, rotation_angle_deg, transform_of, translation_m
+from gausslite.domain.state import select_prefix
 from gausslite.mapping.tracking import CameraTracker, KeyframeIndex
 from gausslite.mission.build import build_mapper, build_tracker
 from gausslite.mission.settings import MissionSettings, PoseMode
@@ -156,9 +157,7 @@ def test_a_forged_state_is_refused(name: str) -> None:
     mapper = tracking_mapper()
     for frame in walk()[:3]:
         mapper.process(frame)
-    tracker = mapper._tracker
-    assert isinstance(tracker, CameraTracker)
-    state = {key: array.copy() for key, array in tracker.state().items()}
+    state = {key: array.copy() for key, array in select_prefix(mapper.state(), "tracker").items()}
     [key] = [key for key in state if key.replace(".", "/") == name]
     state[key].flat[0] = np.nan
     restored = CameraTracker(lambda camera, T_world_camera, motion: as_rendering(walk()[2]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
 import cv2
@@ -21,8 +20,9 @@ from gausslite_evaluation.metrics import psnr
 from gausslite_view.pages import live_page, own_address
 
 pytest.importorskip("viser")
+from page_controls import SeenPage, plot, poll_until
+
 from gausslite_view.agent_panel import AgentPanel
-from gausslite_view.pages import open_page
 
 
 def write(tab: Any, number: int, text: str) -> None:
@@ -41,6 +41,7 @@ def assign(tab: Any, task: str) -> None:
     tab.get_by_role("button", name="Assign task").click()
 
 
+@pytest.mark.slow
 def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it():
     with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
         tab = browser.new_page()
@@ -57,6 +58,7 @@ def test_a_task_from_the_page_arrives_and_the_mission_ends_from_it():
         tab.get_by_text("robot: ended").wait_for()
 
 
+@pytest.mark.slow
 def test_the_newest_detection_is_drawn_over_its_image_in_a_browser():
     mug = RegionDetector({"mug": BallRegion((0.0, 0.0, 1.2), 0.2)})
     with (
@@ -83,6 +85,7 @@ def test_the_newest_detection_is_drawn_over_its_image_in_a_browser():
         assert yellow.sum() > 100
 
 
+@pytest.mark.slow
 def test_a_wrong_task_is_reported_on_the_page():
     with agent() as running, open_browser() as browser, live_page(0, running.client.address, is_agent=True) as url:
         tab = browser.new_page()
@@ -94,22 +97,22 @@ def test_a_wrong_task_is_reported_on_the_page():
 
 def test_the_panel_records_how_well_the_map_renders_the_newest_keyframe():
     with agent() as running:
-        page, client = open_page(0, "test"), AgentClient(running.client.address)
+        page, client = SeenPage(), AgentClient(running.client.address)
         panel = AgentPanel(page, client)
         try:
             running.client.assign_task(TASK)
             for index in range(3):
                 next(running.client.ingest([frame(index)]))
-            wait_for_map(panel)
-            panel.poll()
+            poll_until(panel.poll, lambda: len(page.contents.gaussians) > 0)
             rendered, _ = client.render(frame(0).camera, frame(0).T_world_camera)
-            full_db = panel._quality._full.columns()[1][0]
+            full_db = plot(page, "training PSNR, full image (dB)")["dB"][0]
             assert full_db == pytest.approx(psnr(rendered, client.camera_view().rgb), abs=1.0)
         finally:
             panel.close()
             page.close()
 
 
+@pytest.mark.slow
 def test_a_click_on_the_map_is_a_target_until_it_is_left_out():
     with (
         agent(lambda graph: TaskRelevanceEstimator(graph, RegionDetector({}))) as running,
@@ -133,6 +136,7 @@ def test_a_click_on_the_map_is_a_target_until_it_is_left_out():
         assert next(running.client.ingest([frame(5)])).roi_share == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", [[(0.5, 0.5)], [(0.3, 0.3), (0.7, 0.7)]])
 def test_a_click_or_a_box_on_the_camera_image_is_a_target(places):
     with (
@@ -154,16 +158,6 @@ def test_a_click_or_a_box_on_the_camera_image_is_a_target(places):
         assert next(running.client.ingest([frame(1)])).roi_share > 0
         (wall,) = running.worker.status().objects
         assert wall.noun == "wall"
-
-
-def wait_for_map(panel: AgentPanel) -> None:
-    waiting = threading.Event()
-    for _ in range(1200):
-        newest = panel._follower.newest()
-        if newest is not None and len(newest.batch):
-            return
-        waiting.wait(0.05)
-    raise AssertionError("no map arrived")
 
 
 @pytest.mark.parametrize(

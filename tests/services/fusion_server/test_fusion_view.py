@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from typing import Any
 
@@ -21,11 +20,11 @@ from gausslite_view.contents import ColourMode, legend_of
 from gausslite_view.pages import live_page
 
 pytest.importorskip("viser")
+from page_controls import SeenPage, control, images, plot, poll_until, text
+
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import encode_mask, frame_to_message
-from gausslite.wire.map_follower import FollowedMap, MapFollower
 from gausslite_view.fusion_panel import FusionPanel
-from gausslite_view.pages import open_page
 
 WAIT_S = 60.0
 
@@ -39,33 +38,22 @@ def contribute(running: RunningServer, agent_id: str, task: str, cells_m: list[f
     running.client.report_objects(session, ObjectReport(RuleParser().parse(task)))
 
 
-def wait_for_map(follower: MapFollower) -> FollowedMap:
-    waiting = threading.Event()
-    for _ in range(int(WAIT_S / 0.05)):
-        newest = follower.newest()
-        if newest is not None and len(newest.batch):
-            return newest
-        waiting.wait(0.05)
-    raise AssertionError("no map arrived")
-
-
 def test_the_page_shows_who_won_each_voxel_and_what_it_shows():
     with fusion_server() as running:
         contribute(running, "a", "Pick up the mug", [0.0, 1.0], kappa=5)
         contribute(running, "b", "Find the chair", [1.0, 2.0], kappa=9)
-        page, client = open_page(0, "test"), FusionClient(running.client.address)
+        page, client = SeenPage(), FusionClient(running.client.address)
         panel = FusionPanel(page, client)
         try:
-            wait_for_map(panel._follower)
-            panel.poll()
-            fused = page._contents
+            poll_until(panel.poll, lambda: len(page.contents.gaussians) == 3)
+            fused = page.contents
             order = np.argsort(fused.gaussians.means_m[:, 0])
             assert [fused.agents[i] for i in fused.agent[order]] == ["a", "b", "b"]
             assert [fused.targets[i] for i in fused.gaussians.target[order]] == ["mug", "chair", "chair"]
             assert [name for name, _ in legend_of(fused, ColourMode.AGENT)] == ["a", "b"]
-            panel._layer.value = "a"
+            control(page, "Shown map").value = "a"
             panel.poll()
-            own = page._contents
+            own = page.contents
             np.testing.assert_allclose(np.sort(own.gaussians.means_m[:, 0]), [0.05, 1.05], atol=0.01)
             assert (own.agents, own.targets) == (("a",), ("mug",))
         finally:
@@ -79,26 +67,25 @@ def test_the_page_shows_the_newest_keyframe_of_each_agent_and_an_earlier_one():
         session = running.client.join("a", GRID).session_id
         assert running.client.contribute_keyframes(session, [coloured_frame(3, 40), coloured_frame(8, 200)]) == 2
         contribute(running, "b", "Find the chair", [1.0], kappa=9)
-        page, client = open_page(0, "test"), FusionClient(running.client.address)
+        page, client = SeenPage(), FusionClient(running.client.address)
         panel = FusionPanel(page, client)
         try:
-            wait_for_map(panel._follower)
-            panel.poll()
-            images = panel._cameras._images._shown
-            assert list(images) == ["a"]
-            assert images["a"].handle.label.startswith("a: keyframe 8")
-            assert abs(int(images["a"].handle.image.mean()) - 200) < 3
-            (view,) = page._contents.keyframes
+            poll_until(panel.poll, lambda: len(page.contents.gaussians) == 2)
+            (shown,) = images(page)
+            assert shown.label.startswith("a: keyframe 8")
+            assert abs(int(shown.image.mean()) - 200) < 3
+            (view,) = page.contents.keyframes
             np.testing.assert_allclose(view.T_world_camera[:3, 3], [0.8, 0.0, 0.0])
-            panel._cameras._age.value = 1
+            control(page, "Keyframes back").value = 1
             panel.poll()
-            assert images["a"].handle.label.startswith("a: keyframe 3")
+            assert shown.label.startswith("a: keyframe 3")
         finally:
             panel.close()
             page.close()
 
 
-def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality():
+def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality(monkeypatch):
+    monkeypatch.setattr("gausslite_view.plots._RENDER_INTERVAL_S", 0.0)
     with fusion_server() as running:
         session = running.client.join("a", GRID, T_fused_agent=moved_x(2.0)).session_id
         running.contribute_subsets(session, RoiSubset("a", session, 1, 1, wall()))
@@ -106,31 +93,24 @@ def test_the_page_draws_each_agents_path_and_plots_its_region_and_the_quality():
         contribute(running, "b", "Find the chair", [1.0], kappa=9)
         session_b = running.client.join("b", GRID).session_id
         running.client.contribute_keyframes(session_b, [coloured_frame(5, 90)])
-        page, client = open_page(0, "test"), FusionClient(running.client.address)
+        page, client = SeenPage(), FusionClient(running.client.address)
         panel = FusionPanel(page, client)
         try:
-            wait_for_map(panel._follower)
-            panel.poll()
-            assert not panel._keyframes.is_complete
-            panel.poll()
-            assert panel._keyframes.is_complete
-            a, b = page._contents.paths
+            poll_until(panel.poll, lambda: len(page.contents.gaussians) == len(wall().gaussians) + 1)
+            poll_until(panel.poll, lambda: len(page.contents.paths[0].keyframes) == 20)
+            a, b = page.contents.paths
             assert (a.agent, [view.index for view in a.keyframes]) == ("a", list(range(20)))
             np.testing.assert_allclose(a.keyframes[-1].T_world_camera[:3, 3], [3.9, 0.0, 0.0])
             assert (b.agent, b.colour_index, len(b.keyframes)) == ("b", 1, 1)
-            names = {handle.name for handle in page._markers._drawn["team"]}
-            assert {"/team/a/line", "/team/a/newest", "/team/a/label", "/team/b/newest"} <= names
-            share_percent = panel._plots._roi.columns()[1]
-            assert share_percent[-1] == pytest.approx(25.0)
-            panel._plots._rendered_s = -1e9
-            panel.poll()
+            node = page.server.scene.get_handle_by_name
+            assert all(node(f"/team/{name}") for name in ("a/line", "a/newest", "a/label", "b/newest"))
+            assert plot(page, "pixels in the region (%)")["a"][-1] == pytest.approx(25.0)
             # one agent each time: a has a region, b has none
-            assert set(panel._plots._rendered) == {"a", "b"}
-            assert len(panel._plots._full._names) == 2
-            assert panel._plots._region._names == ["a"]
-            assert panel._plots._traffic._names == ["a", "b"]
-            page._markers._switches["Trajectory"].value = False
-            assert "/team/a/line" not in {handle.name for handle in page._markers._drawn["team"]}
+            poll_until(panel.poll, lambda: plot(page, "fused map, image PSNR (dB)").keys() == {"s", "a", "b"})
+            assert plot(page, "fused map, region PSNR (dB)").keys() == {"s", "a"}
+            assert plot(page, "received (kB/s)").keys() == {"s", "a", "b"}
+            control(page, "Trajectory").value = False
+            assert node("/team/a/line") is None
         finally:
             panel.close()
             page.close()
@@ -141,27 +121,21 @@ def test_the_time_slider_shows_the_earlier_fused_map_and_keyframe():
         contribute(running, "a", "Pick up the mug", [0.0], kappa=5)
         session = running.client.join("a", GRID).session_id
         assert running.client.contribute_keyframes(session, [coloured_frame(3, 40)]) == 1
-        page, client = open_page(0, "test"), FusionClient(running.client.address)
+        page, client = SeenPage(), FusionClient(running.client.address)
         panel = FusionPanel(page, client)
         try:
-            wait_for_map(panel._follower)
-            panel.poll()
+            poll_until(panel.poll, lambda: len(page.contents.gaussians) == 1)
             contribute(running, "b", "Find the chair", [1.0, 2.0], kappa=9)
             assert running.client.contribute_keyframes(session, [coloured_frame(8, 200)]) == 1
-            for _ in range(int(WAIT_S / 0.05)):
-                if len(panel._follower.newest().batch) == 3:
-                    break
-                threading.Event().wait(0.05)
-            panel.poll()
-            assert len(page._contents.gaussians) == 3
-            page._scrub._seconds.value = 0.0
-            past = page._drawn_past.load()
-            assert (len(past.gaussians), [past.agents[i] for i in past.agent]) == (1, ["a"])
-            assert [each.noun for each in past.objects] == []
-            shown = panel._cameras._images._shown["a"].handle
+            poll_until(panel.poll, lambda: len(page.contents.gaussians) == 3)
+            (shown,), seconds = images(page), control(page, "Seconds")
+            control(page, "Colour").value = str(ColourMode.AGENT)
+            seconds.value = 0.0
+            assert "1 Gaussians" in text(page)
+            assert ">b</div>" not in text(page)
             assert shown.label.startswith("a at the chosen time: keyframe 3")
             assert abs(int(shown.image.mean()) - 40) < 3
-            page._scrub._seconds.value = page._scrub._seconds.max
+            seconds.value = seconds.max
             assert shown.label.startswith("a: keyframe 8")
             assert abs(int(shown.image.mean()) - 200) < 3
         finally:
@@ -189,6 +163,7 @@ def with_region(index: int) -> Any:
     return message
 
 
+@pytest.mark.slow
 def test_a_refinement_is_started_in_a_browser_which_then_shows_its_map():
     with (
         fusion_server() as running,
@@ -258,12 +233,12 @@ def coloured_frame(index: int, grey: int) -> Frame:
 
 def test_a_refused_refinement_is_reported_on_the_page():
     with fusion_server() as running:
-        page = open_page(0, "test")
+        page = SeenPage()
         panel = FusionPanel(page, FusionClient(running.client.address))
         try:
-            panel._run_refinement()
-            assert "keyframes" in panel._message.content
-            assert not panel._refine.disabled
+            panel.refine()
+            assert "refinement: expected a fused map and keyframes, got 0 Gaussians" in text(page)
+            assert not control(page, "Start refinement").disabled
         finally:
             panel.close()
             page.close()
