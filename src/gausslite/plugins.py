@@ -28,6 +28,7 @@ class Group(StrEnum):
     PARSERS = "gausslite.parsers"  # a `ParserBackend`, which reads a sentence as a task graph
     NOUNS = "gausslite.nouns"  # a `NounVocabulary`
     DETECTORS = "gausslite.detectors"  # opens a model file as a detector
+    POLICIES = "gausslite.policies"  # a `MapperSettings` of another system, to compare with; the name is of `--policy`
     RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map

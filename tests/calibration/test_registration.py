@@ -11,7 +11,7 @@ from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered import register_depth
+from gausslite_calibration.registered import register_depth
 from gausslite.datasets.source import WrappedSource
 from gausslite.domain.camera import Camera, FileIntrinsics
 from gausslite.domain.errors import DatasetError

@@ -11,7 +11,7 @@ from tiny_sequences import write_seven_scenes, write_tum
 
 import gausslite as gl
 from gausslite.cli.main import main
-from gausslite.cli.source_options import calibrate_with_messages, stated_values
+from gausslite.mission.recording import calibrate_with_messages, stated_values
 from gausslite.config.values import AUTO
 from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.open import open_source

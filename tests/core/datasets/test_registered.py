@@ -10,7 +10,7 @@ import pytest
 from tiny_sequences import write_seven_scenes
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered import RegisteredSource, register_depth
+from gausslite_calibration.registered import RegisteredSource, register_depth
 from gausslite.domain.camera import Camera, FileIntrinsics
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import DepthRegistration

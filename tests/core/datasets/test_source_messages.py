@@ -11,7 +11,7 @@ import pytest
 from tiny_sequences import write_seven_scenes, write_tum
 
 from gausslite.cli.main import main
-from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
+from gausslite.mission.recording import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.calibration import Calibration
 from gausslite.datasets.open import open_source
