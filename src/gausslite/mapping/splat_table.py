@@ -59,9 +59,8 @@ def require_memory(capacity: int) -> None:
 
 
 def _too_large(capacity: int) -> InvalidInputError:
-    return InvalidInputError(
-        f"max_gaussians: expected a table that fits in memory ({_BYTES_PER_GAUSSIAN} bytes per Gaussian), got {capacity}"
-    )
+    fits = f"fits in memory ({_BYTES_PER_GAUSSIAN} bytes per Gaussian)"
+    return InvalidInputError(f"max_gaussians: expected a table that {fits}, got {capacity}")
 
 
 class SplatTable:

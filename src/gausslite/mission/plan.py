@@ -158,10 +158,9 @@ class RunPlan:
         return OpenRun(self, FrameStream.select(source, self.source), mapper, source.world_frame)
 
     def task_mapper(self, scene: SceneInfo) -> TaskMapper:
-        """Return a mapper for frames that come from elsewhere. Raises InvalidInputError, ModelFileError, KernelError."""
-        return build_task_mapper(
-            self.mission, EstimatorFactory(self.perception, lambda: scene), self.schedule.first or self.regions
-        )
+        """Return a mapper for other frames. Raises InvalidInputError, ModelFileError, KernelError."""
+        models = EstimatorFactory(self.perception, lambda: scene)
+        return build_task_mapper(self.mission, models, self.schedule.first or self.regions)
 
     def _stated(self, source: Source, saved: SavedRun | None) -> StatedValues:
         """Return what is not to be estimated: also what a saved run has, and what needs poses that are not used."""
@@ -319,8 +318,10 @@ class OpenRun:
         prepare_folder(path.parent)
         graph = self.scheduled.graph
         extra: State = {_FRAMES: encode_text(self.plan.source.frames)}
-        extra |= {} if self.prior is None else self.prior.state()
-        extra |= {_POINTED: encode_text("\n".join(graph.pointed))} if graph is not None and graph.pointed else {}
+        if self.prior is not None:
+            extra = {**extra, **self.prior.state()}
+        if graph is not None and graph.pointed:
+            extra = {**extra, _POINTED: encode_text("\n".join(graph.pointed))}
         config = ResumeConfig.of(*self.plan.fixed_settings(self.scheduled.schedule.at(last_index), self.sequence))
         save_run(path, self.scheduled.mapper, config, last_index, extra)
 
