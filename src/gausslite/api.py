@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,10 +24,11 @@ from gausslite.domain.checks import describe, require_instance, require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import Answer, ObjectLandmark
 from gausslite.domain.pose import Twist, UpAxis, require_rigid
 from gausslite.domain.recording import DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import BallRegion, PointedObject, Region
+from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import empty_batch
 from gausslite.mission.plan import RunPlan
 from gausslite.mission.schedule import TaskSchedule
@@ -41,7 +42,7 @@ from gausslite.mission.settings import (
 )
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.pointing import region_at, region_on_image
-from gausslite.perception.questions import Z_UP, Answer, answer
+from gausslite.plugins import Group, load
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
 from gausslite.wire.robot import AgentLink
@@ -274,9 +275,10 @@ def render_view(
     return RenderedImage(image.rgb, image.expected_depth_m(), image.alpha)
 
 
-def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = Z_UP) -> Answer:
+def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = (0.0, 0.0, 1.0)) -> Answer:
     """Return the objects that a question means, such as "what is on the table" or "largest chair"; count them with len.
 
-    objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError.
+    objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError, MissingPluginError.
     """
+    answer: Callable[[TaskGraph, list[ObjectLandmark], UpAxis], Answer] = load(Group.QUESTIONS, purpose="ask")
     return answer(DefaultParser().parse(question), list(objects), up_axis)
