@@ -278,7 +278,8 @@ def render_view(
 def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = (0.0, 0.0, 1.0)) -> Answer:
     """Return the objects that a question means, such as "what is on the table" or "largest chair"; count them with len.
 
-    objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError, MissingPluginError.
+    objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError,
+    MissingPluginError.
     """
     answer: Callable[[TaskGraph, list[ObjectLandmark], UpAxis], Answer] = load(Group.QUESTIONS, purpose="ask")
     return answer(DefaultParser().parse(question), list(objects), up_axis)
