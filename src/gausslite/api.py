@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,13 +24,14 @@ from gausslite.domain.checks import describe, require_instance, require_size
 from gausslite.domain.errors import DatasetError, InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import Answer, ObjectLandmark
 from gausslite.domain.pose import Twist, UpAxis, require_rigid
 from gausslite.domain.recording import DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import BallRegion, PointedObject, Region
+from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import empty_batch
-from gausslite.mission.build import EstimatorFactory, build_task_mapper
-from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
+from gausslite.mission.plan import RunPlan
+from gausslite.mission.schedule import TaskSchedule
 from gausslite.mission.settings import (
     MissionSettings,
     PerceptionSettings,
@@ -41,7 +42,7 @@ from gausslite.mission.settings import (
 )
 from gausslite.mission.task_mapper import TaskMapper
 from gausslite.perception.pointing import region_at, region_on_image
-from gausslite.perception.questions import Z_UP, Answer, answer
+from gausslite.plugins import Group, load
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.clients import AgentClient, Export, FrameOutcome, FusionClient, ParserClient
 from gausslite.wire.robot import AgentLink
@@ -160,22 +161,31 @@ def create_mapper(
     `SceneInfo(up_axis)` for a live camera. perception: the detector's files; without a detector, the scene's ground
     truth finds the task's objects. Raises TaskError, InvalidInputError, ModelFileError, KernelError.
     """
-    settings = MissionSettings() if settings is None else settings
-    perception = PerceptionSettings() if perception is None else perception
     require_instance("scene", scene, SceneInfo, "gausslite.SceneInfo.of(source)")
-    require_instance("settings", settings, MissionSettings, "gausslite.MissionSettings(...)")
-    require_instance("perception", perception, PerceptionSettings, "gausslite.PerceptionSettings(...)")
+    return _plan(task, regions, settings, perception).task_mapper(scene)
+
+
+def _plan(
+    task: str | None,
+    regions: Iterable[Region],
+    settings: MissionSettings | None,
+    perception: PerceptionSettings | None,
+) -> RunPlan:
+    """Return what these arguments map. Raises TaskError, InvalidInputError."""
+    mission = MissionSettings() if settings is None else settings
+    models = PerceptionSettings() if perception is None else perception
+    require_instance("settings", mission, MissionSettings, "gausslite.MissionSettings(...)")
+    require_instance("perception", models, PerceptionSettings, "gausslite.PerceptionSettings(...)")
     if task is not None:
         require_instance("task", task, str, "a sentence as text")
     chosen = _require_regions(regions)
     if task is not None and chosen:
         raise InvalidInputError("task: expected either a task or regions, got both")
-    if task is None and perception.model is not None:
+    if task is not None:
+        return RunPlan(mission, models, schedule=TaskSchedule(DefaultParser().parse(task)))
+    if models.model is not None:
         raise InvalidInputError("perception.model: expected a task for the detector, got none")
-    if task is None and not chosen:
-        settings = _without_task(settings)
-    roi = chosen if task is None else DefaultParser().parse(task)
-    return build_task_mapper(settings, EstimatorFactory(perception, lambda: scene), roi)
+    return RunPlan(mission if chosen else _without_task(mission), models, regions=tuple(chosen))
 
 
 def _require_regions(regions: object) -> list[Region]:
@@ -220,16 +230,16 @@ def map_sequence(
     require_instance("frames", frames, str, 'text such as "0:100" or "0:100:2"')
     if size is not None:
         require_size("size", size)
-    mapper = create_mapper(SceneInfo.of(source), task, regions=regions, settings=settings, perception=perception)
     size_text = None if size is None else f"{size[0]}x{size[1]}"
-    stream = FrameStream.select(source, SourceSettings(source.name, frames, size_text))
+    plan = _plan(task, regions, settings, perception)
+    run = replace(plan, source=SourceSettings(source.name, frames, size_text)).open_source(source)
     skipped: list[str] = []
-    corrupt = CorruptFrames(skipped.append)
-    result = MissionRunner(mapper.process).run(stream.frames(corrupt))
-    result.raise_if_stopped()
-    if result.totals.frames == 0:
-        raise corrupt.first_error or DatasetError(f"{source.name}: expected frames with depth, got none")
-    return MapResult(mapper.gaussians(), result.summary(), (*as_recorded_notes(source), *skipped, *mapper.notes))
+    mapped = run.map(skipped.append)
+    mapped.result.raise_if_stopped()
+    if mapped.result.totals.frames == 0:
+        raise mapped.corrupt.first_error or DatasetError(f"{source.name}: expected frames with depth, got none")
+    notes = (*as_recorded_notes(source), *skipped, *mapped.mapper.notes)
+    return MapResult(mapped.gaussians, mapped.result.summary(), notes)
 
 
 def save_ply(path: str | Path, gaussians: Gaussians, *, world_frame: str = "") -> None:
@@ -265,9 +275,11 @@ def render_view(
     return RenderedImage(image.rgb, image.expected_depth_m(), image.alpha)
 
 
-def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = Z_UP) -> Answer:
+def ask(objects: Iterable[ObjectLandmark], question: str, *, up_axis: UpAxis = (0.0, 0.0, 1.0)) -> Answer:
     """Return the objects that a question means, such as "what is on the table" or "largest chair"; count them with len.
 
-    objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError.
+    objects: `[found.landmark for found in fusion.query_objects()]`, or a mapper's `objects`. Raises TaskError,
+    MissingPluginError.
     """
+    answer: Callable[[TaskGraph, list[ObjectLandmark], UpAxis], Answer] = load(Group.QUESTIONS, purpose="ask")
     return answer(DefaultParser().parse(question), list(objects), up_axis)

@@ -27,7 +27,9 @@ class Group(StrEnum):
     CALIBRATORS = "gausslite.calibrators"  # estimates what a recording does not state
     PARSERS = "gausslite.parsers"  # a `ParserBackend`, which reads a sentence as a task graph
     NOUNS = "gausslite.nouns"  # a `NounVocabulary`
+    QUESTIONS = "gausslite.questions"  # a function: the objects of a map that a question's task graph means
     DETECTORS = "gausslite.detectors"  # opens a model file as a detector
+    POLICIES = "gausslite.policies"  # a `MapperSettings` of another system, to compare with; the name is of `--policy`
     RASTERIZERS = "gausslite.rasterizers"  # a backend; the name is the value of the option
     CORRECTORS = "gausslite.correctors"  # finds loops and corrects keyframes
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map

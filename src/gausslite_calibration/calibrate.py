@@ -15,7 +15,6 @@ from dataclasses import replace
 
 from gausslite.datasets.calibration import Calibration, Evidence, StatedValues
 from gausslite.datasets.corrected import CorrectedSource
-from gausslite.datasets.registered import RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import DatasetError, PoseError
@@ -24,6 +23,7 @@ from gausslite_calibration.camera_estimate import estimate_camera
 from gausslite_calibration.consistency import Contradiction, find_contradiction
 from gausslite_calibration.depth_registration import find_registration
 from gausslite_calibration.pose_errors import estimate_pose_exposure_prior
+from gausslite_calibration.registered import RegisteredSource
 
 _NONE = "none"
 

@@ -6,16 +6,17 @@ import argparse
 from pathlib import Path
 
 from gausslite.cli.progress import progress_bar
-from gausslite.cli.source_options import open_recorded
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import to_toml
 from gausslite.config.values import read_correction, read_up_axis
 from gausslite.datasets.calibration import Calibration, Evidence, StatedValues
-from gausslite.mission.results import CALIBRATION_FILE, as_text, prepare_file
+from gausslite.mission.recording import open_recorded
+from gausslite.mission.results import FileKind, as_text, prepare_file
 from gausslite.process import print_message
 from gausslite_calibration.calibrate import calibrate
 
 _STEPS = 3
+_FILE = FileKind("a calibration", b"# gausslite calibrate")
 _KNOWN_HELP = "keep these values, and estimate what they leave out (default: the lens that the files state)"
 
 
@@ -36,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Estimate, print and write the options. Returns the exit code."""
     if options.out is not None:
-        prepare_file(options.out, CALIBRATION_FILE)
+        prepare_file(options.out, _FILE)
     lens = read_correction(f"lens={options.lens}").lens if options.lens else None
     source = open_recorded(options.source, options.up)
     with progress_bar(_STEPS, "calibrate", "estimate") as bar:

@@ -17,7 +17,6 @@ from numpy import ndarray
 
 from gausslite.datasets.corrected import correct_frame
 from gausslite.datasets.files import RgbdImage, resize_rgbd
-from gausslite.datasets.registered import register_depth
 from gausslite.datasets.source import Source, usable_frames
 from gausslite.domain.camera import back_project
 from gausslite.domain.frame import Frame
@@ -31,6 +30,7 @@ from gausslite.pose_fit.photometric import (
     luminance_residual,
 )
 from gausslite.render.rasterizer import NEAR_M, Rendering
+from gausslite_calibration.registered import register_depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gausslite.cli.progress import MappingBar, progress_bar
-from gausslite.cli.source_options import calibrate_with_messages, open_recorded, report_region_file, stated_values
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.plain_values import Plain, to_toml
 from gausslite.config.program import without_options
@@ -29,6 +28,7 @@ from gausslite.datasets.source import HeldOutSplit, frame_size, select_frames
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region
+from gausslite.mission.recording import calibrate_with_messages, open_recorded, report_region_file, stated_values
 from gausslite.mission.results import MAP, REPORT_PAGE, require_absent
 from gausslite.mission.runner import FrameStream
 from gausslite.mission.settings import SceneInfo

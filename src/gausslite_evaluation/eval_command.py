@@ -5,19 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.cli.progress import print_above_bar, progress_bar
-from gausslite.cli.source_options import (
-    RecordingOptions,
-    calibrate_with_messages,
-    open_recorded,
-    selected_regions,
-    stated_values,
-)
 from gausslite.codec.ply import read_ply, read_world_frame
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
@@ -25,13 +19,21 @@ from gausslite.config.option import option
 from gausslite.config.program import Program
 from gausslite.config.values import NONE, read_correction, read_registration_or_auto
 from gausslite.datasets.calibration import StatedValues
+from gausslite.datasets.folder import read_pose_rows
 from gausslite.datasets.open import default_world_frame
 from gausslite.datasets.source import HeldOutSplit, Source, frame_size, select_frames
 from gausslite.domain.errors import DatasetError, PoseError
 from gausslite.domain.frame import Frame
-from gausslite.domain.pose import CorrectionTrack
+from gausslite.domain.pose import CorrectionTrack, pose_at
 from gausslite.domain.recording import PoseExposurePrior
 from gausslite.domain.relevance import MIN_ROI_PIXELS, Region
+from gausslite.mission.recording import (
+    RecordingOptions,
+    calibrate_with_messages,
+    open_recorded,
+    selected_regions,
+    stated_values,
+)
 from gausslite.mission.results import (
     EVALUATION,
     MAP_TO_ODOM,
@@ -39,10 +41,8 @@ from gausslite.mission.results import (
     as_text,
     map_file,
     prepare_folder,
-    read_corrections,
     read_report,
-    read_trajectory,
-    write_evaluation,
+    write_json,
 )
 from gausslite.mission.runner import CorruptFrames
 from gausslite.mission.settings import PoseMode, SourceSettings, TaskSettings
@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
     source = calibrate_with_messages(options.source, recorded, conditions.stated).source
     test_every = _test_every(options)
     positions = _selected_positions(options.frames, test_every, source)
-    regions = selected_regions(options, source)
+    regions = selected_regions(options.source, source, options.roi, options.objects, options.target_at)
     if options.pictures is not None:
         prepare_folder(options.pictures)
     frames = _SelectedFrames(source, positions, frame_size(options.size, source), options.strict, options.json)
@@ -125,7 +125,7 @@ def run(options: argparse.Namespace) -> int:
     figures = {**asdict(result), "fitted": conditions.fit_views, "frames_corrupt": frames.corrupt.count, **extra}
     if options.save_scores:
         views = {"source": str(options.source), "frames": options.frames, "test_every": test_every}
-        write_evaluation(options.map.absolute().parent, {**figures, **views})
+        write_json(options.map.absolute().parent / EVALUATION, {**figures, **views})
     if options.json:
         print(as_text(figures))
     else:
@@ -199,6 +199,18 @@ class _Conditions:
         loops = report.get("loops")
         was_moved = isinstance(loops, dict) and bool(loops.get("corrections"))
         return cls(stated, fit_views, None, corrections, was_moved, lpips)
+
+
+def read_corrections(folder: Path) -> CorrectionTrack | None:
+    """Return the corrections of map_to_odom.txt; None without the file. Raises DatasetError, PoseError."""
+    path = folder / MAP_TO_ODOM
+    return CorrectionTrack(*read_pose_rows(path)) if path.is_file() else None
+
+
+def read_trajectory(folder: Path) -> Callable[[int], Float64[ndarray, "4 4"]]:
+    """Return a function from a time in nanoseconds to T_map_camera, interpolated. Raises DatasetError, PoseError."""
+    times_ns, T_map_camera = read_pose_rows(folder / TRAJECTORY)
+    return partial(pose_at, times_ns, T_map_camera)
 
 
 @dataclass(frozen=True, slots=True)

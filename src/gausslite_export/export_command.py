@@ -10,11 +10,11 @@ from gausslite.cli.progress import progress_bar
 from gausslite.codec.run_files import KeyframeView
 from gausslite.config.command_parser import bounded
 from gausslite.domain.errors import InvalidInputError
-from gausslite.mission.exporting import ExportSettings, Format, MapContent
 from gausslite.mission.results import as_text, map_file, prepare_folder, read_report, require_absent
 from gausslite.plugins import Group, installed, load, names
 from gausslite.process import print_message, size_text
 from gausslite.render.map_viewer import view_map
+from gausslite_export.format import ExportSettings, Format, MapContent
 from gausslite_export.formats import MESH_VOXEL_M, VIDEO_S, read_map, upright
 from gausslite_export.occupancy import OccupancySettings
 

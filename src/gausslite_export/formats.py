@@ -19,9 +19,9 @@ from gausslite.codec.state_file import write_atomic, write_atomic_with
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of
-from gausslite.mission.exporting import MAX_EXTENT_M, ExportSettings, Format, MapContent
 from gausslite.mission.results import map_file, stated_up
 from gausslite.process import import_extra
+from gausslite_export.format import MAX_EXTENT_M, ExportSettings, Format, MapContent
 from gausslite_export.free_cells import free_voxels
 from gausslite_export.mesh import write_mesh
 from gausslite_export.occupancy import (

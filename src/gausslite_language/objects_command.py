@@ -27,8 +27,8 @@ from gausslite.domain.pose import UpAxis, upward_axis
 from gausslite.domain.task import TaskGraph
 from gausslite.fusion.objects import merge_objects
 from gausslite.mission.results import TRAJECTORY, as_text, read_report, stated_up
-from gausslite.perception.questions import answer
 from gausslite.wire.security import TlsFiles
+from gausslite_language.questions import answer
 from gausslite_language.rules import RuleParser
 
 _NS_PER_S = 1e9

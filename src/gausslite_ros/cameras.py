@@ -14,9 +14,8 @@ from numpy import ndarray
 from gausslite.datasets.camera_files import FolderCamera
 from gausslite.datasets.corrected import undistort_colour, undistort_depth
 from gausslite.datasets.files import RgbdImage, resize_rgbd
-from gausslite.datasets.registered import register_depth
 from gausslite.domain.camera import Camera, Lens
-from gausslite.domain.errors import DatasetError
+from gausslite.domain.errors import DatasetError, MissingPluginError
 from gausslite.domain.frame import Frame
 from gausslite_ros.messages import (
     CompressedImageMessage,
@@ -69,7 +68,21 @@ class RgbdCamera:
             rgb = undistort_colour(rgb, self.camera, self.colour.lens)
         if self.depth.lens is not None:
             depth_m = undistort_depth(depth_m, self.depth.camera, self.depth.lens)
-        return RgbdImage(rgb, register_depth(depth_m, self.depth.camera, self.camera, self.T_colour_depth), self.camera)
+        registered_m = _register(depth_m, self.depth.camera, self.camera, self.T_colour_depth)
+        return RgbdImage(rgb, registered_m, self.camera)
+
+
+def _register(
+    depth_m: Float32[ndarray, "h w"], depth_camera: Camera, camera: Camera, T_colour_depth: Float64[ndarray, "4 4"]
+) -> Float32[ndarray, "hc wc"]:
+    # most cameras align depth themselves
+    try:
+        from gausslite_calibration.registered import register_depth
+    except ModuleNotFoundError as error:
+        raise MissingPluginError(
+            "depth that is not aligned to colour: needs the package gausslite_calibration, which is not installed"
+        ) from error
+    return register_depth(depth_m, depth_camera, camera, T_colour_depth)
 
 
 def _require_size(location: str, image: ndarray, camera: Camera) -> None:

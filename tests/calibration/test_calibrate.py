@@ -11,12 +11,12 @@ import pytest
 import gausslite as gl
 from gausslite.cli.main import main
 from gausslite.cli.map_command import configure
-from gausslite.cli.map_inputs import MapInputs
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.program import parse_options
 from gausslite.datasets.calibration import StatedValues
 from gausslite.datasets.open import open_source
 from gausslite.domain.recording import CameraCorrection
+from gausslite.mission.plan import OpenRun, RunPlan
 from gausslite.process import print_message
 from gausslite_calibration.calibrate import calibrate
 
@@ -24,12 +24,12 @@ HOME = "sim:home-1?frames=24&size=120x90&noise=0&exposure=0"
 CLIP_FRAMES = 8
 
 
-def map_inputs(spec: str) -> MapInputs:
-    """Return the inputs of `gausslite map` without options."""
+def open_run(spec: str) -> OpenRun:
+    """Return the run of `gausslite map` without options, before its first frame."""
     parser = CommandParser(prog="gausslite map")
     configure(parser)
     options = parse_options(parser, [spec, "--out", "unused"], {}, warn=print_message)
-    return MapInputs.of(options).calibrated(StatedValues())
+    return RunPlan.from_options(options).open()
 
 
 def opening(note: str) -> tuple[str, str]:
@@ -38,12 +38,12 @@ def opening(note: str) -> tuple[str, str]:
     return option.split()[0], reasons[:60]
 
 
-def require_same(spec: str, capsys: pytest.CaptureFixture[str]) -> tuple[gl.CalibratedSequence, MapInputs]:
-    """Assert that Python and `map` decide alike; return the sequence of the Python API, and the inputs of `map`."""
+def require_same(spec: str, capsys: pytest.CaptureFixture[str]) -> tuple[gl.CalibratedSequence, OpenRun]:
+    """Assert that Python and `map` decide alike; return the sequence of the Python API, and the run of `map`."""
     in_python = gl.open_calibrated(spec)
-    mapped = map_inputs(spec)
+    mapped = open_run(spec)
     printed = capsys.readouterr().err.splitlines()
-    assert mapped.mission.pose_prior == in_python.pose_prior
+    assert mapped.plan.mission.pose_prior == in_python.pose_prior
     notes = [line for line in printed if line.startswith(("register-depth", "camera-correction", "pose-prior"))]
     assert list(map(opening, notes)) == list(map(opening, in_python.notes))
     for frame, other in (
@@ -56,7 +56,7 @@ def require_same(spec: str, capsys: pytest.CaptureFixture[str]) -> tuple[gl.Cali
     return in_python, mapped
 
 
-def require_same_report(spec: str, mapped: MapInputs, capsys: pytest.CaptureFixture[str]) -> None:
+def require_same_report(spec: str, mapped: OpenRun, capsys: pytest.CaptureFixture[str]) -> None:
     """Assert that `calibrate` prints what `map` reports."""
     report = mapped.report()
     assert main(["calibrate", spec, "--json"]) == 0

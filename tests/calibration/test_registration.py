@@ -11,7 +11,6 @@ from tiny_sequences import write_replica, write_seven_scenes, write_tum
 
 from gausslite.datasets.files import RgbdImage, resize_rgbd
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered import register_depth
 from gausslite.datasets.source import WrappedSource
 from gausslite.domain.camera import Camera, FileIntrinsics
 from gausslite.domain.errors import DatasetError
@@ -19,6 +18,7 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.pose import inverse
 from gausslite.domain.recording import DepthRegistration
 from gausslite_calibration.depth_registration import RegistrationEstimate, estimate_from_frames, find_registration
+from gausslite_calibration.registered import register_depth
 
 DEPTH_CAMERA = Camera(300.0, 300.0, 162.0, 118.5, 320, 240)
 

@@ -11,8 +11,8 @@ from gausslite.cli.main import main
 from gausslite.codec.ply import read_ply, write_ply
 from gausslite.codec.run_files import read_keyframe_views
 from gausslite.domain.gaussians import Gaussians
-from gausslite.mission.exporting import Format
 from gausslite.plugins import Group, installed
+from gausslite_export.format import Format
 
 
 @pytest.fixture(scope="module")

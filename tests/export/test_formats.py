@@ -18,8 +18,8 @@ from gausslite.codec.run_files import read_keyframe_views
 from gausslite.domain.errors import InvalidInputError, MapFileError
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.pose import transform_of
-from gausslite.mission.exporting import ExportSettings, Format, MapContent
 from gausslite.plugins import Group, load
+from gausslite_export.format import ExportSettings, Format, MapContent
 from gausslite_export.formats import read_map, upright
 from gausslite_export.occupancy import OccupancySettings, occupied_voxels
 

@@ -12,8 +12,8 @@ import yaml
 from gausslite.codec.run_files import KeyframeView
 from gausslite.domain.camera import Camera
 from gausslite.domain.gaussians import Gaussians
-from gausslite.mission.exporting import ExportSettings, Format, MapContent
 from gausslite.plugins import Group, load
+from gausslite_export.format import ExportSettings, Format, MapContent
 from gausslite_export.occupancy import OccupancySettings, occupied_voxels
 
 VOXEL_M, HALF_M, WALL_M, EYE_M = 0.1, 2.0, 1.5, 0.75

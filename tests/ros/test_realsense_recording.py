@@ -11,8 +11,8 @@ from robot_bag import load_write_bag
 
 from gausslite.datasets.folder import pose_from_quaternion
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered import register_depth
 from gausslite.domain.camera import Camera
+from gausslite_calibration.registered import register_depth
 from gausslite_ros.bag_file import BagFile
 from gausslite_ros.topics import stream_transforms
 from gausslite_ros.transforms import TransformTree

@@ -31,7 +31,7 @@ from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
-from gausslite.mission.prior_map import NoPriorMap, PriorMap
+from gausslite.mission.prior_map import PriorMap
 from gausslite.mission.schedule import MapRecorder, Timeline
 from gausslite.mission.settings import MissionSettings
 from gausslite.mission.task_mapper import TaskMapper
@@ -107,7 +107,7 @@ class MappingWorker:
     ) -> None:
         """build_estimator and on_change run on the worker thread, the latter after each mapped frame."""
         self._keyframe_upload = keyframe_upload
-        self.prior = prior or NoPriorMap()
+        self.prior = prior
         self._settings, self._build_estimator = settings, build_estimator
         self.grid, self.uplink = grid, uplink
         self._on_change = on_change
@@ -296,7 +296,8 @@ class MappingWorker:
             return 0.0
         start_s = time.monotonic()
         checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
-        save_run(path, task_mapper, config, checkpoint.last_index, {**checkpoint.state(), **self.prior.state()})
+        extra = checkpoint.state() if self.prior is None else {**checkpoint.state(), **self.prior.state()}
+        save_run(path, task_mapper, config, checkpoint.last_index, extra)
         return time.monotonic() - start_s
 
     def _map_next(self) -> None:
@@ -350,6 +351,8 @@ class MappingWorker:
 
         The frame that localises it adds the earlier map. Raises QuotaError if that does not fit.
         """
+        if self.prior is None:
+            return frame
         was_done, graph = self.prior.is_done, self.status().graph
         placed = self.prior.place(frame)
         if not was_done and placed is not None:
@@ -361,7 +364,7 @@ class MappingWorker:
 
     def _correction(self) -> PoseCorrection | None:
         """Return the correction of the odometry's own poses."""
-        latest, motion = self._mapper.poses.latest(), self.prior.motion
+        latest, motion = self._mapper.poses.latest(), None if self.prior is None else self.prior.motion
         if latest is None or motion is None:
             return latest
         return replace(latest, T_map_odometry=latest.T_map_odometry @ motion)

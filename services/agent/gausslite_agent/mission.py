@@ -16,6 +16,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import match_warnings
 from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mission.checkpoint import ResumeConfig
+from gausslite.mission.prior_map import compare_with_prior
 from gausslite.mission.results import peak_rss_mib, write_keyframes, write_poses, write_results
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionRunner
 from gausslite.wire.convert import values_of
@@ -352,13 +353,14 @@ class AgentMission:
         report["notes"] = [*self._source_notes, *report["notes"]]
         prior = self._worker.prior
         keyframes = self._worker.run(lambda mapper: mapper.keyframes()).result()
-        changes = prior.compare(gaussians, self._worker.status().objects, keyframes)
+        changes = compare_with_prior(prior, gaussians, self._worker.status().objects, keyframes)
         for line in changes.lines:
             _log.info("since the earlier map: %s", line)
         report |= {**changes.report, "objects": [object_as_json(landmark) for landmark in changes.objects]}
-        world_frame = self._settings.link.uplink.world_frame or prior.world_frame
+        world_frame = self._settings.link.uplink.world_frame or ("" if prior is None else prior.world_frame)
         write_results(folder, gaussians, report, world_frame)
-        self._worker.run(lambda mapper: write_poses(folder, mapper.poses, prior.motion)).result()
+        motion = None if prior is None else prior.motion
+        self._worker.run(lambda mapper: write_poses(folder, mapper.poses, motion)).result()
         write_keyframes(folder, keyframes)
         self._worker.write_history(folder).result()
 

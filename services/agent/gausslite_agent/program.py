@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import NONE
@@ -19,7 +19,8 @@ from gausslite.domain.errors import GaussLiteError, UnavailableError
 from gausslite.domain.pose import unit_up_axis
 from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mission.build import EstimatorFactory
-from gausslite.mission.prior_map import PriorMap, open_prior_map, require_other_folder
+from gausslite.mission.plan import RunPlan
+from gausslite.mission.prior_map import PriorMap, open_prior_map
 from gausslite.mission.results import locked_folder, prepare_file
 from gausslite.mission.runner import FrameStream, region_file_note
 from gausslite.mission.settings import SceneInfo, SourceSettings
@@ -160,7 +161,9 @@ async def _serve(settings: AgentSettings) -> int:
     with ExitStack() as stack:
         parser = _open_parser(settings, stack)
         uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
-        prior = _open_prior(settings, saved)
+        # a saved mission has its own
+        folder, extra = (settings.prior, {}) if saved is None else (None, saved.run.extra)
+        prior = open_prior_map(folder, extra, settings.mission)
         estimators = _estimators(settings, stream, prior)
         worker = MappingWorker(
             settings.mission,
@@ -200,8 +203,7 @@ def _require_usable(settings: AgentSettings) -> None:
     """Raise at the start for settings that would otherwise fail with the first task or at the end of the mission."""
     if settings.up_axis is not None:
         unit_up_axis(settings.up_axis)
-    if settings.out is not None:
-        require_other_folder(settings.prior, settings.out)
+    RunPlan(settings.mission, settings.perception, prior=settings.prior).check(settings.out)
     if settings.state is not None:
         prepare_file(settings.state)
 
@@ -223,7 +225,7 @@ def _report_source(settings: SourceSettings, source: Source) -> tuple[str, ...]:
     return notes
 
 
-def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: PriorMap) -> EstimatorFactory:
+def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: PriorMap | None) -> EstimatorFactory:
     """Return the estimator factory. Raises InvalidInputError if nothing can find the task of the command line."""
     needs_detector = settings.view is None
     estimators = EstimatorFactory(settings.perception, lambda: _scene(settings, stream, prior), needs_detector)
@@ -292,16 +294,10 @@ def _keyframe_upload(link: ConnectionSettings, uplink: Uplink | None) -> Keyfram
     return KeyframeUpload(uplink, link.grid, link.keyframes, link.keyframes_during_mission)
 
 
-def _open_prior(settings: AgentSettings, saved: SavedMission | None) -> PriorMap:
-    """Return the map that the agent continues; a saved mission has its own."""
-    if saved is None:
-        return open_prior_map(settings.prior, {}, settings.mission)
-    return open_prior_map(None, saved.run.extra, settings.mission)
-
-
-def _scene(settings: AgentSettings, stream: FrameStream | None, prior: PriorMap) -> SceneInfo:
+def _scene(settings: AgentSettings, stream: FrameStream | None, prior: PriorMap | None) -> SceneInfo:
     if stream is not None:
-        return replace(SceneInfo.of(stream.source), regions=prior.moved(stream.source).regions())
+        source = stream.source if prior is None else prior.moved(stream.source)
+        return SceneInfo(stream.source.up_axis, source.regions())
     return SceneInfo() if settings.up_axis is None else SceneInfo(unit_up_axis(settings.up_axis))
 
 

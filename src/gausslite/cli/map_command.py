@@ -3,42 +3,31 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import MISSING, asdict, dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gausslite.cli.map_inputs import FRAMES_KEY, MapInputs, has_regions, mission_settings, policy_of
+import numpy as np
+
 from gausslite.cli.progress import MappingBar, print_above_bar
-from gausslite.cli.source_options import (
-    RecordingOptions,
-    depth_notes,
-    report_region_file,
-    require_mappable_depth,
-    selected_regions,
-    stated_values,
-)
 from gausslite.codec.json import noun_as_json, object_as_json
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import option
 from gausslite.config.program import Program
-from gausslite.datasets.open import open_reference
+from gausslite.datasets.open import default_world_frame, open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
-from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError, StorageError
+from gausslite.domain.errors import DatasetError, MissingPluginError, PoseError
 from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR
-from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import found_text
-from gausslite.domain.relevance import Region
-from gausslite.domain.state import State, encode_text, get_text
-from gausslite.domain.task import TaskGraph, noun_of
-from gausslite.mapping.splat_table import SplatTable
-from gausslite.mission.build import EstimatorFactory, build_task_mapper
-from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
+from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.evaluation import Evaluator, TrainingFit
-from gausslite.mission.prior_map import PriorMap, open_prior_map, require_other_folder
+from gausslite.mission.plan import MappedRun, OpenRun, RunPlan, policy_of
+from gausslite.mission.prior_map import compare_with_prior
+from gausslite.mission.recording import RecordingOptions, has_regions
 from gausslite.mission.results import (
     MAP,
     PREVIEW,
@@ -51,37 +40,28 @@ from gausslite.mission.results import (
     write_poses,
     write_results,
 )
-from gausslite.mission.runner import CorruptFrames, MissionResult, MissionRunner
-from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, TaskSchedule, Timeline
-from gausslite.mission.settings import (
-    MissionSettings,
-    PerceptionSettings,
-    PoseMode,
-    SceneInfo,
-    SourceSettings,
-    TaskSettings,
-)
-from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome, TaskMapper
+from gausslite.mission.runner import MissionResult
+from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, Timeline
+from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SourceSettings, TaskSettings
+from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome
 from gausslite.pages import load_pages
 from gausslite.plugins import Group, load
-from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt, print_message
-from gausslite.render.choose import choose_rasterizer
+from gausslite.process import TASK_NOT_FOUND, DeferredInterrupt
 from gausslite.render.map_viewer import view_map
 from gausslite.wire.channel import MAX_PORT
 
 
-def trajectory_report(
-    settings: SourceSettings, source: Source, mapper: TaskMapper, evaluator: Evaluator | None
-) -> dict[str, object]:
+def trajectory_report(mapped: MappedRun, evaluator: Evaluator | None) -> dict[str, object]:
     """Return the ATE of the map's trajectory and of the given one, if true poses exist, and the tracking counts.
 
-    source: the sequence as it was mapped. evaluator: None leaves out the ATE.
+    evaluator: None leaves out the ATE.
     """
+    settings, mapper = mapped.run.plan.source, mapped.mapper
     errors: dict[str, object] = {"ate": None, "given_ate": None, "tracking": dict(mapper.tracking_counts)}
     try:
         reference = open_reference(settings.spec, settings.depth_registration)
         true = None if reference is None else reference.trajectory()
-        given = source.trajectory()
+        given = mapped.run.stream.source.trajectory()
     except (DatasetError, PoseError):  # a frame's damaged pose, reported when the frame was read
         return errors
     if true is not None and len(mapper.poses) > 0 and evaluator is not None:
@@ -106,9 +86,6 @@ _SKIPS = {
     REPEATED: "repeated",
     TRACKING_LOST: "lost by tracking",
 }
-_NOT_RESUMED = -1
-_POINTED = "pointed"
-"""Name of the nouns that a person points at, among the extra arrays of a saved run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,234 +145,174 @@ def run(options: argparse.Namespace) -> int:
     require_name("world-frame", options.world_frame or "")
     if options.view is not None:
         load_pages("--view").require_usable("--view")
-    if options.prior is not None and options.resume is not None:
-        raise InvalidInputError("--prior: expected it without resume; a saved run knows the map that it continues")
-    require_other_folder(options.prior, options.out)
+    plan = RunPlan.from_options(options)
+    plan.check(options.out)
     if options.resume is None and not options.overwrite:
         require_absent(options.out / MAP)
     with locked_folder(options.out):
-        return _map(options)
+        if options.save_state is not None:
+            require_additional_file(options.save_state, options.out)
+        return _map(options, plan.open())
 
 
-def _map(options: argparse.Namespace) -> int:
-    saved = None if options.resume is None else SavedRun.read(options.resume)
-    prior = open_prior_map(options.prior, {} if saved is None else saved.extra, mission_settings(options))
-    inputs = MapInputs.of(options)
-    if saved is not None:
-        inputs = inputs.resumed(options, saved)
-    if options.save_state is not None:
-        require_additional_file(options.save_state, options.out)
-    resumed_after = _NOT_RESUMED if saved is None else saved.last_index
-    # a person can point on the page
-    needs_detector = options.view is None
-    estimators = EstimatorFactory(inputs.perception, lambda: SceneInfo.of(inputs.stream.source), needs_detector)
-    roi = _first_roi(options, inputs, saved)
-    if saved is None:
-        # an estimate takes half a minute; first refuse what cannot be mapped, and name what cannot be found
-        choose_rasterizer(inputs.mission.backend, inputs.mission.threads)
-        SplatTable(inputs.mission.max_gaussians)
-        if isinstance(roi, TaskGraph):
-            estimators.require_detector()
-    _report_search(options, inputs, estimators)
-    if saved is None:
-        stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
-        inputs = inputs.calibrated(replace(stated, force=options.force))
-    if options.prior is not None:
-        # without given poses, frames far apart in time are in no common frame
-        prior.localise(inputs.stream, spread=inputs.mission.poses is not PoseMode.TRACK)
-        print_message(prior.describe())
-    if prior.motion is not None:
-        inputs = inputs.in_frame_of(prior)
-        estimators = estimators.in_scene(lambda: SceneInfo.of(inputs.stream.source))
-        roi = _first_roi(options, inputs, saved)
-    task = "" if inputs.schedule.first is None else inputs.schedule.first.text
-    mapper = build_task_mapper(inputs.mission, estimators, roi, prior.gaussians_for(task))
-    if saved is not None:
-        saved.restore(mapper)
-        saved = None  # its arrays, as large as the map and the keyframes, have been copied
-    graph = roi if isinstance(roi, TaskGraph) else None
-    scheduled = ScheduledTaskMapper(mapper, inputs.schedule, estimators, graph, resumed_after)
-    mapping = _Run(options, inputs, scheduled, prior)
+def _map(options: argparse.Namespace, run: OpenRun) -> int:
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
-        result = mapping.map_frames(resumed_after)
-        if result.processed > 0 or result.stopped_by is None:
-            mapping.write_results(result)
+        mapped, history = _map_frames(options, run)
+        written = _write_results(options, mapped, history) if mapped.is_worth_keeping else None
     # an early end keeps the map so far; the exit code reports it
-    mapping.raise_if_failed(result)
+    if isinstance(mapped.result.stopped_by, KeyboardInterrupt):
+        raise type(mapped.result.stopped_by)(_interrupted_text(options, mapped.result, written))
+    mapped.result.raise_if_stopped()
+    if mapped.save_error is not None:
+        raise mapped.save_error
     if interrupt.pending_exception is not None:
         raise type(interrupt.pending_exception)(f"all frames are mapped, and all files are in {options.out}")
-    mapping.print_results(result)
-    return 0 if mapping.has_found_task(result) else TASK_NOT_FOUND
+    if written is not None:
+        _print_results(options, mapped, written)
+    return 0 if mapped.has_found_task else TASK_NOT_FOUND
 
 
-class _Run:
-    """One run: its frame loop and its results."""
+@dataclass(frozen=True, slots=True)
+class _History:
+    """What was recorded of each frame."""
 
-    def __init__(
-        self, options: argparse.Namespace, inputs: MapInputs, scheduled: ScheduledTaskMapper, prior: PriorMap
-    ) -> None:
-        self._options, self._inputs, self._prior = options, inputs, prior
-        self._changes: tuple[str, ...] = ()
-        self._scheduled, self._mapper = scheduled, scheduled.mapper
-        self._corrupt = CorruptFrames(print_above_bar)
-        self._timeline, self._recorder = Timeline(), MapRecorder()
-        self._gaussians = Gaussians.empty()
-        self._report: dict[str, object] = {}
-        self._notes: tuple[str, ...] = ()
-        self._training_scores: TrainingFit | None = None
-        self._save_error: StorageError | None = None
-
-    def map_frames(self, resumed_after: int) -> MissionResult:
-        """Map the frames after an index. Raises DatasetError if frames exist and none of them can be used."""
-        inputs, options = self._inputs, self._options
-        stream = inputs.stream.after(resumed_after)
-        frames = stream.frames(None if options.strict else self._corrupt)
-        with _view(options.view, self._scheduled) as draw, MappingBar(len(stream)) as bar:
-
-            def report(outcome: FrameOutcome) -> None:
-                bar.count(outcome)
-                self._timeline.add(outcome)
-                self._recorder.record(self._mapper.poses, self._mapper.gaussians)
-                draw(outcome)
-
-            checkpoint = None if options.save_state is None else self._save
-            result = MissionRunner(self._scheduled.process, report, checkpoint).run(frames, resumed_after)
-        # a person may have given other tasks on the page
-        self._inputs = replace(inputs, schedule=self._scheduled.schedule)
-        if result.processed == 0 and self._corrupt.first_error is not None:
-            raise self._corrupt.first_error
-        self._gaussians = self._mapper.gaussians()
-        if len(self._gaussians) == 0 and result.processed > 0:
-            require_mappable_depth(options.source, inputs.stream.source, result, self._mapper.keyframes())
-        return result
-
-    def write_results(self, result: MissionResult) -> None:
-        """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
-        options, mission, graph = self._options, self._inputs.mission, self._scheduled.graph
-        evaluator, missing = _evaluator()
-        self._notes = (
-            *missing,
-            *self._inputs.notes,
-            *self._mapper.notes,
-            *_unseen_notes(options, result),
-            *_unreached_notes(self._inputs.schedule, result.last_index),
-            *depth_notes(self._inputs.stream.source, self._mapper.keyframes()),
-        )
-        changes = self._prior.compare(self._gaussians, self._mapper.objects, self._mapper.keyframes())
-        self._changes = changes.lines
-        self._report = {
-            **self._inputs.report(),
-            "resumed_from": None if options.resume is None else str(options.resume),
-            **result.summary(),
-            **trajectory_report(self._inputs.source, self._inputs.stream.source, self._mapper, evaluator),
-            "targets": [] if graph is None else list(graph.targets),
-            "loops": asdict(self._mapper.loops),
-            "frames_corrupt": self._corrupt.count,
-            "gaussians": len(self._gaussians),
-            "active_gaussians": int(self._gaussians.active.sum()),
-            "peak_rss_mib": peak_rss_mib(),
-            "memory_mib": self._mapper.memory_mib(),
-            "objects": [object_as_json(landmark) for landmark in changes.objects],
-            "nouns": [noun_as_json(noun) for noun in self._mapper.nouns],
-            "notes": list(self._notes),
-            **changes.report,
-        }
-        prepare_folder(options.out)
-        keyframes = [(keyframe.frame, keyframe.relevance.roi) for keyframe in self._mapper.keyframes()]
-        viewer = view_map(self._gaussians, mission.backend, mission.threads)
-        if evaluator is not None and keyframes:
-            self._training_scores = evaluator.training_fit(viewer, keyframes)
-            self._report["training_views"] = asdict(self._training_scores)
-        write_results(options.out, self._gaussians, self._report, self._inputs.world_frame(options))
-        write_poses(options.out, self._mapper.poses, self._prior.motion)
-        self._timeline.write(options.out)
-        self._recorder.write(options.out)
-        write_keyframes(options.out, self._mapper.keyframes())
-        if evaluator is not None and keyframes:
-            write_png(options.out / PREVIEW, evaluator.preview(viewer, keyframes))
-
-    def raise_if_failed(self, result: MissionResult) -> None:
-        """Raise the error that ended the run early, the interrupt with a text on what is kept, or that of saving."""
-        if isinstance(result.stopped_by, KeyboardInterrupt):
-            raise type(result.stopped_by)(_interrupted_text(self._options, result, self._training_scores is not None))
-        result.raise_if_stopped()
-        if self._save_error is not None:
-            raise self._save_error
-
-    def has_found_task(self, result: MissionResult) -> bool:
-        """Return False if a task was mapped, and no frame and no object of the map shows a target of it."""
-        graphs = self._inputs.schedule.graphs()
-        targets = {noun_of(target) for graph in graphs for target in graph.targets}
-        is_in_map = any(landmark.noun in targets for landmark in self._mapper.objects)
-        return not graphs or result.processed == 0 or result.totals.region_seen or is_in_map
-
-    def print_results(self, result: MissionResult) -> None:
-        """Print the figures and the notes of a complete run."""
-        totals, report = result.totals, self._report
-        counts = {words: totals.reasons[reason] for reason, words in _SKIPS.items()} | {"corrupt": self._corrupt.count}
-        skipped = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
-        active = report["active_gaussians"]
-        in_region = f" ({active:,} in the task's region)" if active or self._inputs.schedule.graphs() else ""
-        shown = "" if self._training_scores is None else f"; {PREVIEW} in the same folder shows it"
-        print(
-            f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
-            f"{len(self._gaussians):,} Gaussians{in_region} → {self._options.out / 'map.ply'}{shown}"
-        )
-        if totals.late:
-            print(f"  {totals.late} of {totals.frames} frames missed the deadline of --rate {self._options.rate:g}")
-        if self._inputs.mission.poses is PoseMode.TRACK:
-            print(f"  {tracking_text(report)}")
-        if result.processed == 0:
-            print(f"  no selected frame comes after frame {result.last_index}, the last one of the resumed run")
-        # the notes repeat what is missing among the nouns
-        for line in dict.fromkeys((*(noun.describe() for noun in self._mapper.nouns), *self._notes)):
-            print(f"  {line}")
-        for change in self._changes:
-            print(f"  {change}")
-        print(self._outcome())
-
-    def _outcome(self) -> str:
-        """Return what was found, where, and how good the map is on views that it was trained on."""
-        graph, gaussians = self._scheduled.graph, self._gaussians
-        region_m = gaussians.means_m[gaussians.active]
-        parts = [] if graph is None else [f"found: {found_text(self._mapper.objects, graph.targets, region_m)}"]
-        if self._training_scores is not None:
-            scores = self._training_scores
-            in_region = "" if scores.roi_psnr is None else f"{scores.roi_psnr:.1f} dB PSNR in the region, "
-            views = f"{scores.n_views} training view{'s' if scores.n_views > 1 else ''}"
-            parts.append(f"{views}: {in_region}{scores.full_psnr:.1f} dB in whole images")
-        return "; ".join(parts)
-
-    def _save(self, last_index: int) -> None:
-        prepare_folder(self._options.save_state.parent)
-        extra: State = {FRAMES_KEY: encode_text(self._options.frames), **self._prior.state()}
-        if self._scheduled.graph is not None and self._scheduled.graph.pointed:
-            extra = {**extra, _POINTED: encode_text("\n".join(self._scheduled.graph.pointed))}
-        fixed = replace(self._inputs, schedule=self._scheduled.schedule).fixed_settings(last_index)
-        try:
-            save_run(self._options.save_state, self._mapper, ResumeConfig.of(*fixed), last_index, extra)
-        except StorageError as error:
-            self._save_error = error  # the map is worth writing nevertheless
+    timeline: Timeline = field(default_factory=Timeline)
+    maps: MapRecorder = field(default_factory=MapRecorder)
 
 
-def _first_roi(options: argparse.Namespace, inputs: MapInputs, saved: SavedRun | None) -> TaskGraph | list[Region]:
-    """Return the first frame's task, with what a person has pointed at in the saved run, or the regions."""
-    graph = inputs.schedule.at(_NOT_RESUMED if saved is None else saved.last_index)
-    if graph is None:
-        return selected_regions(options, inputs.stream.source)
-    if saved is None or _POINTED not in saved.extra:
-        return graph
-    return graph.with_pointed(get_text(saved.extra, _POINTED).split("\n"))
+def _map_frames(options: argparse.Namespace, run: OpenRun) -> tuple[MappedRun, _History]:
+    """Map all frames with a bar. Raises DatasetError if frames exist and none of them can be used."""
+    history, mapper = _History(), run.scheduled.mapper
+    with _view(options.view, run.scheduled) as draw, MappingBar(len(run.stream)) as bar:
+
+        def report(outcome: FrameOutcome) -> None:
+            bar.count(outcome)
+            history.timeline.add(outcome)
+            history.maps.record(mapper.poses, mapper.gaussians)
+            draw(outcome)
+
+        mapped = run.map(print_above_bar, report, options.strict, options.save_state)
+    if mapped.result.processed == 0 and mapped.corrupt.first_error is not None:
+        raise mapped.corrupt.first_error
+    if len(mapped.gaussians) == 0 and mapped.result.processed > 0:
+        require_mappable_depth(mapped)
+    return mapped, history
 
 
-def _report_search(options: argparse.Namespace, inputs: MapInputs, estimators: EstimatorFactory) -> None:
-    """Report what is searched for each noun of the tasks."""
-    if options.detector is None and inputs.schedule.graphs():
-        report_region_file(options.source, inputs.stream.source)
-    for scheduled in inputs.schedule.graphs():
-        for match in estimators.noun_matches(scheduled):
-            print_message(match.describe())
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """What was written and is printed: report.json, its notes, what changed since the earlier map, and the scores."""
+
+    report: Mapping[str, Any]
+    notes: tuple[str, ...]
+    changes: tuple[str, ...]
+    scores: TrainingFit | None
+
+
+def _write_results(options: argparse.Namespace, mapped: MappedRun, history: _History) -> _Written:
+    """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
+    out, mapper, mission, prior = options.out, mapped.mapper, mapped.run.plan.mission, mapped.run.prior
+    keyframes = mapper.keyframes()
+    evaluator, missing = _evaluator()
+    views = [(keyframe.frame, keyframe.relevance.roi) for keyframe in keyframes]
+    viewer = view_map(mapped.gaussians, mission.backend, mission.threads)
+    prepare_folder(out)
+    scores = evaluator.training_fit(viewer, views) if evaluator is not None and views else None
+    changes = compare_with_prior(prior, mapped.gaussians, mapper.objects, keyframes)
+    notes = (*missing, *_notes(options, mapped))
+    report: dict[str, object] = {
+        **mapped.run.report(),
+        "resumed_from": None if options.resume is None else str(options.resume),
+        **mapped.result.summary(),
+        **trajectory_report(mapped, evaluator),
+        **_map_report(mapped),
+        "objects": [object_as_json(landmark) for landmark in changes.objects],
+        "nouns": [noun_as_json(noun) for noun in mapper.nouns],
+        "notes": list(notes),
+        **changes.report,
+        **({} if scores is None else {"training_views": asdict(scores)}),
+    }
+    stated = options.world_frame
+    world_frame = default_world_frame(mapped.run.stream.source) if stated is None else str(stated)
+    write_results(out, mapped.gaussians, report, world_frame)
+    write_poses(out, mapper.poses, None if prior is None else prior.motion)
+    history.timeline.write(out)
+    history.maps.write(out)
+    write_keyframes(out, keyframes)
+    if evaluator is not None and views:
+        write_png(out / PREVIEW, evaluator.preview(viewer, views))
+    return _Written(report, notes, changes.lines, scores)
+
+
+def _map_report(mapped: MappedRun) -> dict[str, object]:
+    """Return the figures of the map as part of the report."""
+    graph, gaussians = mapped.run.scheduled.graph, mapped.gaussians
+    return {
+        "targets": [] if graph is None else list(graph.targets),
+        "loops": asdict(mapped.mapper.loops),
+        "frames_corrupt": mapped.corrupt.count,
+        "gaussians": len(gaussians),
+        "active_gaussians": int(gaussians.active.sum()),
+        "peak_rss_mib": peak_rss_mib(),
+        "memory_mib": mapped.mapper.memory_mib(),
+    }
+
+
+def _notes(options: argparse.Namespace, mapped: MappedRun) -> Iterator[str]:
+    """Yield the messages on the recording, the task and the frames."""
+    result, graphs = mapped.result, mapped.run.scheduled.schedule
+    yield from mapped.run.notes
+    yield from mapped.mapper.notes
+    if result.processed > 0 and not result.totals.region_seen:
+        if options.task is not None:
+            yield "none of these frames shows an object of the task"
+        elif has_regions(options):
+            yield "none of these frames shows the selected region; check that it belongs to this sequence, in metres"
+    for frame, _ in graphs.switches:
+        if frame > result.last_index:
+            yield f"task-at {frame}: not reached, the last frame was {result.last_index}"
+    median_m = _median_depth_m(mapped.mapper.keyframes())
+    if median_m < _LEAST_DEPTH_M:
+        yield f"the median depth is {median_m:.2g} m; {_depth_unit_advice(mapped.run.stream.source)}"
+
+
+def _print_results(options: argparse.Namespace, mapped: MappedRun, written: _Written) -> None:
+    """Print the figures and the notes of a complete run."""
+    result, totals = mapped.result, mapped.result.totals
+    counts = {words: totals.reasons[reason] for reason, words in _SKIPS.items()} | {"corrupt": mapped.corrupt.count}
+    skipped = ", ".join(f"{count} {words}" for words, count in counts.items() if count)
+    active = written.report["active_gaussians"]
+    in_region = f" ({active:,} in the task's region)" if active or mapped.run.scheduled.schedule.graphs() else ""
+    shown = "" if written.scores is None else f"; {PREVIEW} in the same folder shows it"
+    print(
+        f"{totals.frames} frames{f' (skipped: {skipped})' if skipped else ''} at {result.hz:.1f} Hz, "
+        f"{len(mapped.gaussians):,} Gaussians{in_region} → {options.out / 'map.ply'}{shown}"
+    )
+    if totals.late:
+        print(f"  {totals.late} of {totals.frames} frames missed the deadline of --rate {options.rate:g}")
+    if options.poses is PoseMode.TRACK:
+        print(f"  {tracking_text(written.report)}")
+    if result.processed == 0:
+        print(f"  no selected frame comes after frame {result.last_index}, the last one of the resumed run")
+    # the notes repeat what is missing among the nouns
+    for line in dict.fromkeys((*(noun.describe() for noun in mapped.mapper.nouns), *written.notes)):
+        print(f"  {line}")
+    for change in written.changes:
+        print(f"  {change}")
+    print(_outcome(mapped, written.scores))
+
+
+def _outcome(mapped: MappedRun, scores: TrainingFit | None) -> str:
+    """Return what was found, where, and how good the map is on views that it was trained on."""
+    graph, gaussians = mapped.run.scheduled.graph, mapped.gaussians
+    region_m = gaussians.means_m[gaussians.active]
+    parts = [] if graph is None else [f"found: {found_text(mapped.mapper.objects, graph.targets, region_m)}"]
+    if scores is not None:
+        in_region = "" if scores.roi_psnr is None else f"{scores.roi_psnr:.1f} dB PSNR in the region, "
+        views = f"{scores.n_views} training view{'s' if scores.n_views > 1 else ''}"
+        parts.append(f"{views}: {in_region}{scores.full_psnr:.1f} dB in whole images")
+    return "; ".join(parts)
 
 
 def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextManager[Callable[[FrameOutcome], None]]:
@@ -405,11 +322,11 @@ def _view(port: int | None, mission: ScheduledTaskMapper) -> AbstractContextMana
     return load_pages("--view").mission_view(port, mission)
 
 
-def _interrupted_text(options: argparse.Namespace, result: MissionResult, has_preview: bool) -> str:
+def _interrupted_text(options: argparse.Namespace, result: MissionResult, written: _Written | None) -> str:
     """Return how many frames an interrupted run has mapped, where its files are, and how to resume it."""
-    if result.processed == 0:
+    if written is None:
         return "no frame was mapped, and no file was written"
-    files = f"map.ply, report.json and {PREVIEW}" if has_preview else "map.ply and report.json"
+    files = "map.ply and report.json" if written.scores is None else f"map.ply, report.json and {PREVIEW}"
     text = f"{result.totals.frames} frames are mapped; {files} are in {options.out}"
     if options.save_state is None:
         return f"{text}; only a run with save-state can be resumed"
@@ -425,21 +342,31 @@ def _evaluator() -> tuple[Evaluator | None, tuple[str, ...]]:
     return evaluator, ()
 
 
-def _unseen_notes(options: argparse.Namespace, result: MissionResult) -> tuple[str, ...]:
-    """Return a note if no frame showed the task's objects or the selected regions."""
-    if result.totals.region_seen or result.processed == 0:
-        return ()
-    if options.task is not None:
-        return ("none of these frames shows an object of the task",)
-    if has_regions(options):
-        return ("none of these frames shows the selected region; check that it belongs to this sequence, in metres",)
-    return ()
+_LEAST_DEPTH_M = 0.05
+"""No depth camera measures nearer: a smaller median is in another unit."""
 
 
-def _unreached_notes(schedule: TaskSchedule, last_index: int) -> tuple[str, ...]:
-    """Return a note for each scheduled task after the last frame."""
-    return tuple(
-        f"task-at {frame}: not reached, the last frame was {last_index}"
-        for frame, _ in schedule.switches
-        if frame > last_index
-    )
+def require_mappable_depth(mapped: MappedRun) -> None:
+    """Raise DatasetError for frames that gave no Gaussian: without depth, or with depth too far away."""
+    spec, source, result = mapped.run.plan.source.spec, mapped.run.stream.source, mapped.result
+    if result.totals.frames == 0:
+        reasons = ", ".join(f"in {count} {reason}" for reason, count in result.totals.reasons.items())
+        raise DatasetError(f"{spec}: expected frames with depth, got none in {result.processed}: {reasons}")
+    if result.stopped_by is None:
+        raise DatasetError(
+            f"{spec}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
+            f"{_median_depth_m(mapped.mapper.keyframes()):.3g} m; {_depth_unit_advice(source)}"
+        )
+
+
+def _depth_unit_advice(source: Source) -> str:
+    return ", ".join(filter(None, ("check the depth unit", source.depth_unit_setting)))
+
+
+def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:
+    medians = [
+        float(np.median(keyframe.frame.depth_m[keyframe.frame.depth_m > 0]))
+        for keyframe in keyframes
+        if keyframe.frame.has_depth
+    ]
+    return float(np.median(medians)) if medians else np.inf

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gausslite.datasets.corrected import CorrectedSource
-from gausslite.datasets.registered import RegisteredSource
 from gausslite.datasets.source import Source
 from gausslite.domain.camera import Lens
 from gausslite.domain.errors import MissingPluginError
@@ -32,6 +31,13 @@ class StatedValues:
     pose_prior: PoseExposurePrior | None = None
     force: bool = False
     checked: bool = False
+
+    @classmethod
+    def all_of(
+        cls, registration: DepthRegistration | None, correction: CameraCorrection, prior: PoseExposurePrior
+    ) -> StatedValues:
+        """Return values that leave nothing to an estimate; without a registration, depth is used as recorded."""
+        return cls(registration, registration is None, correction, pose_prior=prior, checked=True)
 
     def leaves_registration_open(self, source: Source) -> bool:
         """True if neither the user nor the source states whether depth is registered to colour."""
@@ -100,7 +106,7 @@ class Calibrator(Protocol):
 
 
 class StatedOnly:
-    """The Calibrator without a plug-in: applies what is stated, and returns a note on what nobody states."""
+    """The Calibrator without a plug-in: corrects images as stated, and returns a note on what nobody states."""
 
     def __init__(self, reason: str) -> None:
         self._reason = reason
@@ -108,16 +114,16 @@ class StatedOnly:
     def calibrate(
         self, source: Source, stated: StatedValues, _report: Callable[[Evidence], None] | None = None
     ) -> Calibration:
-        """Return the source with what the user and its files state. Raises InvalidInputError."""
+        """Return the source with what is stated. Raises InvalidInputError; MissingPluginError to register depth."""
         registration = ("registration of depth",) if stated.leaves_registration_open(source) else ()
         unknown = (*registration, *stated.open_values(source))
         if stated.registration is not None:
-            source = RegisteredSource(source, stated.registration)
+            load(Group.CALIBRATORS, purpose="register-depth")
         correction = stated.correction or CameraCorrection(stated.lens or source.lens)
         if not correction.is_identity:
             source = CorrectedSource(source, correction)
         notes = (f"not estimated: {', '.join(unknown)}; {self._reason}",) if unknown else ()
-        return Calibration(source, stated.registration, correction, stated.pose_prior or PoseExposurePrior(), (), notes)
+        return Calibration(source, None, correction, stated.pose_prior or PoseExposurePrior(), (), notes)
 
     def intentions(self, _source: Source, _stated: StatedValues) -> tuple[str, ...]:
         """Return none: nothing is estimated."""

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.corrected import UndistortedColourSource
 from gausslite.datasets.folder import FolderReader
-from gausslite.datasets.registered import RegisteredSource
 from gausslite.datasets.replica import ReplicaSource
 from gausslite.datasets.sevenscenes import SevenScenesSource
 from gausslite.datasets.source import Source, SourceReader
@@ -16,7 +16,7 @@ from gausslite.datasets.tum import TumSource
 from gausslite.domain.checks import require_name
 from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
 from gausslite.domain.pose import UpAxis
-from gausslite.domain.recording import DepthRegistration
+from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.plugins import Group, installed, load, names
 
 _LAYOUTS: Final[tuple[SourceReader, ...]] = (
@@ -59,7 +59,10 @@ def open_reference(spec: str, depth_registration: DepthRegistration | None = Non
 def _registered(source: Source, registration: DepthRegistration | None) -> Source:
     if source.lens is not None and not source.depth_registered:
         source = UndistortedColourSource(source)
-    return source if registration is None else RegisteredSource(source, registration)
+    if registration is None:
+        return source
+    stated = StatedValues.all_of(registration, CameraCorrection(), PoseExposurePrior())
+    return open_calibrator().calibrate(source, stated).source
 
 
 def _open(spec: str, up_axis: UpAxis | None, require_poses: bool) -> Source:

@@ -183,6 +183,14 @@ class ObjectLandmark:
 
 
 @dataclass(frozen=True, slots=True)
+class Answer:
+    """The objects that a question means, and why there may be others. A count is their number."""
+
+    objects: tuple[ObjectLandmark, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class ObjectReport:
     """The task graph of one agent and its object landmarks; a later report replaces an earlier one."""
 

@@ -1,12 +1,4 @@
-"""Named mapping policies (task, paper, uniform and the baselines), and the flags that disable their parts.
-
-A baseline follows no task; seeding, scales, loss weights and density control are those of its system's released
-configuration. Everything else is common to all policies: Adam's rates (ONLINE_RATES), the density limit of seeds near
-the cap, seeds where no depth is measured, clone and split that preserve appearance, pose refinement, and the views to
-train on, in turn. With so few iterations, the released rates would lose several decibels. Views are the 24 most recent
-keyframes and 24 others, spread over the mission; the task policy also has 24 that show the ROI. Two values were tuned
-in the baselines' favour (bench/results): the initial scale of MonoGS and the number of SplaTAM's seeds.
-"""
+"""Named mapping policies (task, paper, uniform and those of packages), and the flags that disable their parts."""
 
 from __future__ import annotations
 
@@ -25,56 +17,15 @@ from gausslite.mapping.settings import (
     OptimizationSettings,
     SeedingSettings,
 )
+from gausslite.plugins import Group, load, names
 from gausslite.render.rasterizer import AdamSettings, LossWeights
 
-_NO_TASK = Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
-_NO_DENSIFICATION = DensitySettings(min_mean_gradient=math.inf)
+NO_TASK = Components(sb=False, mvo=True, roi=False, sis=False, gfd=False)
 
 
 def uniform_policy() -> MapperSettings:
     """Return uniform seeding and full-image training with this engine's density control."""
-    return MapperSettings(components=_NO_TASK)
-
-
-def gaussian_slam_policy() -> MapperSettings:
-    """Return Gaussian-SLAM (Yugay et al. 2023).
-
-    Uniform seeds where alpha < 0.6, scale = neighbour distance, 7 iterations, prune only.
-    """
-    return MapperSettings(
-        components=_NO_TASK,
-        optimization=OptimizationSettings(warmup_iterations=7, active_iterations=0),
-        density=_NO_DENSIFICATION,
-    )
-
-
-def splatam_policy() -> MapperSettings:
-    """Return SplaTAM (Keetha et al. 2024).
-
-    Isotropic Gaussians of one pixel's width: every fourth pixel of the first frame, then at most 2000 per frame of
-    320x240, where alpha < 0.5 or depth errs by 50 times its median; no clone, no split.
-    """
-    return MapperSettings(
-        components=_NO_TASK,
-        seeding=SeedingSettings(
-            first_frame_seeds=76_800, later_seeds=8_000, min_alpha=0.5, depth_error_factor=50.0, init_scale=0.5
-        ),
-        optimization=OptimizationSettings(loss=LossWeights(colour=0.4, depth=1.0, ssim=0.1), isotropic=True),
-        density=_NO_DENSIFICATION,
-    )
-
-
-def monogs_policy() -> MapperSettings:
-    """Return MonoGS with RGB-D input (Matsuki et al. 2024).
-
-    Small sparse seeds everywhere (one pixel in 32, later in 64; point size 0.05 scales the squared neighbour distance),
-    no SSIM term, clone and split by gradient.
-    """
-    return MapperSettings(
-        components=_NO_TASK,
-        seeding=SeedingSettings(first_frame_seeds=9_600, later_seeds=4_800, min_alpha=1.0, init_scale=math.sqrt(0.05)),
-        optimization=OptimizationSettings(loss=LossWeights(colour=0.95, depth=0.05, ssim=0.0)),
-    )
+    return MapperSettings(components=NO_TASK)
 
 
 def task_policy() -> MapperSettings:
@@ -113,21 +64,17 @@ TASK = "task"
 UNIFORM = "uniform"
 """Name of the policy without a region of interest."""
 
-POLICIES: dict[str, Callable[[], MapperSettings]] = {
-    TASK: task_policy,
-    "paper": paper_policy,
-    UNIFORM: uniform_policy,
-    "gaussian-slam": gaussian_slam_policy,
-    "splatam": splatam_policy,
-    "monogs": monogs_policy,
-}
+_CORE: dict[str, Callable[[], MapperSettings]] = {TASK: task_policy, "paper": paper_policy, UNIFORM: uniform_policy}
+POLICIES = (*_CORE, *names(Group.POLICIES))
+"""All names; those of packages are the baselines of comparisons."""
 
 
 def policy(name: str) -> MapperSettings:
-    """Return the settings of a named policy. Raises InvalidInputError if the name is not in POLICIES."""
+    """Return the settings of a named policy. Raises InvalidInputError for another name, MissingPluginError."""
     if name not in POLICIES:
         raise InvalidInputError(f"policy: expected one of {', '.join(POLICIES)}, got {name!r}")
-    return POLICIES[name]()
+    settings: MapperSettings = _CORE[name]() if name in _CORE else load(Group.POLICIES, name)
+    return settings
 
 
 def follows_task(name: str) -> bool:

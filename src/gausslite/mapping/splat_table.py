@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32, Int64, UInt32
@@ -45,9 +46,21 @@ _MAX_MOMENT_RATIO, _MOMENT_TOLERANCE = 1e6, 1e-30
 """Bounds of (first moment)² against the second. By the Cauchy-Schwarz inequality their ratio is at most
 (1 - b1)² / ((1 - b2) (1 - b1² / b2)): 53 for Adam's usual betas. The margin allows other betas; the tolerance, second
 moments that float32 rounds to 0."""
+_BYTES_PER_GAUSSIAN = 274
 _ROWS_IN_CACHE = 4096
 _MIN_UPDATES_PER_HORIZON = 8.0
 """The EMA horizon of a row is at most its number of updates divided by this."""
+
+
+def require_memory(capacity: int) -> None:
+    """Raise InvalidInputError for a table larger than the machine's memory; nothing is allocated."""
+    if capacity * _BYTES_PER_GAUSSIAN > os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"):
+        raise _too_large(capacity)
+
+
+def _too_large(capacity: int) -> InvalidInputError:
+    fits = f"fits in memory ({_BYTES_PER_GAUSSIAN} bytes per Gaussian)"
+    return InvalidInputError(f"max_gaussians: expected a table that {fits}, got {capacity}")
 
 
 class SplatTable:
@@ -72,9 +85,7 @@ class SplatTable:
             self._roi_evidence = np.zeros(capacity, np.int16)
             self._anchor = np.zeros(capacity, np.int32)
         except (OSError, MemoryError, OverflowError, ValueError):
-            raise InvalidInputError(
-                f"max_gaussians: expected a table that fits in memory (274 bytes per Gaussian), got {capacity}"
-            ) from None
+            raise _too_large(capacity) from None
 
     def __len__(self) -> int:
         return self._count

@@ -11,7 +11,6 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from gausslite.datasets.source import Source
-from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import Frame
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark
@@ -82,54 +81,23 @@ OpenPriorMap = Callable[[Path, MissionSettings, State], PriorMap]
 """The plug-in: reads the folder of an earlier run, for a new run, or for one with this state. Raises MapFileError."""
 
 
-class NoPriorMap(PriorMap):
-    """A run that begins a map in its own frame."""
-
-    motion, world_frame, is_done = None, "", True
-
-    def localise(self, stream: FrameStream, spread: bool) -> None:
-        """Do nothing."""
-
-    def place(self, frame: Frame) -> Frame:
-        """Return the frame as it is."""
-        return frame
-
-    def describe(self) -> str:
-        """Return an empty line."""
-        return ""
-
-    def gaussians_for(self, _task: str) -> None:
-        """Return None."""
-
-    def moved(self, source: Source) -> Source:
-        """Return the sequence as it is."""
-        return source
-
-    def compare(
-        self, _gaussians: Gaussians, objects: Sequence[ObjectLandmark], _keyframes: Sequence[Keyframe]
-    ) -> MapChanges:
-        """Return the run's own objects."""
-        return MapChanges(objects)
-
-    def state(self) -> State:
-        """Return nothing."""
-        return {}
-
-
-def open_prior_map(folder: Path | None, saved: State, settings: MissionSettings) -> PriorMap:
-    """Return the map of the run in a folder, or of the extra arrays of a saved run, which a run continues.
+def open_prior_map(folder: Path | None, saved: State, settings: MissionSettings) -> PriorMap | None:
+    """Return the map of the run in a folder, or of the extra arrays of a saved run; None if a run begins its own.
 
     Raises MapFileError, MissingPluginError.
     """
-    if PRIOR_FOLDER in saved:
-        folder = Path(get_text(saved, PRIOR_FOLDER))
+    folder = Path(get_text(saved, PRIOR_FOLDER)) if PRIOR_FOLDER in saved else folder
     if folder is None:
-        return NoPriorMap()
+        return None
     open_plugin: OpenPriorMap = load(Group.LOCALISERS, purpose=f"--prior {folder}")
     return open_plugin(folder, settings, saved)
 
 
-def require_other_folder(prior: Path | None, out: Path) -> None:
-    """Raise InvalidInputError for a saved map in the folder of the new run, which would replace it."""
-    if prior is not None and prior.resolve() == out.resolve():
-        raise InvalidInputError(f"--prior {prior}: expected another folder than --out, whose map is replaced")
+def compare_with_prior(
+    prior: PriorMap | None,
+    gaussians: Gaussians,
+    objects: Sequence[ObjectLandmark],
+    keyframes: Sequence[Keyframe],
+) -> MapChanges:
+    """Return what changed since the earlier map; without one, the run's own objects."""
+    return MapChanges(objects) if prior is None else prior.compare(gaussians, objects, keyframes)

@@ -9,10 +9,9 @@ import math
 import os
 import resource
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +23,10 @@ from gausslite.codec.ply import write_ply
 from gausslite.codec.run_files import KeyframeView, ViewImage, write_keyframe_views, write_view_images
 from gausslite.codec.state_file import FORMAT as STATE_FORMAT
 from gausslite.codec.state_file import write_atomic
-from gausslite.datasets.folder import format_pose_rows, read_pose_rows
+from gausslite.datasets.folder import format_pose_rows
 from gausslite.domain.errors import InvalidInputError, MapFileError, StorageError
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.pose import CorrectionTrack, UpAxis, pose_at, unit_up_axis
+from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.relevance import largest_roi_per_segment
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mapping.poses import PoseTable
@@ -91,7 +90,6 @@ class FileKind:
 
 MAP_FILE = FileKind("a map", b"ply\nformat ", ".ply")
 STATE_FILE = FileKind("a saved run", STATE_FORMAT.encode())
-CALIBRATION_FILE = FileKind("a calibration", b"# gausslite calibrate")
 
 
 def map_file(path: Path) -> Path:
@@ -176,18 +174,6 @@ def write_poses(folder: Path, poses: PoseTable, T_map_sequence: Float64[ndarray,
         write_atomic(folder / name, format_pose_rows(title, corrections.times_ns, T).encode())
 
 
-def read_corrections(folder: Path) -> CorrectionTrack | None:
-    """Return the corrections of map_to_odom.txt; None without the file. Raises DatasetError, PoseError."""
-    path = folder / MAP_TO_ODOM
-    return CorrectionTrack(*read_pose_rows(path)) if path.is_file() else None
-
-
-def read_trajectory(folder: Path) -> Callable[[int], Float64[ndarray, "4 4"]]:
-    """Return a function from a time in nanoseconds to T_map_camera, interpolated. Raises DatasetError, PoseError."""
-    times_ns, T_map_camera = read_pose_rows(folder / TRAJECTORY)
-    return partial(pose_at, times_ns, T_map_camera)
-
-
 def read_report(folder: Path) -> Mapping[str, object]:
     """Return the content of report.json; empty if there is none or it is not a JSON object."""
     return _read_json(folder / _REPORT)
@@ -210,11 +196,6 @@ def read_evaluation(folder: Path) -> Mapping[str, object]:
     if not scores and (folder / EVALUATION).exists():
         raise MapFileError(f"{folder / EVALUATION}: expected the scores of `gausslite eval`, got something else")
     return scores
-
-
-def write_evaluation(folder: Path, scores: Mapping[str, object]) -> None:
-    """Write the scores of the folder's map to evaluation.json. Raises StorageError."""
-    write_json(folder / EVALUATION, scores)
 
 
 def write_json(path: Path, report: Mapping[str, object]) -> None:

@@ -48,12 +48,8 @@ class FrameStream:
         InvalidInputError.
         """
         source = open_source(settings.spec, settings.up_axis, settings.depth_registration, settings.require_poses)
-        correction = settings.camera_correction
-        if correction is None:
-            correction = CameraCorrection(source.lens)
-        if not correction.is_identity:
-            source = CorrectedSource(source, correction)
-        return cls.select(source, settings)
+        correction = settings.camera_correction or CameraCorrection(source.lens)
+        return cls.select(source if correction.is_identity else CorrectedSource(source, correction), settings)
 
     @classmethod
     def select(cls, source: Source, settings: SourceSettings) -> FrameStream:
@@ -208,14 +204,12 @@ class MissionRunner:
     """Pass frames to a processing step, one after the other.
 
     process: maps one frame, or queues it elsewhere and returns None. on_frame: gets each outcome, for progress.
-    checkpoint: gets the index of the last frame when the run ends, unless an error came before the first frame.
     should_stop: called before each frame; the run ends if it returns True. Publishing is part of the processing step,
     see `TaskMapper`.
     """
 
     process: Callable[[Frame], FrameOutcome | None]
     on_frame: Callable[[FrameOutcome], None] = lambda _outcome: None
-    checkpoint: Callable[[int], None] | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
 
     def run(self, frames: Iterable[Frame], resumed_after: int = _NO_FRAME_INDEX) -> MissionResult:
@@ -244,7 +238,4 @@ class MissionRunner:
                 if outcome is not None:
                     totals.add(outcome)
                     self.on_frame(outcome)
-        result = MissionResult(totals, time.perf_counter() - start_s, last_index, stopped_by)
-        if self.checkpoint is not None and (result.processed > 0 or stopped_by is None):
-            self.checkpoint(last_index)
-        return result
+        return MissionResult(totals, time.perf_counter() - start_s, last_index, stopped_by)

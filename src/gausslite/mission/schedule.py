@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import match_warnings
 from gausslite.domain.relevance import PointedObject, PointM
 from gausslite.domain.state import EvenHistory
-from gausslite.domain.task import TaskGraph
+from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.mapping.poses import PoseTable
 from gausslite.mission.build import EstimatorFactory
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
@@ -51,27 +52,22 @@ class MapRecorder:
 
 
 @dataclass(frozen=True, slots=True)
-class TaskSwitch:
-    """A new task, in natural language, from a frame index on."""
-
-    frame: int
-    text: str
-
-    @classmethod
-    def parse(cls, text: str) -> TaskSwitch:
-        """Return the switch written as "120:Find the mug". Raises InvalidInputError."""
-        number, colon, task = text.partition(":")
-        if not (colon and number.isascii() and number.isdigit() and len(number) < 10 and task.strip()):
-            raise InvalidInputError(f"task-at: expected a frame and a task such as '120:Find the mug', got {text!r}")
-        return cls(int(number), task.strip())
-
-
-@dataclass(frozen=True, slots=True)
 class TaskSchedule:
     """The first task of a mission (None without a task in natural language), and later ones by their first frame."""
 
     first: TaskGraph | None
     switches: tuple[tuple[int, TaskGraph], ...] = ()
+
+    @classmethod
+    def parse(cls, first: TaskGraph | None, switches: Sequence[str], parser: TaskParser) -> TaskSchedule:
+        """Return the schedule with switches such as "120:Find the mug". Raises InvalidInputError, TaskError."""
+        later = [_split_switch(text) for text in switches]
+        if later and first is None:
+            raise InvalidInputError("task-at: expected a first task, with --task TEXT, got none")
+        for frame, count in Counter(frame for frame, _ in later).items():
+            if count > 1:
+                raise InvalidInputError(f"task-at: expected one task for a frame, got {count} for {frame}")
+        return cls(first, tuple((frame, parser.parse(task)) for frame, task in later))
 
     def graphs(self) -> tuple[TaskGraph, ...]:
         """Return all tasks."""
@@ -89,11 +85,18 @@ class TaskSchedule:
         return replace(self, switches=(*others, (first_frame, graph)))
 
 
+def _split_switch(text: str) -> tuple[int, str]:
+    number, colon, task = text.partition(":")
+    if not (colon and number.isascii() and number.isdigit() and len(number) < 10 and task.strip()):
+        raise InvalidInputError(f"task-at: expected a frame and a task such as '120:Find the mug', got {text!r}")
+    return int(number), task.strip()
+
+
 class ScheduledTaskMapper:
     """Process frames with a TaskMapper, assign each scheduled task before its first frame, and take what a person says.
 
     graph: the task that the mapper has now, with what a person points at; None without a task in natural language.
-    schedule: all tasks, those of a person included.
+    schedule: all tasks, those of a person included. last_index: of the last frame, -1 for none.
     """
 
     def __init__(
@@ -104,11 +107,10 @@ class ScheduledTaskMapper:
         graph: TaskGraph | None,
         last_index: int,
     ) -> None:
-        """last_index: of the last frame that the mapper has processed, -1 for none."""
         self.mapper, self.graph, self.schedule = mapper, graph, schedule
         self._estimators = estimators
         self._scheduled = schedule.at(last_index)
-        self._last_index = last_index
+        self.last_index = last_index
 
     def process(self, frame: Frame) -> FrameOutcome:
         """Process one frame for the task that is scheduled for it."""
@@ -116,7 +118,7 @@ class ScheduledTaskMapper:
         if scheduled is not None and self._scheduled is not None and not scheduled.is_equivalent_to(self._scheduled):
             self.mapper.assign(self._estimators.build(scheduled))
             self.graph = scheduled
-        self._scheduled, self._last_index = scheduled, frame.index
+        self._scheduled, self.last_index = scheduled, frame.index
         return self.mapper.process(frame)
 
     def assign(self, graph: TaskGraph) -> TaskGraph:
@@ -129,7 +131,7 @@ class ScheduledTaskMapper:
         if not graph.is_equivalent_to(self.graph):
             self.mapper.assign(self._estimators.build(graph))
         self.graph = self._scheduled = graph
-        self.schedule = self.schedule.with_switch(self._last_index + 1, graph)
+        self.schedule = self.schedule.with_switch(self.last_index + 1, graph)
         return graph.with_warnings(match_warnings(self._estimators.noun_matches(graph)))
 
     def point_at(self, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM] = ()) -> TaskGraph:

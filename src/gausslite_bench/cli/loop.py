@@ -5,15 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from gausslite.cli.map_inputs import mission_settings, parse_task
 from gausslite.cli.progress import MappingBar
-from gausslite.cli.source_options import (
-    RecordingOptions,
-    calibrate_with_messages,
-    open_recorded,
-    selected_regions,
-    stated_values,
-)
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build
 from gausslite.config.program import Program
@@ -23,6 +15,14 @@ from gausslite.mapping.policies import TASK
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import EstimatorFactory, build_mapper, region_estimator
 from gausslite.mission.frame_scheduler import FrameScheduler
+from gausslite.mission.plan import mission_settings, parse_task
+from gausslite.mission.recording import (
+    RecordingOptions,
+    calibrate_with_messages,
+    open_recorded,
+    selected_regions,
+    stated_values,
+)
 from gausslite.mission.results import peak_rss_mib
 from gausslite.mission.runner import FrameStream, MissionRunner
 from gausslite.mission.settings import (
@@ -81,7 +81,9 @@ def _estimator(options: argparse.Namespace, source: Source) -> RelevanceEstimato
     """Return the relevance estimator of the options: for a task, for regions, or for a uniform map."""
     graph = parse_task(options)
     if graph is None:
-        return region_estimator(selected_regions(options, source))
+        return region_estimator(
+            selected_regions(options.source, source, options.roi, options.objects, options.target_at)
+        )
     perception = build(PerceptionSettings, options).at_rate(mission_settings(options))
     return EstimatorFactory(perception, lambda: SceneInfo.of(source)).build(graph)
 

@@ -7,12 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gausslite.cli.source_options import (
-    RecordingOptions,
-    calibrate_with_messages,
-    open_recorded,
-    stated_values,
-)
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build, option
 from gausslite.config.plain_values import split_names
@@ -23,6 +17,12 @@ from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import CameraCorrection, PoseExposurePrior
 from gausslite.domain.relevance import Region
 from gausslite.mission.build import chosen_detector
+from gausslite.mission.recording import (
+    RecordingOptions,
+    calibrate_with_messages,
+    open_recorded,
+    stated_values,
+)
 from gausslite.mission.settings import PerceptionSettings, SourceSettings
 from gausslite.nouns import head_of
 from gausslite_bench.perception.stage_scores import PerceptionBench, TaskQuery

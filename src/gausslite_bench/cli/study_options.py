@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 
-from gausslite.cli.source_options import RecordingOptions, calibrate_with_messages, open_recorded, stated_values
 from gausslite.codec.state_file import write_atomic
 from gausslite.config.option import build, option
 from gausslite.config.program import add_flags
 from gausslite.datasets.regions import REGIONS_FILE
 from gausslite.datasets.source import downscaled_size
 from gausslite.domain.errors import InvalidInputError
+from gausslite.mission.recording import RecordingOptions, calibrate_with_messages, open_recorded, stated_values
 from gausslite.mission.results import as_text, write_json
 from gausslite.mission.settings import SourceSettings
 from gausslite_bench.quality.real_scenes import REAL_CAMERA, RealScenePlan, real_plans

@@ -11,12 +11,12 @@ from tiny_sequences import write_seven_scenes, write_tum
 
 import gausslite as gl
 from gausslite.cli.main import main
-from gausslite.cli.source_options import calibrate_with_messages, stated_values
 from gausslite.config.values import AUTO
 from gausslite.datasets.calibration import StatedValues, open_calibrator
 from gausslite.datasets.open import open_source
 from gausslite.domain.errors import DatasetError, MissingPluginError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
+from gausslite.mission.recording import calibrate_with_messages, stated_values
 
 READERS = ("gausslite_ros", "gausslite_recorders", "gausslite_sim")
 ABSENT = "needs the package gausslite_calibration, which is not installed"
@@ -70,16 +70,23 @@ def test_stated_values_are_used_without_a_calibrator(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = open_source(str(write_seven_scenes(tmp_path / "seq")))
-    camera, prior = DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0"), PoseExposurePrior(0.01, 0.5)
-    stated = StatedValues(camera, correction=CameraCorrection(readout_s=0.01), pose_prior=prior)
+    prior, correction = PoseExposurePrior(0.01, 0.5), CameraCorrection(readout_s=0.01)
+    stated = StatedValues.all_of(None, correction, prior)
     expected = open_calibrator().calibrate(source, stated)
     remove_package(monkeypatch, "gausslite_calibration")
     found = calibrate_with_messages("seq", source, stated)
-    assert (found.registration, found.correction, found.pose_prior) == (camera, stated.correction, prior)
+    assert (found.registration, found.correction, found.pose_prior) == (None, correction, prior)
     frame, other = found.source.frame(1), expected.source.frame(1)
     np.testing.assert_array_equal(frame.depth_m, other.depth_m)
     assert (frame.camera, frame.motion) == (other.camera, other.motion)
     assert capsys.readouterr().err == ""
+
+
+def test_a_registration_names_its_absent_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, camera = write_seven_scenes(tmp_path / "seq"), DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0")
+    remove_package(monkeypatch, "gausslite_calibration")
+    with pytest.raises(MissingPluginError, match=f"register-depth: {ABSENT}"):
+        open_source(str(folder), depth_registration=camera)
 
 
 def test_one_line_says_what_is_not_estimated_without_a_calibrator(

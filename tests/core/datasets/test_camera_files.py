@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tiny_sequences import HEIGHT, WIDTH, write_colour, write_seven_scenes, write_tum
 
-from gausslite.cli.source_options import open_recorded
 from gausslite.datasets.camera_files import lens_of, read_folder_camera
 from gausslite.datasets.open import open_source
 from gausslite.domain.camera import Lens, LensModel
 from gausslite.domain.errors import DatasetError
+from gausslite.mission.recording import open_recorded
 
 FISHEYE_NAMES = [
     "equidistant",

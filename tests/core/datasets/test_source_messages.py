@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
@@ -11,12 +10,12 @@ import pytest
 from tiny_sequences import write_seven_scenes, write_tum
 
 from gausslite.cli.main import main
-from gausslite.cli.source_options import calibrate_with_messages, open_recorded, selected_regions, stated_values
 from gausslite.config.values import AUTO, NONE
 from gausslite.datasets.calibration import Calibration
 from gausslite.datasets.open import open_source
 from gausslite.domain.errors import DatasetError
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
+from gausslite.mission.recording import calibrate_with_messages, open_recorded, selected_regions, stated_values
 
 EXACT = PoseExposurePrior()
 CAMERA = DepthRegistration.parse("20,20,7.5,5.5,-0.01,0,0")
@@ -88,8 +87,7 @@ def test_skipped_images_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_regions_of_the_folder_are_used_with_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_tum(tmp_path / "fr1")
     np.savez(folder / "roi_voxels.npz", voxel_size_m=0.02, mug_1=np.zeros((1, 3), np.int32))
-    options = argparse.Namespace(source=str(folder), roi=None, objects=("mug_1",), target_at=[])
-    assert len(selected_regions(options, open_source(str(folder)))) == 1
+    assert len(selected_regions(str(folder), open_source(str(folder)), None, ("mug_1",), ())) == 1
     [line] = capsys.readouterr().err.splitlines()
     assert line == f"{folder}: the ground-truth regions of roi_voxels.npz in the sequence's folder are used"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gausslite.cli.main import main
-from gausslite.mission.schedule import TaskSchedule, TaskSwitch
+from gausslite.mission.schedule import TaskSchedule
 from gausslite_language.rules import RuleParser
 
 
@@ -17,7 +17,9 @@ def test_the_current_task_is_that_of_the_latest_switch() -> None:
     first, second, third = parse("Find the mug"), parse("Find the bowl"), parse("Find the chair")
     plan = TaskSchedule(first, ((20, third), (10, second)))
     assert [plan.at(frame) for frame in (0, 9, 10, 19, 20, 99)] == [first, first, second, second, third, third]
-    assert TaskSwitch.parse("7: Find the mug ") == TaskSwitch(7, "Find the mug")
+    assert TaskSchedule.parse(second, ["20:Find the chair", "10: Find the mug "], RuleParser()) == TaskSchedule(
+        second, ((20, third), (10, first))
+    )
 
 
 @pytest.mark.parametrize("text", ["Find the mug", "x:Find the mug", "7:", "-1:Find the mug"])

@@ -8,7 +8,7 @@ import pytest
 import gausslite as gl
 from gausslite.domain.objects import ObjectLandmark, ObjectRole
 from gausslite.domain.voxels import AxisAlignedBox
-from gausslite.perception.questions import answer
+from gausslite_language.questions import answer
 from gausslite_language.rules import RuleParser
 
 

@@ -1,4 +1,4 @@
-"""Declare the options for what a recording does not state, and open a sequence, with messages on stderr."""
+"""Open a recording with messages on stderr: the options for what it may not state, its calibration, its regions."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import textwrap
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-
-import numpy as np
+from pathlib import Path
 
 from gausslite.config.option import option
 from gausslite.config.values import (
@@ -27,13 +26,12 @@ from gausslite.datasets.calibration import Calibration, Evidence, StatedValues, 
 from gausslite.datasets.folder import up_note
 from gausslite.datasets.open import open_source
 from gausslite.datasets.source import Source, usable_frames
-from gausslite.domain.errors import DatasetError, PoseError
+from gausslite.domain.errors import DatasetError, GaussLiteError, PoseError
 from gausslite.domain.pose import UpAxis
 from gausslite.domain.recording import CameraCorrection, DepthRegistration, PoseExposurePrior
 from gausslite.domain.relevance import Region, TargetPoint
-from gausslite.mapping.keyframes import Keyframe
-from gausslite.mission.runner import MissionResult, region_file_note
-from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP
+from gausslite.mission.runner import region_file_note
+from gausslite.mission.settings import CORRECTION_HELP, POSE_PRIOR_HELP, REGISTRATION_HELP, PoseMode, SourceSettings
 from gausslite.process import print_message
 
 _MESSAGE_WIDTH, _VALUE_WIDTH = 150, 30
@@ -87,8 +85,37 @@ def open_recorded(spec: str, up_axis: UpAxis | None, require_poses: bool = True)
     return source
 
 
-def _depth_unit_advice(source: Source) -> str:
-    return ", ".join(filter(None, ("check the depth unit", source.depth_unit_setting)))
+def open_for_mapping(settings: SourceSettings) -> Source:
+    """Open a sequence to map; where its poses cannot be read, the error says that such frames can be tracked."""
+    try:
+        source = open_recorded(settings.spec, settings.up_axis, settings.require_poses)
+    except (DatasetError, PoseError) as error:
+        raise _with_advice(error, settings) or error from None
+    first = _error_of(source, 0) if settings.require_poses else None
+    if first is not None and all(_error_of(source, i) for i in (len(source) // 2, len(source) - 1)):
+        advised = _with_advice(first, settings)
+        if advised is not None:
+            raise advised
+    return source
+
+
+def _error_of(source: Source, position: int) -> GaussLiteError | None:
+    try:
+        source.frame(position)
+    except (DatasetError, PoseError) as error:
+        return error
+    return None
+
+
+def _with_advice(error: GaussLiteError, settings: SourceSettings) -> GaussLiteError | None:
+    """Return the error with the option that maps frames without poses; None if it would not."""
+    if not settings.require_poses:
+        return None
+    try:
+        open_source(settings.spec, settings.up_axis, require_poses=False).frame(0)
+    except (DatasetError, PoseError):
+        return None
+    return type(error)(f"{error}; --poses {PoseMode.TRACK} maps the frames without given poses")
 
 
 def stated_values(
@@ -123,21 +150,28 @@ def _report_estimate(evidence: Evidence) -> None:
         print_message(textwrap.shorten(line, _MESSAGE_WIDTH, placeholder=" …"))
 
 
-def selected_regions(options: argparse.Namespace, source: Source) -> list[Region]:
-    """Return the objects of --roi (those of --objects, or all) and the regions of target-at.
+def has_regions(options: argparse.Namespace) -> bool:
+    """Return True if the options select regions of space."""
+    return bool(options.roi is not None or options.objects or options.target_at)
 
-    --objects without --roi selects regions of the source. Empty if the user selects nothing. Raises
-    InvalidInputError, DatasetError.
+
+def selected_regions(
+    spec: str, source: Source, roi: Path | None, objects: Sequence[str], target_at: Sequence[TargetPoint]
+) -> list[Region]:
+    """Return the objects of a voxel file (those of `objects`, or all) and the regions at points.
+
+    Without a file, the objects are regions of the source. Empty if nothing is selected. Raises InvalidInputError,
+    DatasetError.
     """
     from gausslite.datasets.regions import balls_for_small_objects, choose_regions, load_voxel_regions
 
     regions: list[Region] = []
-    if options.roi is not None:
-        regions += choose_regions(balls_for_small_objects(load_voxel_regions(options.roi)), options.objects)
-    elif options.objects:
-        report_region_file(options.source, source)
-        regions += choose_regions(source.regions(), options.objects)
-    return [*regions, *(_target_region(point, source) for point in options.target_at)]
+    if roi is not None:
+        regions += choose_regions(balls_for_small_objects(load_voxel_regions(roi)), objects)
+    elif objects:
+        report_region_file(spec, source)
+        regions += choose_regions(source.regions(), objects)
+    return [*regions, *(_target_region(point, source) for point in target_at)]
 
 
 def _target_region(point: TargetPoint, source: Source) -> Region:
@@ -155,35 +189,3 @@ def report_region_file(spec: str, source: Source) -> None:
     note = region_file_note(spec, source)
     if note is not None:
         print_message(note)
-
-
-_LEAST_DEPTH_M = 0.05
-
-
-def require_mappable_depth(spec: str, source: Source, result: MissionResult, keyframes: Sequence[Keyframe]) -> None:
-    """Raise DatasetError for frames that gave no Gaussian: without depth, or with depth too far away."""
-    if result.totals.frames == 0:
-        reasons = ", ".join(f"in {count} {reason}" for reason, count in result.totals.reasons.items())
-        raise DatasetError(f"{spec}: expected frames with depth, got none in {result.processed}: {reasons}")
-    if result.stopped_by is None:
-        raise DatasetError(
-            f"{spec}: expected surfaces in reach, got none in {result.processed} frames with a median depth of "
-            f"{_median_depth_m(keyframes):.3g} m; {_depth_unit_advice(source)}"
-        )
-
-
-def depth_notes(source: Source, keyframes: Sequence[Keyframe]) -> tuple[str, ...]:
-    """Return a note if the median depth is nearer than any depth camera measures."""
-    median_m = _median_depth_m(keyframes)
-    if median_m >= _LEAST_DEPTH_M:
-        return ()
-    return (f"the median depth is {median_m:.2g} m; {_depth_unit_advice(source)}",)
-
-
-def _median_depth_m(keyframes: Sequence[Keyframe]) -> float:
-    medians = [
-        float(np.median(keyframe.frame.depth_m[keyframe.frame.depth_m > 0]))
-        for keyframe in keyframes
-        if keyframe.frame.has_depth
-    ]
-    return float(np.median(medians)) if medians else np.inf

@@ -1,15 +1,18 @@
-"""Answer a question about a finished map's objects, with the graph and the relations of a task."""
+"""Answer a question about a finished map's objects, with the graph and the relations of a task.
+
+`answer` is the default plug-in of the group `gausslite.questions`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from gausslite.domain.objects import ObjectLandmark
+from gausslite.domain.objects import Answer, ObjectLandmark
 from gausslite.domain.pose import UpAxis, unit_up_axis
 from gausslite.domain.task import Relation, Superlative, TaskGraph, noun_of
 from gausslite.nouns import meant_by
@@ -19,21 +22,12 @@ from gausslite.perception.relations import RelationFilter, select_extreme
 _BOX_STEP_M = 0.05
 _MAX_STEPS = 16
 _OF_A_VIEWPOINT = (Superlative.NEAREST, Superlative.FARTHEST, Superlative.LEFTMOST, Superlative.RIGHTMOST)
-Z_UP: UpAxis = (0.0, 0.0, 1.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """The objects that a question means, and why there may be others. A count is their number."""
-
-    objects: tuple[ObjectLandmark, ...]
-    notes: tuple[str, ...] = ()
 
 
 def answer(
     graph: TaskGraph,
     objects: Sequence[ObjectLandmark],
-    up_axis: UpAxis = Z_UP,
+    up_axis: UpAxis = (0.0, 0.0, 1.0),
     T_world_camera: Float64[ndarray, "4 4"] | None = None,
 ) -> Answer:
     """Return the objects that are targets of the graph, as a robot with this task would choose them from their boxes.

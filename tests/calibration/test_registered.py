@@ -10,11 +10,11 @@ import pytest
 from tiny_sequences import write_seven_scenes
 
 from gausslite.datasets.open import open_source
-from gausslite.datasets.registered import RegisteredSource, register_depth
 from gausslite.domain.camera import Camera, FileIntrinsics
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.recording import DepthRegistration
 from gausslite_agent.settings import parse_arguments
+from gausslite_calibration.registered import RegisteredSource, register_depth
 
 DEPTH = Camera(100.0, 100.0, 64.0, 48.0, 128, 96)
 OFFSET_M = (-0.04, 0.0, 0.0)
