@@ -12,9 +12,8 @@ from fusion_running import GRID, make_subset
 
 from gausslite.domain.errors import InvalidInputError, UnavailableError
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.traffic import TrafficCounters
 
 pytest.importorskip("prometheus_client", reason="the extra metrics is not installed")
