@@ -39,10 +39,10 @@ from gausslite_cluster.regions import Owners
 from gausslite_cluster.shared_watch import SharedRevisions, SharedWatch
 from gausslite_fusion_server.contributions import Contributions
 from gausslite_fusion_server.messages import declared_frame_from_message, exported_file
-from gausslite_fusion_server.metrics import MessageCounts
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate, FusionServicer
 from gausslite_fusion_server.settings import ServerSettings
+from gausslite_fusion_server.stores import MessageCounts
 from gausslite_fusion_server.watch import watched_part
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
