@@ -35,6 +35,8 @@ class Group(StrEnum):
     LOCALISERS = "gausslite.localisers"  # places a run in an earlier map
     ALIGNERS = "gausslite.aligners"  # decides the frames of a team's robots
     STORES = "gausslite.stores"  # a durable store of a server; the name is the scheme of its URL
+    SERVER_COMMANDS = "gausslite.server_commands"  # a command of the fusion server; called with its arguments
+    METRICS = "gausslite.metrics"  # serves the figures of a fusion server
     EVALUATORS = "gausslite.evaluators"  # says how well a finished run fits its images
     EXPORTERS = "gausslite.exporters"  # writes a map for another tool; the name is the format
     PAGES = "gausslite.pages"  # shows a run or a service in the browser

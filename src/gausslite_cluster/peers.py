@@ -15,9 +15,9 @@ import grpc
 from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.store_values import SessionRecord
+from gausslite.fusion.limits import SessionRecord
 from gausslite.fusion.traffic import Acknowledgements
-from gausslite.fusion.updates import PendingUpdate, UpdateQueue, decode_own
+from gausslite.fusion.updates import PendingUpdate, UpdateQueue
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
 from gausslite.wire.channel import open_async_channel
@@ -178,14 +178,10 @@ class PartSender:
 
     def _decode_next(self) -> None:
         [update] = self._queue.take(1)
-        try:
-            assert isinstance(update.message, bytes)
-            update.future.set_result(decode_own(update.message, update.agent_id, self._grid))
-        except Exception as error:
-            # reaches the call; this thread decodes the messages of all agents
-            update.future.set_exception(error)
-        finally:
-            self._queue.put_back(update, is_done=True)
+        update.decode(self._grid)
+        if not update.future.done():
+            update.future.set_result(update.subset)
+        self._queue.put_back(update)
 
     @contextmanager
     def _room_for(self, subset: StoredSubset) -> Iterator[None]:

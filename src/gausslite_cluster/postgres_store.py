@@ -12,7 +12,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from threading import RLock
+from threading import Lock
 from typing import Any, TypeVar
 
 import psycopg
@@ -20,7 +20,7 @@ from psycopg.conninfo import conninfo_to_dict
 
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.fusion.store import TABLES, Execute, FusionStore
-from gausslite.fusion.store_rows import SLOT_BITS, LogChange, require_intact
+from gausslite.fusion.update_log import SLOT_BITS, LogChange, require_intact
 from gausslite_cluster.regions import ALL_SLOTS, OwnedSlots, slots_of
 
 _FIRST_DELAY_S, _MAX_DELAY_S = 0.1, 5.0
@@ -68,7 +68,7 @@ class PostgresConnection:
         """Raises InvalidInputError for an address that cannot be read, StorageError without a connection."""
         self._name = database_name(url)
         self._parameters, self._prepare = {**_PARAMETERS, **conninfo_to_dict(url)}, prepare
-        self._lock = RLock()
+        self._lock = Lock()
         self._db: Database | None = None
         self._delay_s, self._next_try_s, self._failure = 0.0, 0.0, ""
         self._open()
@@ -204,7 +204,7 @@ class PostgresStore(FusionStore):
 
     def close(self) -> None:
         """Close the own connections; without owned slots, this frees the database for another server."""
-        with self._write_lock:
+        with self._log_lock:
             self._opened.close()
 
     def _take_over(self, db: Database) -> None:
@@ -279,8 +279,7 @@ class PostgresStore(FusionStore):
                 db.execute(_SET_PROPERTY, ("position", _position(self._opening, self._commits + 1)))
             self._commits += 1
 
-        with self._write_lock:
-            self._writer.run(commit)
+        self._writer.run(commit)
 
 
 def _translated(query: str) -> bytes:

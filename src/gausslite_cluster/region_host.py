@@ -162,9 +162,10 @@ class RegionHost:
         try:
             store.set_mission_config(self.settings.mission_config)
             engine = FusionEngine(store, self.settings, decode_keyframe=decode_frame, traffic=self.traffic)
-            if engine.moved_agents:
+            moved = sorted(engine.frames.unused | engine.frames.transforms().keys())
+            if moved:
                 raise MismatchError(
-                    f"server {self.server}: the frames of {', '.join(engine.moved_agents[:8])} differ from the fused "
+                    f"server {self.server}: the frames of {', '.join(moved[:8])} differ from the fused "
                     "map's, and servers that share a mission trust frames; evict these agents, or run one server "
                     "without peer-address"
                 )

@@ -16,7 +16,7 @@ from gausslite.codec.subset_codec import SubsetCoding, encode_subset, split_batc
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
-from gausslite.fusion.store_values import SessionRecord
+from gausslite.fusion.limits import SessionRecord
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import region_service_pb2 as region_pb
 from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc

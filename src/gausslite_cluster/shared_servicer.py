@@ -20,7 +20,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchE
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, merge_batches
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.store_values import SessionRecord
+from gausslite.fusion.limits import SessionRecord
 from gausslite.fusion.traffic import Acknowledgements
 from gausslite.render.choose import choose_rasterizer
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -39,10 +39,10 @@ from gausslite_cluster.regions import Owners
 from gausslite_cluster.shared_watch import SharedRevisions, SharedWatch
 from gausslite_fusion_server.contributions import Contributions
 from gausslite_fusion_server.messages import declared_frame_from_message, exported_file
-from gausslite_fusion_server.metrics import MessageCounts
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate, FusionServicer
 from gausslite_fusion_server.settings import ServerSettings
+from gausslite_fusion_server.stores import MessageCounts
 from gausslite_fusion_server.watch import watched_part
 
 # ruff: noqa: N802, ARG002 - the methods' names and arguments are those of the generated base class
@@ -168,7 +168,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
 
         async def read() -> bytes:
             batch = await self._read_map(request)
-            world_frame = (await self._host.ready()).engine.mission_config.given_world_frame
+            world_frame = (await self._host.ready()).engine.members.mission_config.given_world_frame
             return await asyncio.to_thread(ply_bytes, batch.gaussians, world_frame)
 
         async for chunk in exported_file(self._exports, read, self._gate.require_open):
@@ -232,16 +232,16 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
 
     async def _session(self, session_id: str, caller: Caller) -> SessionRecord:
         """Return a session, whoever opened it. Raises SessionUnknownError, NotPermittedError for another robot."""
-        engine = (await self._host.ready()).engine
-        session = engine.known_session(session_id)
+        sessions = (await self._host.ready()).engine.members.sessions
+        session = sessions.known(session_id)
         if session is None:
-            session = await asyncio.to_thread(engine.session, session_id)
+            session = await asyncio.to_thread(sessions.get, session_id)
         caller.require_agent(session.agent_id)
         return session
 
     async def _require_mission(self, mission_id: str) -> None:
         self._gate.require_open()
-        (await self._host.ready()).engine.require_mission(mission_id)
+        (await self._host.ready()).engine.members.require_mission(mission_id)
 
     def _home(self, agent_id: str) -> str:
         server = self._host.owners.home(agent_id)

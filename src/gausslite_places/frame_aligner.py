@@ -18,7 +18,15 @@ from gausslite.fusion.earlier_map import earlier_map_of
 from gausslite.fusion.frames import FrameAlignment, FrameFit
 from gausslite_places.fit_process import FitProcess
 from gausslite_places.frame_fit import MIN_SAMPLES, Fit, SurfaceSamples, fit_frame
-from gausslite_places.frame_rules import WITNESSES, Comparison, contradicts, corrects, find_quarantined
+from gausslite_places.frame_rules import (
+    WITNESSES,
+    Comparison,
+    contradicts,
+    corrected,
+    corrects,
+    find_quarantined,
+    in_state,
+)
 from gausslite_places.map_samples import MapSamples
 from gausslite_places.unknown_frames import Find, UnknownFrames, find_frame
 
@@ -201,8 +209,8 @@ class MapAligner:
             self._note(agent_id, name, fit, frames)
         first_seq, own.first_seq = own.first_seq, highest_seq + 1
         if joint is not None:
-            corrected = alignment.corrected(joint, first_seq)
-            frames.decide(agent_id, corrected if corrects(joint) else replace(alignment, fit=joint, against=()))
+            kept = replace(alignment, fit=joint, against=())
+            frames.decide(agent_id, corrected(alignment, joint, first_seq) if corrects(joint) else kept)
 
     def _read(self, agent_id: str, team: TeamView) -> None:
         """Read the voxels that changed since the last time, as far as they are sampled."""
@@ -278,7 +286,7 @@ class MapAligner:
         has_reference = False
         for name in names:
             before = frames[name]
-            after = before.in_state(self._contradictions(name, quarantined), name in quarantined, not has_reference)
+            after = in_state(before, self._contradictions(name, quarantined), name in quarantined, not has_reference)
             has_reference |= after.is_used
             if (after.state, after.message, after.against) != (before.state, before.message, before.against):
                 frames.decide(name, after)

@@ -31,6 +31,7 @@ from gausslite_places.frame_fit import (
     in_shared_cubes,
     occupied_blocks,
 )
+from gausslite_places.frame_rules import in_state, placed
 from gausslite_places.map_samples import thinned_samples
 from gausslite_places.surface_registration import Surface, can_match_without_guess, matched_motion
 
@@ -283,7 +284,7 @@ class UnknownFrames:
         if waiting and not localised:
             # nobody knows a frame: the first agent's is as good as any
             first = waiting.pop(0)
-            found[first] = localised[first] = frames[first].in_state({}, is_quarantined=False, is_first=True)
+            found[first] = localised[first] = in_state(frames[first], {}, is_quarantined=False, is_first=True)
         for name in waiting:
             if self._is_due(team, name, tuple(localised)):
                 found[name] = self._search(team, name, frames[name], localised)
@@ -312,7 +313,7 @@ class UnknownFrames:
             self._failed[agent_id] = self._failed.get(agent_id, 0) + 1
             if self._failed[agent_id] < _ATTEMPTS:
                 del self._searched[agent_id]
-        return unknown.unlocalised(found.reason) if found.fit is None else unknown.localised(found.fit)
+        return unknown.unlocalised(found.reason) if found.fit is None else placed(unknown, found.fit)
 
     def _samples(self, team: TeamView, agent_id: str, alignment: FrameAlignment) -> SurfaceSamples:
         """Return samples of the agent's voxels and keyframes, in the fused frame if the agent is localised."""

@@ -38,6 +38,10 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_evaluation": (("gausslite", "eval", "map.ply", SEQUENCE),),
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
     "gausslite_recorders": (),
+    "gausslite_operations": (
+        ("gausslite_fusion_server", "verify", "fusion.sqlite"),
+        ("gausslite_fusion_server", "--listen", "127.0.0.1:0", "--metrics", "127.0.0.1:0"),
+    ),
     "gausslite_demo": (("gausslite", "demo", "--out", "refused"), ("gausslite", "doctor")),
     "gausslite_view": (
         ("gausslite", "report", "a"),

@@ -18,9 +18,8 @@ from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import FrameFit
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite_places.fit_process import FitProcess
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.frame_fit import SurfaceSamples, fit_frame

@@ -28,10 +28,9 @@ from gausslite.domain.voxels import (
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameFit
 from gausslite.fusion.keyframe_pool import AgentKeyframe
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.frame_fit import Fit, SurfaceSamples, fit_frame
 
@@ -128,14 +127,14 @@ def test_five_centimetres_and_two_degrees_are_corrected_also_after_a_restart(tmp
     store = SqliteStore(tmp_path / "store.sqlite")
     engine = team(wrong_frame((0.03, -0.03, 0.025), 2.0), store)
     wrong = surface_error_m(engine.maps.voted_map("bee").gaussians.means_m)
-    revision = engine.revision
+    revision = engine.maps.revision()
     assert engine.align_due().is_changed
     assert not engine.align_due().is_changed
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
     corrected = surface_error_m(engine.maps.voted_map("bee").gaussians.means_m)
     assert wrong > 0.015
     assert corrected < 0.005
-    assert engine.revision > revision
+    assert engine.maps.revision() > revision
     # a watcher that follows the changes has the map of a new watcher
     assert len(engine.maps.changes(revision).won.batch) > 0
     store.close()

@@ -24,10 +24,9 @@ from gausslite.domain.voxels import AxisAlignedBox, RoiSubset, VoxelGrid, group_
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignment, FrameFit, Misfit
 from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.frame_fit import Fit, SurfaceSamples, fit_frame
 from gausslite_places.unknown_frames import Find, FrameSearch, find_frame, keyframe_samples
@@ -94,8 +93,7 @@ def test_an_agent_in_an_unknown_frame_stays_apart_until_the_server_has_found_it(
     send(engine, "ant", scan(0))
     few = move_gaussians(scan(1, kappa=9), T_BEE_ROOM).take(np.arange(150))
     send(engine, "bee", few, unknown=True)
-    session = engine.join("bee", ANYTHING).session.session_id
-    engine.report_objects(session, report(1.0))
+    engine.objects.report(engine.join("bee", ANYTHING).session, report(1.0))
     engine.align_due()
     apart = alignment_of(engine, "bee")
     assert apart.state is AlignmentState.UNLOCALISED
@@ -106,7 +104,7 @@ def test_an_agent_in_an_unknown_frame_stays_apart_until_the_server_has_found_it(
     assert engine.in_fused_frame([AgentKeyframe("bee", seen)]) == []
 
     send(engine, "bee", move_gaussians(scan(1, kappa=9), T_BEE_ROOM), seq=2)
-    revision = engine.revision
+    revision = engine.maps.revision()
     assert engine.align_due().is_changed
     found = alignment_of(engine, "bee")
     assert found.state is AlignmentState.CORRECTED
@@ -259,8 +257,8 @@ def test_a_keyframe_that_no_decoder_reads_ends_no_comparison_of_others() -> None
     engine = aligning()  # without a decoder
     send(engine, "ant", scan(0))
     send(engine, "bee", scan(1), unknown=True)
-    session = engine.join("bee", MissionConfig("", "", SETTINGS.grid.size_m)).session
-    engine.add_keyframe(session.session_id, EncodedKeyframe("bee", 0, 1, 1, b"of another version"))
+    engine.join("bee", MissionConfig("", "", SETTINGS.grid.size_m))
+    engine.keyframes.add(EncodedKeyframe("bee", 0, 1, 1, b"of another version"))
     send(engine, "cat", scan(2))
     engine.align_due()
     assert alignment_of(engine, "cat").fit is not None
@@ -280,8 +278,8 @@ def test_a_slow_disk_delays_nobody_while_keyframes_are_read(monkeypatch: pytest.
     engine = aligning(store, find=lambda *_: FrameSearch(None))
     send(engine, "ant", scan(0))
     send(engine, "bee", scan(1), unknown=True)
-    session = engine.join("bee", ANYTHING).session
-    engine.add_keyframe(session.session_id, EncodedKeyframe("bee", 0, 1, 1, b"an image"))
+    engine.join("bee", ANYTHING)
+    engine.keyframes.add(EncodedKeyframe("bee", 0, 1, 1, b"an image"))
     read = store.keyframe
 
     def read_slowly(*arguments: Any) -> bytes:
@@ -294,7 +292,7 @@ def test_a_slow_disk_delays_nobody_while_keyframes_are_read(monkeypatch: pytest.
         run = threads.submit(engine.align_due)
         assert begun.wait(60)
         try:
-            assert threads.submit(engine.alignment, "ant").result(30).is_used
+            assert threads.submit(engine.frames.get, "ant").result(30).is_used
         finally:
             released.set()
         run.result(60)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from gausslite.domain.errors import GaussLiteError, MismatchError, SessionUnknownError, StorageError, UnavailableError
-from gausslite.fusion.store_values import SessionRecord
+from gausslite.fusion.limits import SessionRecord
 from gausslite.fusion.traffic import TrafficCounters
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.security import Caller, RejectionLog

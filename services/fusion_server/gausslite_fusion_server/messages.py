@@ -19,8 +19,8 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
+from gausslite.fusion.limits import SessionRecord
 from gausslite.fusion.refinement import LayerView
-from gausslite.fusion.store_values import SessionRecord
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
@@ -34,7 +34,7 @@ _MAX_SELECTED_KEYFRAMES = 10_000
 
 def session_of(engine: FusionEngine, session_id: str, caller: Caller) -> SessionRecord:
     """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
-    session = engine.session(session_id)
+    session = engine.members.sessions.get(session_id)
     caller.require_agent(session.agent_id)
     return session
 
@@ -43,9 +43,9 @@ def kept_session(engine: FusionEngine, session_id: str, caller: Caller) -> pb.Ke
     """Renew the lease of a session; return what identifies the stored updates. Raises as `session_of`."""
     agent_id = session_of(engine, session_id, caller).agent_id
     return pb.KeepSessionResponse(
-        highest_update_seq=engine.highest_update_seq(agent_id),
-        incarnation_id=engine.incarnation_id,
-        alignment=alignment_to_message(engine.alignment(agent_id)),
+        highest_update_seq=engine.store.totals(agent_id).highest_update_seq,
+        incarnation_id=engine.store.incarnation_id,
+        alignment=alignment_to_message(engine.frames.get(agent_id)),
     )
 
 
@@ -61,7 +61,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     region_from_png(message.region_png, frame.camera)
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
-    engine.add_keyframe(request.session_id, keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES])
+    engine.keyframes.add(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES], request.session_id)
 
 
 def select_map(engine: FusionEngine, request: pb.ExportFusedMapRequest) -> VoxelBatch:
@@ -104,7 +104,7 @@ async def exported_file(
 def read_keyframe(engine: FusionEngine, request: pb.GetKeyframeRequest) -> pb.GetKeyframeResponse:
     """Return a keyframe without its depth; empty if the agent has none. Raises InvalidInputError, StorageError."""
     index = request.index if request.HasField("index") else None
-    data, indices = engine.encoded_keyframe(request.agent_id, index)
+    data, indices = engine.keyframes.find(request.agent_id, index), engine.keyframes.indices(request.agent_id)
     if not data:
         return pb.GetKeyframeResponse()
     message = EncodedFrame.FromString(data)
@@ -149,7 +149,7 @@ def declare_frame(engine: FusionEngine, request: pb.JoinSessionRequest) -> None:
         engine.declare_frame(request.agent_id, None)
     elif T_fused_agent is not None:
         engine.declare_frame(request.agent_id, T_fused_agent)
-    elif engine.alignment(request.agent_id).is_unknown:
+    elif engine.frames.get(request.agent_id).is_unknown:
         # it knows its frame now
         engine.declare_frame(request.agent_id, np.eye(4))
 

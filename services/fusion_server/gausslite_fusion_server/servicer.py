@@ -16,8 +16,8 @@ from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import AlignmentRun, FusionEngine
+from gausslite.fusion.limits import MissionConfig, SessionRecord
 from gausslite.fusion.refinement import MapRenderer
-from gausslite.fusion.store_values import MissionConfig, SessionRecord
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import fusion_service_pb2_grpc as pb_grpc
 from gausslite.wire import convert
@@ -149,7 +149,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def publish_changes(self) -> None:
         """Wake the watchers, and look which frames are due. Use it on the event loop."""
         self._map_changes.notify()
-        if self.engine.compares_frames:
+        if self.engine.frames.are_compared:
             self._align_in_background()
 
     def _commit_soon(self) -> None:
@@ -181,8 +181,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             joined = await self._work(self.engine.join, request.agent_id, requested, request.fresh_map, request.token)
         await self._work(messages.declare_frame, self.engine, request)
         if task is not None:
-            objects = await self._work(self.engine.reported_objects, request.agent_id, task)
-            await self._work(self.engine.report_objects, joined.session.session_id, ObjectReport(task, objects))
+            objects = await self._work(self.engine.objects.of_task, request.agent_id, task)
+            await self._work(self.engine.objects.report, joined.session, ObjectReport(task, objects))
         self._map_changes.notify()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,
@@ -193,7 +193,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             max_gaussians=self.engine.settings.quotas.gaussians_per_agent,
             keyframes=joined.keyframes,
             max_keyframes=self.engine.settings.quotas.keyframes_per_agent,
-            incarnation_id=self.engine.incarnation_id,
+            incarnation_id=self.engine.store.incarnation_id,
         )
 
     async def KeepSession(self, request: pb.KeepSessionRequest, context: Any) -> pb.KeepSessionResponse:
@@ -205,7 +205,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.GetUpdateDigestsResponse]:
         """Return the digests of the agent's stored updates."""
         agent_id = (await self._session(request.session_id, Caller.of(context))).agent_id
-        for block in convert.digests_to_messages(await self._work(self.engine.stored_digests, agent_id)):
+        for block in convert.digests_to_messages(await self._work(self.engine.store.digests, agent_id)):
             with read_deadline():
                 yield block
 
@@ -235,14 +235,14 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def GetKeyframe(self, request: pb.GetKeyframeRequest, context: Any) -> pb.GetKeyframeResponse:
         """Return a stored keyframe of an agent, for a person."""
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         return await self._work(messages.read_keyframe, self.engine, request)
 
     async def WatchFusedMap(
         self, request: pb.WatchFusedMapRequest, context: Any
     ) -> AsyncIterator[pb.WatchFusedMapResponse]:
         """Send the map, then its changes. A slow watcher gets several changes as one; nothing is queued."""
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         watched = watched_part(request)
         reader = FusedMapReader(self.engine, watched, self._encoded_parts, request.since_revision)
 
@@ -261,7 +261,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     ) -> AsyncIterator[pb.RefineFusedMapResponse]:
         """Refine the fused map and report progress; closing the stream cancels the refinement."""
         self._gate.require_open()
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         response = pb.RefineFusedMapResponse()
         async for progress in self._refinement_worker.run(self.engine, request):
             self._gate.require_open()
@@ -275,24 +275,24 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request: pb.ExportFusedMapRequest, context: Any
     ) -> AsyncIterator[pb.ExportFusedMapResponse]:
         """Send a map as the bytes of a PLY file."""
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
 
         async def read() -> bytes:
             batch = await self._work(messages.select_map, self.engine, request)
-            return await self._work(ply_bytes, batch.gaussians, self.engine.mission_config.given_world_frame)
+            return await self._work(ply_bytes, batch.gaussians, self.engine.members.mission_config.given_world_frame)
 
         async for chunk in messages.exported_file(self._exports, read, self._gate.require_open):
             yield chunk
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:
         """Replace the agent's task graph and objects."""
-        await self._session(request.session_id, Caller.of(context))
-        await self._work(self.engine.report_objects, request.session_id, report_from_message(request))
+        session = await self._session(request.session_id, Caller.of(context))
+        await self._work(self.engine.objects.report, session, report_from_message(request))
         return pb.ReportObjectsResponse()
 
     async def QueryObjects(self, request: pb.QueryObjectsRequest, context: Any) -> pb.QueryObjectsResponse:
         """Return the team's objects that a noun names, or all."""
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         async with self._queries:
             return await self._work(self._find_objects, request.noun)
 
@@ -303,7 +303,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:
         """Render a layer of the map from a camera pose."""
         self._gate.require_open()
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         camera = convert.camera_from_message(request.camera)
         T_world_camera = convert.transform_from_message("t_world_camera", request.t_world_camera)
         layer = messages.layer_from_message(request.layer)
@@ -312,7 +312,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         status = await self._work(self.engine.status)
         return pb.GetSessionStatusResponse(
             mission_id=status.mission_config.mission_id,
@@ -332,17 +332,17 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def EvictAgent(self, request: pb.EvictAgentRequest, context: Any) -> pb.EvictAgentResponse:
         """End an agent's session and delete its data; with `ban` its later joins are refused."""
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         voxels = await self._work(self.engine.evict, request.agent_id, request.ban)
         self.publish_changes()
         _log.warning(
             "agent %s: %s, data of %d voxels deleted", request.agent_id, "banned" if request.ban else "evicted", voxels
         )
-        return pb.EvictAgentResponse(fused_revision=self.engine.revision, voxels=voxels)
+        return pb.EvictAgentResponse(fused_revision=self.engine.maps.revision(), voxels=voxels)
 
     async def UnbanAgent(self, request: pb.UnbanAgentRequest, context: Any) -> pb.UnbanAgentResponse:
         """Let a banned agent join again."""
-        self.engine.require_mission(request.mission_id)
+        self.engine.members.require_mission(request.mission_id)
         await self._work(self.engine.unban, request.agent_id)
         _log.warning("agent %s: may join again", request.agent_id)
         return pb.UnbanAgentResponse()
@@ -374,8 +374,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
 
     async def _session(self, session_id: str, caller: Caller) -> SessionRecord:
         """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""
-        if self.engine.known_session(session_id) is None:
-            # it may wait for the engine's lock, and so for the disk
+        if self.engine.members.sessions.known(session_id) is None:
+            # it asks the store
             return await self._work(messages.session_of, self.engine, session_id, caller)
         return messages.session_of(self.engine, session_id, caller)
 

@@ -17,6 +17,7 @@ from gausslite.config.values import read_path
 from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.limits import FusionSettings
 from gausslite.fusion.refinement import RefineSettings
+from gausslite.plugins import Group, names
 from gausslite.process import print_message
 from gausslite.render.choose import backends
 from gausslite.wire.channel import FUSION_ADDRESS, MAX_PORT, host_and_port, require_callable
@@ -29,12 +30,6 @@ STORE_SUFFIX = ".sqlite"
 _DATABASE = "postgresql://USER@HOST/DATABASE"
 """An example: the plug-in of a store has the name of the scheme."""
 _MAX_STORE_MB = 1 << 24
-_MAINTENANCE = (
-    ("backup", ("store", "target"), "copy a store to a new file and verify the copy; a server may be using it"),
-    ("restore", ("backup", "store"), "replace a store by a backup; the earlier file is kept under another name"),
-    ("verify", ("store",), "check every row; a server may be using the store"),
-)
-MAINTENANCE_COMMANDS = tuple(name for name, _, _ in _MAINTENANCE)
 
 
 class FrameUse(StrEnum):
@@ -117,17 +112,6 @@ OPTIONS = Program.of(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class MaintenanceSettings:
-    """A maintenance command of a store's file. other: the new copy of `backup`, the source of `restore`."""
-
-    command: str
-    store: Path
-    other: Path
-    json: bool
-    repair: bool
-
-
 def parse_arguments(arguments: Sequence[str] | None = None) -> ServerSettings:
     """Return the settings of the options. Raises InvalidInputError for values that are out of range."""
     options = parse_options(build_parser(), arguments, warn=print_message)
@@ -162,28 +146,8 @@ def build_parser() -> CommandParser:
         prog=PROGRAM,
         description="Store every agent's latest voxel updates and serve the fused map. In each voxel the agent with "
         "the largest sum of kappa (per Gaussian, the training steps in which it was visible and active) wins.",
-        epilog=f"Commands that maintain the file of a store: {', '.join(MAINTENANCE_COMMANDS)}. `{PROGRAM} COMMAND "
-        "--help` describes each.",
+        epilog=f"Commands that maintain the file of a store: {', '.join(names(Group.SERVER_COMMANDS))}. "
+        f"`{PROGRAM} COMMAND --help` describes each.",
     )
     OPTIONS.add_to(parser)
-    return parser
-
-
-def parse_maintenance(arguments: Sequence[str]) -> MaintenanceSettings:
-    """Return the settings of a maintenance command."""
-    options = _maintenance_parser().parse_args(arguments)
-    other = getattr(options, "target", None) or getattr(options, "backup", options.store)
-    return MaintenanceSettings(options.command, options.store, other, options.json, getattr(options, "repair", False))
-
-
-def _maintenance_parser() -> CommandParser:
-    parser = CommandParser(prog=PROGRAM, description="Maintain the file of a store.")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, paths, text in _MAINTENANCE:
-        command = commands.add_parser(name, help=text, description=text.capitalize() + ".")
-        for path in paths:
-            command.add_argument(path, type=Path, metavar=path.upper())
-        command.add_argument("--json", action="store_true", help="print one JSON object")
-        if name == "verify":
-            command.add_argument("--repair", action="store_true", help="delete the damaged rows; without a server")
     return parser

@@ -1,10 +1,11 @@
-"""Open the store of a server: memory, a SQLite file, or a database whose plug-in has the name of its URL's scheme."""
+"""What a server finds as plug-ins: its store, unless that is memory or a SQLite file, and what serves its figures."""
 
 from __future__ import annotations
 
-from contextlib import AbstractAsyncContextManager
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -12,8 +13,27 @@ from gausslite.fusion.store import FusionStore
 from gausslite.fusion.traffic import Acknowledgements
 from gausslite.plugins import Group, load
 from gausslite.wire.server import Service
-from gausslite_fusion_server.metrics import MessageCounts
 from gausslite_fusion_server.settings import ServerSettings
+
+
+class MessageCounts(NamedTuple):
+    """Of a server that shares a mission: messages of agents, parts sent to owners and stored as one, and parts refused
+    because their voxels are another server's.
+    """
+
+    received: int
+    sent: int
+    stored: int
+    foreign: int
+
+
+FindEngine = Callable[[], FusionEngine]
+FindCounts = Callable[[], MessageCounts]
+MetricsServer = Callable[[str, FindEngine, Acknowledgements, FindCounts | None], AbstractContextManager[int]]
+"""A plug-in of the group gausslite.metrics: serves the figures of a server at HOST:PORT; gives the actual port.
+
+Raises InvalidInputError for another address, UnavailableError if it is in use.
+"""
 
 
 class Share(Protocol):

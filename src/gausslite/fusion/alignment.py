@@ -16,8 +16,8 @@ from gausslite.domain.frame import Frame
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.frames import FrameAlignment
 from gausslite.fusion.keyframe_pool import KeyframePool
+from gausslite.fusion.score_index import AgentTotals
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import AgentTotals
 
 
 class TeamView:
@@ -44,7 +44,7 @@ class TeamView:
     def voxels(self, agent_id: str, keys: Int64[ndarray, " k"]) -> tuple[VoxelBatch, Int64[ndarray, " v"]]:
         """Return the agent's updates of these voxels, and their sequence numbers. Raises StorageError."""
         batch = self._store.batch(agent_id, keys)
-        return batch, self._store.stored(agent_id, batch.keys)["update_seqs"]
+        return batch, self._store.scores_of(agent_id, batch.keys)["update_seqs"]
 
     def keyframe_ids(self, agent_id: str) -> dict[int, int]:
         """Return the id of the agent's keyframe of each index; one that is received again has another id."""

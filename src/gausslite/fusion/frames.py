@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import Any
@@ -20,12 +19,11 @@ from numpy import ndarray
 
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, GaussLiteError
-from gausslite.domain.pose import inverse, require_rigid, rotation_angle_deg
+from gausslite.domain.pose import require_rigid
 from gausslite.fusion.store import FusionStore
 
 _log = logging.getLogger(__name__)
 RECORD = "alignment"
-_MAX_SEGMENTS = 200
 
 
 class AlignmentState(StrEnum):
@@ -135,114 +133,78 @@ class FrameAlignment:
         """Return T_fused_agent of a segment."""
         return self.declared if segment < 0 else self.segments[segment][1]
 
-    def corrected(self, fit: FrameFit, first_seq: int) -> FrameAlignment:
-        """Return the alignment with the fit's motion for the updates from first_seq on; the first one is for all."""
-        segment = (first_seq if self.segments else 0, fit.motion @ self.T_fused_agent)
-        return replace(self, fit=fit, against=(), segments=(*self.segments[1 - _MAX_SEGMENTS :], segment))
-
     def unlocalised(self, reason: str) -> FrameAlignment:
         """Return the alignment of an agent whose frame nobody knows; reason: why not."""
         message = f"frame unknown: not in the team's map yet{'; ' if reason else ''}{reason}"
         return FrameAlignment(self.order, AlignmentState.UNLOCALISED, message=message, is_unknown=True)
 
-    def localised(self, fit: FrameFit) -> FrameAlignment:
-        """Return the alignment with the frame that the server has found."""
-        found = replace(self, state=AlignmentState.CORRECTED, declared=fit.motion, segments=(), fit=fit, message="")
-        return found.in_state({}, is_quarantined=False, is_first=False)
-
-    def in_state(self, against: Mapping[str, FrameFit], is_quarantined: bool, is_first: bool) -> FrameAlignment:
-        """Return the alignment in the state that follows from its contradictions. is_first: no other defines a frame"""
-        if is_quarantined and self.is_unknown:
-            return self.unlocalised(f"its former place contradicts {', '.join(against)}")
-        message, last = "", self.fit if not self.against else None
-        if against:
-            name, last = next(iter(against.items()))
-            misfit = f"its surfaces are {1e3 * last.before.distance_m:.0f} mm away"
-            motion = f"{last.shift_m:.2f} m and {last.rotation_deg:.0f} deg would fit better"
-            message = (
-                f"frame: contradicts {', '.join(against)}: {motion if last.is_better else misfit} ({name}); check the "
-                f"agent's localisation, or declare its frame with fused-from-agent"
-            )
-        if is_quarantined:
-            state = AlignmentState.QUARANTINED
-        elif is_first:
-            state = AlignmentState.REFERENCE
-            if self.is_unknown:
-                message = message or "frame unknown: as the first agent, it defines the frame of the team's map"
-        elif self.segments or self.is_unknown:
-            state = AlignmentState.CORRECTED
-            found = "frame unknown: found by the server" if self.is_unknown else "frame: corrected"
-            message = message or f"{found}; {self._size()} in all"
-        else:
-            state = AlignmentState.UNKNOWN if last is None or against else AlignmentState.ALIGNED
-        return replace(self, state=state, message=message, against=tuple(against), fit=last)
-
-    def _size(self) -> str:
-        motion = self.T_fused_agent if self.is_unknown else self.T_fused_agent @ inverse(self.declared)
-        return (
-            f"{np.linalg.norm(motion[:3, 3]):.3f} m at the origin and {rotation_angle_deg(motion, np.eye(4)):.1f} deg"
-        )
-
 
 class FrameAlignments:
-    """The alignments of all agents; they persist with the store. Not thread-safe; FusionEngine holds a lock.
+    """The alignments of all agents; they persist with the store. Reads are safe in any thread, changes come one by one.
 
     An agent's frame has an id, which changes when another frame is declared, and with the agent's data. What is decided
     from copies of the data holds the id of the frame that it is for.
     """
 
-    def __init__(self, store: FusionStore) -> None:
-        self._store = store
-        self._by_agent = {agent_id: _decode(data) for agent_id, data in store.records(RECORD).items()}
+    def __init__(self, store: FusionStore, are_compared: bool) -> None:
+        """are_compared: an aligner corrects the frames; else they are used as declared."""
+        self._store, self.are_compared = store, are_compared
+        stored = store.records(RECORD).items()
+        # replaced by each change, so that no reader waits for a disk
+        self._frames = {agent_id: (number, _decode(data)) for number, (agent_id, data) in enumerate(stored, start=1)}
         self._contributors = set(store.agents())
-        self._frame_ids = {agent_id: number for number, agent_id in enumerate(self._by_agent, start=1)}
-        self._next_id = 1 + len(self._frame_ids)
-        self.unmoved: set[str] = set()
+        self._next_id = 1 + len(self._frames)
+        self.unmoved: frozenset[str] = frozenset()
         """Agents whose alignment is another one than that by which the vote has moved their maps."""
 
     def get(self, agent_id: str) -> FrameAlignment:
         """Return the agent's alignment."""
-        orders = (alignment.order for alignment in self._by_agent.values())
-        return self._by_agent.get(agent_id) or FrameAlignment(order=1 + max(orders, default=-1))
+        frames = self._frames
+        if agent_id in frames:
+            return frames[agent_id][1]
+        return FrameAlignment(order=1 + max((alignment.order for _, alignment in frames.values()), default=-1))
 
-    def __contains__(self, agent_id: str) -> bool:
-        return agent_id in self._by_agent
-
-    def frames(self) -> dict[str, tuple[int, FrameAlignment]]:
+    def by_rank(self) -> dict[str, tuple[int, FrameAlignment]]:
         """Return the id of each agent's frame, and its alignment, by rank."""
-        names = sorted(self._by_agent, key=lambda name: self._by_agent[name].rank)
-        return {name: (self._frame_ids[name], self._by_agent[name]) for name in names}
+        return dict(sorted(self._frames.items(), key=lambda own: own[1][1].rank))
 
     def add(self, agent_id: str, alignment: FrameAlignment) -> None:
         """Set the alignment of an agent in another frame than before. Raises StorageError."""
-        self._save(agent_id, alignment)
-        self._frame_ids[agent_id] = self._next_id
+        self._save(agent_id, self._next_id, alignment)
         self._next_id += 1
 
-    def contribute(self, agent_id: str, is_compared: bool) -> None:
+    def add_earlier(self, name: str, agent_id: str) -> None:
+        """Set the alignment of the agent's earlier map, which is in the fused frame. Raises StorageError."""
+        if name not in self._frames:
+            own = self.get(agent_id)
+            is_reference = own.state is AlignmentState.REFERENCE
+            state = AlignmentState.REFERENCE if is_reference else AlignmentState.ALIGNED
+            self.add(name, FrameAlignment(own.order, state, is_unknown=own.is_unknown))
+
+    def contribute(self, agent_id: str) -> None:
         """Note an update of the agent: its first one fixes its rank. Raises StorageError.
 
-        is_compared: the server compares frames. Before the first update of the first agent that knows its frame, what
-        was found without it is unknown again.
+        Before the first update of the first agent that knows its frame, what was found without it is unknown again.
         """
-        if is_compared:
+        if self.are_compared:
             self._end_provisional_frames(agent_id)
-        if agent_id not in self._by_agent:
-            is_first = not any(alignment.is_used for alignment in self._by_agent.values())
-            self.add(agent_id, self.get(agent_id).in_state({}, is_quarantined=False, is_first=is_first))
+        if agent_id not in self._frames:
+            is_first = not any(alignment.is_used for _, alignment in self._frames.values())
+            state = AlignmentState.REFERENCE if is_first else AlignmentState.UNKNOWN
+            self.add(agent_id, replace(self.get(agent_id), state=state))
         self._contributors.add(agent_id)
 
-    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None, reason: str = "") -> bool:
+    def declare(self, agent_id: str, T_fused_agent: Float64[ndarray, "4 4"] | None) -> bool:
         """Set the motion that the agent declares, None if it does not know its frame. Raises StorageError.
 
-        reason: why the server does not find an unknown frame. Returns whether the motion changed; what was found of an
-        unknown frame stays.
+        Returns whether the motion changed; what was found of an unknown frame stays.
         """
         current = self.get(agent_id)
         if T_fused_agent is None:
             if current.is_unknown:
                 return False
-            declared = current.unlocalised(reason)
+            trusts = "this server compares no frames (frame-alignment = trust, or no plug-in)"
+            declared = current.unlocalised("" if self.are_compared else trusts)
         elif current.is_unknown or not np.array_equal(current.declared, T_fused_agent):
             declared = FrameAlignment(current.order, declared=T_fused_agent)
         else:
@@ -257,55 +219,51 @@ class FrameAlignments:
         """
         if not self.has_frame(agent_id, frame_id):
             return
-        before = self._by_agent[agent_id]
-        self._save(agent_id, alignment)
+        before = self.get(agent_id)
+        self._save(agent_id, frame_id, alignment)
         if alignment.state is not before.state or alignment.message != before.message:
             level = logging.WARNING if alignment.against else logging.INFO
             reason = f": {alignment.message}" if alignment.message else ""
             _log.log(level, "agent %s is %s%s", quote_name(agent_id), alignment.state, reason)
         if not alignment.is_placed_as(before):
-            self.unmoved.add(agent_id)
+            self.unmoved |= {agent_id}
 
     def has_frame(self, agent_id: str, frame_id: int) -> bool:
         """Return whether the agent is still in this frame."""
-        return self._frame_ids.get(agent_id) == frame_id
+        return agent_id in self._frames and self._frames[agent_id][0] == frame_id
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete the alignment of the agent; the store deletes its record with its updates."""
-        self._by_agent.pop(agent_id, None)
-        self._frame_ids.pop(agent_id, None)
+        self._frames = {name: own for name, own in self._frames.items() if name != agent_id}
         self._contributors.discard(agent_id)
-        self.unmoved.discard(agent_id)
+        self.unmoved -= {agent_id}
 
     def transforms(self) -> dict[str, Float64[ndarray, "4 4"]]:
         """Return the latest T_fused_agent of the agents whose frame differs from the fused map's."""
-        return {
-            name: alignment.T_fused_agent for name, alignment in self._by_agent.items() if not alignment.is_identity
-        }
+        return {name: own.T_fused_agent for name, (_, own) in self._frames.items() if not own.is_identity}
 
     @property
     def unused(self) -> set[str]:
         """The agents whose contribution is not used."""
-        return {name for name, alignment in self._by_agent.items() if not alignment.is_used}
+        return {name for name, (_, own) in self._frames.items() if not own.is_used}
 
     @property
     def unlocalised(self) -> set[str]:
         """The agents whose frame nobody knows."""
-        return {name for name, alignment in self._by_agent.items() if not alignment.is_localised}
+        return {name for name, (_, own) in self._frames.items() if not own.is_localised}
 
     def _end_provisional_frames(self, agent_id: str) -> None:
-        names = self._contributors & self._by_agent.keys()
-        is_first = agent_id not in self._contributors and all(self._by_agent[name].is_unknown for name in names)
-        if not is_first or self.get(agent_id).is_unknown:
+        if agent_id in self._contributors or self.get(agent_id).is_unknown:
             return
-        for name, own in list(self._by_agent.items()):
-            if own.is_unknown and own.is_localised:
-                self.add(name, own.unlocalised(f"agent {agent_id} knows its frame, which is the team's now"))
-                self.unmoved.add(name)
+        if all(self.get(name).is_unknown for name in self._contributors & self._frames.keys()):
+            for name, (_, own) in self._frames.items():
+                if own.is_unknown and own.is_localised:
+                    self.add(name, own.unlocalised(f"agent {agent_id} knows its frame, which is the team's now"))
+                    self.unmoved |= {name}
 
-    def _save(self, agent_id: str, alignment: FrameAlignment) -> None:
+    def _save(self, agent_id: str, frame_id: int, alignment: FrameAlignment) -> None:
         self._store.save_record(agent_id, RECORD, json.dumps(asdict(alignment), default=np.ndarray.tolist).encode())
-        self._by_agent[agent_id] = alignment
+        self._frames = {**self._frames, agent_id: (frame_id, alignment)}
 
 
 def _decode(data: bytes) -> FrameAlignment:

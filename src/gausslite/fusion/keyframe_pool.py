@@ -73,19 +73,17 @@ class KeyframePool:
     def __len__(self) -> int:
         return sum(map(len, list(self._stored.values())))
 
-    def add(
-        self, keyframe: EncodedKeyframe, selected: Collection[int] = (), require: Callable[[], object] = lambda: None
-    ) -> None:
+    def add(self, keyframe: EncodedKeyframe, selected: Collection[int] = (), session_id: str | None = None) -> None:
         """Store the keyframe; delete the agent's keyframes that are not selected, and its oldest above the limits.
 
-        An empty `selected` deletes none. require: raises if the agent has left meanwhile. Raises QuotaError if this
-        keyframe alone exceeds a limit, StorageError.
+        An empty `selected` deletes none. Raises SessionUnknownError if a given session ends meanwhile, QuotaError if
+        this keyframe alone exceeds a limit, StorageError.
         """
         self._quotas.require_keyframe(keyframe.index, keyframe.pixels, len(keyframe.data))
         with self._changing:
             # from here on, `remove_agent` waits
             stored = dict(self._stored.setdefault(keyframe.agent_id, {}))
-            self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data, require)
+            self._store.save_keyframe(keyframe.agent_id, keyframe.index, keyframe.data, session_id)
             before = stored.get(keyframe.index)
             if before is not None and before.capture_time_ns != keyframe.capture_time_ns:
                 del stored[keyframe.index]

@@ -1,4 +1,4 @@
-"""Limit what a mission accepts: the number of agents, and the voxels, Gaussians, kappa and keyframes of each."""
+"""Limit what a mission accepts: its names and voxel size, the number of agents, and the data of each."""
 
 from __future__ import annotations
 
@@ -6,16 +6,66 @@ from dataclasses import dataclass, field, fields
 
 from gausslite.config.option import option
 from gausslite.config.values import VOXEL_SIZE
-from gausslite.domain.checks import require_identifier, require_name
-from gausslite.domain.errors import InvalidInputError, QuotaError
+from gausslite.domain.checks import quote_name, require_identifier, require_name
+from gausslite.domain.errors import InvalidInputError, MismatchError, QuotaError
 from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
 from gausslite.domain.voxels import VoxelGrid
-from gausslite.fusion.store_values import MissionConfig
 
 DEFAULT_LEASE_S = 60.0
 """Longer than a robot needs to notice a lost server and to reconnect, see wire/channel.py."""
 MAX_REFINE_ITERATIONS = 30_000
 """A larger number would occupy a server for hours with one request."""
+_DEFAULT_MISSION_ID, _DEFAULT_WORLD_FRAME = "mission", "world"
+
+
+@dataclass(frozen=True, slots=True)
+class MissionConfig:
+    """Common to all voxel updates of one store; the first agent that joins fixes it. Names may be empty until then."""
+
+    mission_id: str
+    world_frame: str
+    voxel_size_m: float
+
+    def with_default_names(self) -> MissionConfig:
+        """Return the configuration with "mission" and "world" in place of empty names."""
+        mission_id, world_frame = self.mission_id or _DEFAULT_MISSION_ID, self.world_frame or _DEFAULT_WORLD_FRAME
+        return MissionConfig(mission_id, world_frame, self.voxel_size_m)
+
+    @property
+    def given_world_frame(self) -> str:
+        """The world frame's name; empty if it is the default, because maps of different frames share that name."""
+        return "" if self.world_frame == _DEFAULT_WORLD_FRAME else self.world_frame
+
+
+def reconcile(own: MissionConfig, requested: MissionConfig) -> MissionConfig:
+    """Return the configuration that satisfies both sides; an empty name accepts the other side's.
+
+    Raises InvalidInputError if a requested name is not permitted, MismatchError if the sides differ.
+    """
+    if requested.mission_id:
+        require_identifier("mission_id", requested.mission_id)
+    require_name("world_frame", requested.world_frame)
+    if requested.voxel_size_m != own.voxel_size_m:
+        raise MismatchError(
+            f"voxel size: this mission votes on {own.voxel_size_m:g} m, got {requested.voxel_size_m:g} m"
+        )
+    for name, expected, received in (
+        ("world frame", own.world_frame, requested.world_frame),
+        ("mission", own.mission_id, requested.mission_id),
+    ):
+        if expected and received and expected != received:
+            raise MismatchError(f"{name}: expected {quote_name(expected)} as agreed here, got {quote_name(received)}")
+    return MissionConfig(
+        own.mission_id or requested.mission_id, own.world_frame or requested.world_frame, own.voxel_size_m
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRecord:
+    """An agent's permission to contribute, from joining until it leaves or joins again."""
+
+    session_id: str
+    agent_id: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ from threading import Lock
 from gausslite.domain import errors
 from gausslite.domain.checks import quote_name, require_identifier
 from gausslite.fusion.earlier_map import is_earlier_map
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord, reconcile
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig, SessionRecord, reconcile
 
 _log = logging.getLogger(__name__)
 RECORD = "ban"
@@ -23,37 +22,33 @@ _BANNED = b"banned"
 
 
 class BanList:
-    """Not thread-safe; FusionEngine holds a lock."""
+    """The banned agents. Reads are safe in any thread, changes come one by one."""
 
     def __init__(self, store: FusionStore) -> None:
         self._store = store
-        self._agents = {agent_id for agent_id, data in store.records(RECORD).items() if data == _BANNED}
-
-    @property
-    def agents(self) -> tuple[str, ...]:
-        """The banned agents, sorted."""
-        return tuple(sorted(self._agents))
+        self.agents = tuple(sorted(name for name, data in store.records(RECORD).items() if data == _BANNED))
+        """Sorted."""
 
     def require_allowed(self, agent_id: str) -> None:
         """Raise NotPermittedError for a banned agent."""
-        if agent_id in self._agents:
+        if agent_id in self.agents:
             raise errors.NotPermittedError(f"agent {quote_name(agent_id)}: banned by an operator of this server")
 
     def add(self, agent_id: str) -> None:
         """Ban an agent. Call it after the agent's other records were deleted. Raises StorageError."""
         self._store.save_record(agent_id, RECORD, _BANNED)
-        self._agents.add(agent_id)
+        self.agents = tuple(sorted({*self.agents, agent_id}))
 
     def remove(self, agent_id: str) -> None:
         """Allow a banned agent again. Raises InvalidInputError if it is not banned, StorageError."""
-        if agent_id not in self._agents:
+        if agent_id not in self.agents:
             expected = ", ".join(self.agents[:8]) or "none is banned"
             raise errors.InvalidInputError(
                 f"agent_id: expected a banned agent ({expected}), got {quote_name(agent_id)}"
             )
         # it has nothing else
         self._store.remove_agent(agent_id)
-        self._agents.remove(agent_id)
+        self.agents = tuple(name for name in self.agents if name != agent_id)
 
 
 _MAX_REPLACED_SESSIONS = 1000
@@ -62,7 +57,7 @@ _NAME_TAKEN = "another robot uses this name; give each its own agent id"
 
 
 class SessionRegistry:
-    """Opens, finds and ends sessions; they persist with the store. FusionEngine holds a lock, but not for `known`.
+    """Opens, finds and ends sessions; they persist with the store. Changes come one by one, reads in any thread.
 
     A lease lasts `lease_s` after the session's last use; clock_s: the time in seconds. Only a join with the token of
     the earlier one replaces a session before its lease has ended. The store has only the tokens' SHA-256. Sessions that
@@ -141,9 +136,11 @@ class SessionRegistry:
         session = self.known(session_id)
         if session is not None:
             return session
-        if (session_id, True) in self._replaced:
-            raise errors.MismatchError(f"session: {_NAME_TAKEN}")
-        if (session_id, False) in self._replaced:
+        with self._lock:
+            replaced = dict(self._replaced)
+        if session_id in replaced:
+            if replaced[session_id]:
+                raise errors.MismatchError(f"session: {_NAME_TAKEN}")
             error = errors.NameInUseError(f"session: {_NAME_TAKEN}")
             error.retry_after_s = self._lease_s
             raise error
@@ -197,7 +194,7 @@ def _hash(token: str) -> bytes:
 
 
 class Membership:
-    """Owns the mission's configuration, `sessions` and `bans`. Not thread-safe; FusionEngine holds a lock.
+    """Owns the mission's configuration, `sessions` and `bans`. Reads are safe in any thread, changes come one by one.
 
     Raises MismatchError if the store belongs to another mission configuration, StorageError.
     """
@@ -214,6 +211,14 @@ class Membership:
     def mission_config(self) -> MissionConfig:
         """The mission's configuration, with default names in place of empty ones."""
         return self._mission_config.with_default_names()
+
+    def require_mission(self, mission_id: str) -> None:
+        """Raise MismatchError unless the id is this mission's, or empty."""
+        own = self.mission_config.mission_id
+        if mission_id and mission_id != own:
+            raise errors.MismatchError(
+                f"mission: expected {quote_name(own)} as agreed here, got {quote_name(mission_id)}"
+            )
 
     @property
     def sources(self) -> frozenset[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -30,6 +30,7 @@ from gausslite.domain.objects import (
 )
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.fusion.limits import SessionRecord
 from gausslite.fusion.store import FusionStore
 from gausslite.nouns import same_kind
 
@@ -232,13 +233,13 @@ class TeamObjects:
         self._reports: dict[str, tuple[bytes, ObjectReport]] = {}
         self._read()
 
-    def report(self, agent_id: str, report: ObjectReport, require: Callable[[], object] = lambda: None) -> None:
-        """Replace the agent's report. require: raises if the agent has left meanwhile. Raises StorageError."""
+    def report(self, session: SessionRecord, report: ObjectReport) -> None:
+        """Replace the agent's report. Raises SessionUnknownError if the session has ended, StorageError."""
         encoded = encode_object_report(report)
         with self._changing:
-            require()
-            self._store.save_record(agent_id, RECORD, encoded)
-            self._reports[agent_id] = encoded, report
+            self._store.require_session(session.session_id)
+            self._store.save_record(session.agent_id, RECORD, encoded)
+            self._reports[session.agent_id] = encoded, report
 
     def of_task(self, agent_id: str, graph: TaskGraph) -> tuple[ObjectLandmark, ...]:
         """Return the objects that the agent has reported for an equivalent task; empty for another task."""

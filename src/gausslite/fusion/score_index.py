@@ -7,19 +7,76 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from itertools import repeat
 from operator import or_
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Int32, Int64, UInt64
 from numpy import ndarray
+from numpy.typing import NDArray
 
 from gausslite.codec.stored import RECORD, to_records
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels, join_elements
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch
-from gausslite.fusion.store_values import NO_SCORES, SCORES, AgentTotals, Scores, VoxelScoreTable
+
+SCORES = np.dtype([("keys", "i8"), ("update_seqs", "i8"), ("kappa_sums", "u8"), ("counts", "u4"), ("rows", "i8")])
+Scores = NDArray[Any]
+"""An element of SCORES for each of an agent's updates: its totals, and the store's row that has its Gaussians.
+
+update_seq and row are -1 where the agent has no update of a voxel.
+"""
+NO_SCORES: Scores = np.zeros(0, SCORES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelScoreTable:
+    """The totals of every update (tombstones included) without the Gaussians: the input of the vote.
+
+    agent_index holds indices into `agents`, which is sorted; the scores are sorted by (agent, key).
+    """
+
+    agents: tuple[str, ...]
+    agent_index: Int32[ndarray, " w"]
+    scores: Scores
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def take(self, places: Int64[ndarray, " s"]) -> VoxelScoreTable:
+        """Return the scores at these places."""
+        return VoxelScoreTable(self.agents, self.agent_index[places], self.scores.take(places))
+
+
+@dataclass(frozen=True, slots=True)
+class AgentTotals:
+    """Sums over an agent's updates: voxels with and without tombstones, Gaussians, Σkappa; the highest update_seq."""
+
+    voxels: int = 0
+    occupied_voxels: int = 0
+    gaussians: int = 0
+    kappa_sum: int = 0
+    highest_update_seq: int = 0
+
+    def replace_part(self, removed: Scores, added: Scores) -> AgentTotals:
+        """Return the totals after `added` replaced `removed`."""
+        counts, counts_before = added["counts"], removed["counts"]
+        return AgentTotals(
+            self.voxels + len(added) - int(np.count_nonzero(removed["update_seqs"] >= 0)),
+            self.occupied_voxels + int(np.count_nonzero(counts)) - int(np.count_nonzero(counts_before)),
+            self.gaussians + int(counts.sum(dtype=np.int64)) - int(counts_before.sum(dtype=np.int64)),
+            self.kappa_sum + _exact_sum(added["kappa_sums"]) - _exact_sum(removed["kappa_sums"]),
+            max(self.highest_update_seq, int(added["update_seqs"].max(initial=0))),
+        )
+
+
+def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
+    """Return a sum that cannot wrap around."""
+    return sum(values.tolist())
+
 
 _FIRST_CAPACITY = 64
 _MISSING = np.zeros((), SCORES)
@@ -48,7 +105,7 @@ class ScoreIndex:
         scores = self.sorted_scores(agent_id)
         return TileDigests.of(scores["keys"], scores["update_seqs"])
 
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
+    def scores_of(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels, in their order."""
         rows = self._rows.get(agent_id, _NO_ROWS)
         return rows.stored(rows.find(keys))
@@ -103,7 +160,7 @@ def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadVoxels) -> B
     does not depend on the order of arrival.
     """
     keys, table = update.voxels.keys, update.voxels.voxels
-    stored = index.stored(update.agent_id, keys)
+    stored = index.scores_of(update.agent_id, keys)
     newer: Bool[ndarray, " v"] = stored["update_seqs"] < update.update_seq
     same_seq = stored["update_seqs"] == update.update_seq
     if same_seq.any():

@@ -10,12 +10,12 @@ import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from threading import Event, RLock, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.store import TABLES, Execute, FusionStore
-from gausslite.fusion.store_rows import LogChange, require_intact
+from gausslite.fusion.update_log import LogChange, require_intact
 
 IN_MEMORY = Path(":memory:")
 """The name of a database that ends with its connection."""
@@ -176,10 +176,10 @@ class SqliteStore(FusionStore):
         self._path = path
         with ExitStack() as opened:
             self._writer = self._reader = _open(path, opened)
-            # one connection for both in memory
-            self._read_lock = self._write_lock
+            # held for a transaction, and for a query; one connection for both in memory
+            self._write_lock = self._read_lock = Lock()
             if path != IN_MEMORY:
-                self._read_lock = RLock()
+                self._read_lock = Lock()
                 self._reader = opened.enter_context(contextlib.closing(connect(path)))
             if max_bytes is not None:
                 self._writer.execute(f"PRAGMA max_page_count = {max(1, max_bytes // PAGE_BYTES)}")
@@ -197,7 +197,9 @@ class SqliteStore(FusionStore):
         if self._checkpoints.is_alive():
             # before the lock, for which it may wait
             self._checkpoints.join()
-        with self._write_lock, self._read_lock:
+        with ExitStack() as held:
+            for lock in dict.fromkeys((self._write_lock, self._read_lock)):
+                held.enter_context(lock)
             self._opened.close()
 
     def _copy_log(self) -> None:

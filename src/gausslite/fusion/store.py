@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import astuple
 from functools import partial
-from threading import RLock
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -23,17 +23,18 @@ from jaxtyping import Int64
 from numpy import ndarray
 
 from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.domain.errors import GaussLiteError, StorageError
+from gausslite.domain.errors import GaussLiteError, SessionUnknownError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
-from gausslite.fusion.store_rows import LogChange, SlotsOf, UpdateLog, data_checksum, read_batches
-from gausslite.fusion.store_values import (
-    AgentTotals,
-    MissionConfig,
+from gausslite.fusion.limits import MissionConfig, SessionRecord
+from gausslite.fusion.score_index import AgentTotals, Scores, VoxelScoreTable
+from gausslite.fusion.update_log import (
+    LogChange,
     PutOutcome,
-    Scores,
-    SessionRecord,
-    VoxelScoreTable,
+    SlotsOf,
+    UpdateLog,
+    batch_of,
+    data_checksum,
     require_storable,
 )
 
@@ -51,6 +52,7 @@ CREATE TABLE properties (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 """
 """Those that SQLite and PostgreSQL have in common; SQLite takes any name of a type."""
 _PART_BYTES = 1 << 19
+_READ_ATTEMPTS = 20
 # nothing, if a connection was lost after the commit and the work is done again
 _INSERT_PART = "INSERT INTO keyframes VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING"
 _DELETE_KEYFRAME = "DELETE FROM keyframes WHERE agent_id = ? AND frame_index = ?"
@@ -92,7 +94,8 @@ class FusionStore(ABC):
     """Whether other servers have parts of it."""
 
     def __init__(self, slots_of: SlotsOf = np.zeros_like) -> None:
-        self._write_lock, self._index_lock = RLock(), RLock()
+        # the first is held while a change of the log is planned, written and applied; the second for a moment
+        self._log_lock, self._index_lock = Lock(), Lock()
         self._log = UpdateLog(slots_of)
         self.incarnation_id = ""
 
@@ -104,7 +107,7 @@ class FusionStore(ABC):
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
         for update in updates:
             require_storable(update)
-        with self._write_lock:
+        with self._log_lock:
             change = self._log.plan(updates, self._read_rows)
             if change.rows:
                 self._write(partial(self._write_change, change))
@@ -120,7 +123,7 @@ class FusionStore(ABC):
             for table in ("keyframes", "records") if self._is_home(agent_id) else ():
                 execute(f"DELETE FROM {table} WHERE agent_id = ?", (agent_id,))  # noqa: S608 - constant names
 
-        with self._write_lock:
+        with self._log_lock:
             self._write(delete)
             with self._index_lock:
                 return self._log.remove_agent(agent_id)
@@ -144,10 +147,10 @@ class FusionStore(ABC):
         with self._index_lock:
             return np.ascontiguousarray(self._log.index.sorted_scores(agent_id)["keys"])
 
-    def stored(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
+    def scores_of(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels, in their order."""
         with self._index_lock:
-            return self._log.index.stored(agent_id, keys)
+            return self._log.index.scores_of(agent_id, keys)
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return all agents' totals on these voxels, or on all."""
@@ -156,11 +159,23 @@ class FusionStore(ABC):
 
     def batch(self, agent_id: str, keys: Int64[ndarray, " k"] | None = None) -> VoxelBatch:
         """Return an agent's updates (with tombstones) of these voxels, or of all; empty for an unknown agent."""
-        return read_batches(self._log, self._index_lock, self._read_rows, keys, (agent_id,))[agent_id]
+        return self._batches(keys, (agent_id,))[agent_id]
 
     def batches(self, keys: Int64[ndarray, " k"] | None = None) -> dict[str, VoxelBatch]:
         """Return the batch of every agent, all read at one instant."""
-        return read_batches(self._log, self._index_lock, self._read_rows, keys)
+        return self._batches(keys)
+
+    def _batches(self, keys: Int64[ndarray, " k"] | None, agents: Sequence[str] | None = None) -> dict[str, VoxelBatch]:
+        for _ in range(_READ_ATTEMPTS):
+            with self._index_lock:
+                names = self._log.index.agents if agents is None else agents
+                places = {agent_id: self._log.places(agent_id, keys) for agent_id in names}
+            numbers = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for _, rows in places.values())]))
+            data = self._read_rows(numbers.tolist()) if len(numbers) else {}
+            # rows may have been moved after the index was asked
+            if len(data) == len(numbers):
+                return {agent_id: batch_of(keys, rows, data) for agent_id, (keys, rows) in places.items()}
+        raise StorageError(f"store: expected rows that the index names, got {len(data)} of {len(numbers)}; try again")
 
     def mission_config(self) -> MissionConfig | None:
         """Return the mission's configuration; None before an agent has joined."""
@@ -181,6 +196,11 @@ class FusionStore(ABC):
         rows = self._read(f"{_SELECT_RECORDS} AND data = ?", (_SESSION, session_id.encode()))
         return next((SessionRecord(session_id, agent_id) for agent_id in self._intact(_SESSION, rows)), None)
 
+    def require_session(self, session_id: str) -> None:
+        """Raise SessionUnknownError unless the session is open, so that nothing is stored of an agent that is gone."""
+        if self.find_session(session_id) is None:
+            raise SessionUnknownError("session: has ended; join again")
+
     def save_session(self, session: SessionRecord) -> None:
         """Store a session; it replaces any other session of the same agent."""
         self.save_record(session.agent_id, _SESSION, session.session_id.encode())
@@ -190,13 +210,12 @@ class FusionStore(ABC):
         query = "DELETE FROM records WHERE name = ? AND data = ?"
         self._write(lambda execute: execute(query, (_SESSION, session_id.encode())))
 
-    def save_keyframe(
-        self, agent_id: str, index: int, data: bytes, require: Callable[[], object] = lambda: None
-    ) -> None:
+    def save_keyframe(self, agent_id: str, index: int, data: bytes, session_id: str | None = None) -> None:
         """Store an encoded keyframe; it replaces the agent's one of this frame index. One thread for each keyframe.
 
         A large one takes several transactions, so that others need not wait for all of it. It exists, in place of the
-        earlier one, after the last part. If one fails, or `require` raises before it, the parts are deleted.
+        earlier one, after the last part. If one fails, or the session, if one is given, ends before it, the parts are
+        deleted. Raises SessionUnknownError, StorageError.
         """
         parts = [data[start : start + _PART_BYTES] for start in range(0, max(len(data), 1), _PART_BYTES)]
         key = agent_id, index
@@ -213,7 +232,7 @@ class FusionStore(ABC):
             execute(_INSERT_PART, (*key, version, part, len(parts), checksum, parts[part]))
 
         try:
-            self._write_slowly([partial(insert, part) for part in range(len(parts))], require)
+            self._write_slowly([partial(insert, part) for part in range(len(parts))], session_id)
         except GaussLiteError:
             # else they would take the space of other messages
             with suppress(GaussLiteError):
@@ -223,12 +242,11 @@ class FusionStore(ABC):
             # else the next start deletes them
             self._write_slowly([partial(delete, part) for part in sorted({part for _, part in before} - {0})])
 
-    def _write_slowly(
-        self, steps: Sequence[Callable[[Execute], None]], require: Callable[[], object] = lambda: None
-    ) -> None:
-        """Do each step in a transaction of its own, after `require`, with pauses for others."""
+    def _write_slowly(self, steps: Sequence[Callable[[Execute], None]], session_id: str | None = None) -> None:
+        """Do each step in a transaction of its own while the session is open, with pauses for others."""
         for number, step in enumerate(steps):
-            require()
+            if session_id is not None:
+                self.require_session(session_id)
             begin_s = time.monotonic()
             self._write(step)
             if number + 1 < len(steps):

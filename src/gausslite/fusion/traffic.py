@@ -12,8 +12,9 @@ from threading import Lock
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.fusion.frames import FrameAlignment
+from gausslite.fusion.limits import MissionConfig
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig, PutOutcome
+from gausslite.fusion.update_log import PutOutcome
 
 _PROBE_BYTES = 256 << 10
 # no agent can have an empty id

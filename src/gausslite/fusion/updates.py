@@ -24,19 +24,12 @@ from gausslite.domain.errors import StorageError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import Quotas
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import PutOutcome
+from gausslite.fusion.update_log import PutOutcome, require_storable
 
 MAX_SEQ_STEP = 1 << 32
 """An honest agent counts its messages; a larger step would let one message use up all later numbers."""
 RECORD = "first-joined"
 _SECONDS = struct.Struct("<d")
-
-
-def decode_own(message: bytes, agent_id: str, grid: VoxelGrid) -> StoredSubset:
-    """Return an agent's message as a store keeps it. Raises CodecError, ChecksumError and as `require_own`."""
-    subset, own_grid = decode_stored(message)
-    require_own(agent_id, subset.agent_id, own_grid, grid)
-    return subset
 
 
 def require_own(agent_id: str, named: str, grid: VoxelGrid, expected: VoxelGrid) -> None:
@@ -86,7 +79,7 @@ class MissionClock:
 
 
 class UpdateChecks:
-    """Knows when each agent first joined. Not thread-safe; FusionEngine holds a lock.
+    """Knows when each agent first joined. Not thread-safe: FusionEngine calls it for one change at a time.
 
     The first joins persist with the store, those at its other servers too. clock_s: the mission's time in seconds.
     """
@@ -102,11 +95,13 @@ class UpdateChecks:
             self._store.save_record(agent_id, RECORD, _SECONDS.pack(now_s))
             self._first_joined_s[agent_id] = now_s
 
-    def require_plausible(self, subset: StoredSubset) -> None:
-        """Raise InvalidInputError for a sequence number too far above the stored ones, QuotaError for a kappa.
+    def require_permitted(self, subset: StoredSubset) -> None:
+        """Raise InvalidInputError for a number that a store cannot keep, or a sequence number far above those before.
 
-        No robot can have reached a kappa above the bound, which grows with the time since its first join.
+        Raises QuotaError for a kappa that no robot can have reached, as the bound grows with the time since its first
+        join, and for more voxels (with tombstones) or Gaussians than an agent may have.
         """
+        require_storable(subset)
         name, highest = quote_name(subset.agent_id), self._store.totals(subset.agent_id).highest_update_seq
         if subset.update_seq > highest + MAX_SEQ_STEP:
             raise errors.InvalidInputError(
@@ -117,6 +112,24 @@ class UpdateChecks:
             raise errors.QuotaError(
                 f"agent {name}: expected a kappa of at most {bound} this long after its first join, got {largest}"
             )
+
+        self._require_within_quotas(subset)
+
+    def _require_within_quotas(self, subset: StoredSubset) -> None:
+        """Raise QuotaError if the agent would have too many voxels (with tombstones) or Gaussians."""
+        stored = self._store.scores_of(subset.agent_id, subset.voxels.keys)
+        totals = self._store.totals(subset.agent_id)
+        # equal numbers count as newer: a larger content replaces the stored one, and a duplicate adds nothing
+        newer = stored["update_seqs"] <= subset.update_seq
+        added = subset.voxels.counts[newer].sum(dtype=np.int64) - stored["counts"][newer].sum(dtype=np.int64)
+        for name, value, limit in (
+            ("voxels", totals.voxels + int(np.count_nonzero(stored["update_seqs"] < 0)), self._quotas.voxels_per_agent),
+            ("Gaussians", totals.gaussians + int(added), self._quotas.gaussians_per_agent),
+        ):
+            if value > limit:
+                raise errors.QuotaError(
+                    f"agent {quote_name(subset.agent_id)}: expected at most {limit} {name} in all, got {value}"
+                )
 
     def remove_agent(self, agent_id: str) -> None:
         """Delete what is known of the agent; the store deletes its records."""
@@ -139,6 +152,8 @@ _MESSAGE_BYTES = 1024
 _MAX_PENDING, _AGENT_BYTES = 64, 4 << 20
 """Of one agent; a robot waits for each acknowledgement, so it has one or two."""
 _TOTAL_BYTES = 64 << 20
+_GROUP_BYTES = 1 << 19
+"""Of about 20 messages of a robot; a message that comes during a commit waits for its end."""
 _LATE_S, _LATE_LOG_S = 2.0, 10.0
 _log = logging.getLogger(__name__)
 
@@ -181,6 +196,18 @@ class PendingUpdate:
         voxels = self.message.voxels
         share = min(SLICE_VOXELS / max(len(voxels), 1), 1.0)
         return _MESSAGE_BYTES + int(share * (voxels.voxels.nbytes + voxels.gaussians.nbytes))
+
+    def decode(self, grid: VoxelGrid) -> None:
+        """Decode the message, as a store keeps it; the future of one that cannot be decoded has the error."""
+        if isinstance(self.message, StoredSubset):
+            return
+        try:
+            subset, own_grid = decode_stored(self.message)
+            require_own(self.agent_id, subset.agent_id, own_grid, grid)
+            self.message = subset
+        except Exception as error:
+            # the thread decodes the messages of several agents
+            self.fail(error)
 
     def next_slice(self) -> StoredSubset:
         """Return the part of the message to store next."""
@@ -226,8 +253,8 @@ class UpdateQueue:
         self._finish: dict[str, float] = {}
         # the bytes that each waiting agent would have had
         self._round = 0.0
-        self._arrivals = 0
-        self._bytes = 0
+        self._arrivals = self._bytes = 0
+        self._next_log_s = 0.0
 
     def add(self, update: PendingUpdate) -> None:
         """Queue a message. Raises UnavailableError if its agent, or all agents together, have too many."""
@@ -256,7 +283,7 @@ class UpdateQueue:
         """Whether `take` would return a message."""
         return bool(self._waiting)
 
-    def take(self, max_bytes: int) -> list[PendingUpdate]:
+    def take(self, max_bytes: int = _GROUP_BYTES) -> list[PendingUpdate]:
         """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue.
 
         Together they cost `max_bytes` at most, so that small messages do not wait for a large one in their group.
@@ -276,14 +303,15 @@ class UpdateQueue:
                 # it is decoded now
                 self._bytes -= update.encoded_bytes
                 taken.append(update)
+                self._log_if_late(update)
         return taken
 
-    def put_back(self, update: PendingUpdate, is_done: bool) -> None:
-        """Let the agent of a taken message wait for its next slice, or for its next message."""
+    def put_back(self, update: PendingUpdate) -> None:
+        """Let the agent of a taken message wait for its next slice or, if this one has its answer, its next message."""
         agent_id = update.agent_id
         with self._lock:
             own = self._pending[agent_id]
-            if is_done:
+            if update.future.done():
                 own.popleft()
             if own:
                 self._wait(agent_id)
@@ -294,58 +322,19 @@ class UpdateQueue:
                 self._finish.clear()
                 self._round = 0.0
 
+    def _log_if_late(self, update: PendingUpdate) -> None:
+        now_s = time.monotonic()
+        if update.encoded_bytes and now_s - update.queued_s > _LATE_S and now_s >= self._next_log_s:
+            self._next_log_s = now_s + _LATE_LOG_S
+            _log.warning(
+                "messages are late: one of agent %s has waited %.1f s", update.agent_id, now_s - update.queued_s
+            )
+
     def _wait(self, agent_id: str) -> None:
         finish = max(self._round, self._finish.get(agent_id, 0.0)) + self._pending[agent_id][0].cost
         self._finish[agent_id] = finish
         self._arrivals += 1
         heapq.heappush(self._waiting, (finish, self._arrivals, agent_id))
-
-
-_GROUP_BYTES = 1 << 19
-"""Of about 20 messages of a robot; a message that comes during a commit waits for its end."""
-
-
-class UpdateIngest:
-    """The queue of received messages, which are decoded when it is their agents' turn. Thread-safe."""
-
-    def __init__(self, grid: VoxelGrid) -> None:
-        self._grid = grid
-        self._queue = UpdateQueue()
-        self._next_log_s = 0.0
-
-    def add(self, update: PendingUpdate) -> Future[PutOutcome]:
-        """Queue a message; the future has its outcome after a commit. Raises UnavailableError."""
-        self._queue.add(update)
-        return update.future
-
-    def take(self) -> list[PendingUpdate]:
-        """Return the next group, decoded, or none; its messages stay in the queue until `put_back`.
-
-        The future of a message that cannot be decoded has the error.
-        """
-        group = self._queue.take(_GROUP_BYTES)
-        for update in group:
-            self._log_if_late(update)
-            try:
-                if isinstance(update.message, bytes):
-                    update.message = decode_own(update.message, update.agent_id, self._grid)
-            except Exception as error:
-                # a group has messages of several agents
-                update.fail(error)
-        return group
-
-    def put_back(self, group: Sequence[PendingUpdate]) -> None:
-        """Let the agents of a group wait for their next slices, or for their next messages."""
-        for update in group:
-            self._queue.put_back(update, update.future.done())
-
-    def _log_if_late(self, update: PendingUpdate) -> None:
-        now_s = time.monotonic()
-        if isinstance(update.message, bytes) and now_s - update.queued_s > _LATE_S and now_s >= self._next_log_s:
-            self._next_log_s = now_s + _LATE_LOG_S
-            _log.warning(
-                "messages are late: one of agent %s has waited %.1f s", update.agent_id, now_s - update.queued_s
-            )
 
 
 def store_slices(store: FusionStore, group: Sequence[PendingUpdate]) -> list[tuple[PendingUpdate, PutOutcome]]:
@@ -364,19 +353,3 @@ def store_slices(store: FusionStore, group: Sequence[PendingUpdate]) -> list[tup
             return [stored for update in group for stored in store_slices(store, [update])]
         group[0].fail(error)
         return []
-
-
-def require_within_quotas(subset: StoredSubset, store: FusionStore, quotas: Quotas) -> None:
-    """Raise QuotaError if the agent would have too many voxels (with tombstones) or Gaussians."""
-    stored, totals = store.stored(subset.agent_id, subset.voxels.keys), store.totals(subset.agent_id)
-    # equal numbers count as newer: a larger content replaces the stored one, and a duplicate adds nothing
-    newer = stored["update_seqs"] <= subset.update_seq
-    added = subset.voxels.counts[newer].sum(dtype=np.int64) - stored["counts"][newer].sum(dtype=np.int64)
-    for name, value, limit in (
-        ("voxels", totals.voxels + int(np.count_nonzero(stored["update_seqs"] < 0)), quotas.voxels_per_agent),
-        ("Gaussians", totals.gaussians + int(added), quotas.gaussians_per_agent),
-    ):
-        if value > limit:
-            raise errors.QuotaError(
-                f"agent {quote_name(subset.agent_id)}: expected at most {limit} {name} in all, got {value}"
-            )

@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelScore, VoxelVotes, gather_rows, group_by_voxel
-from gausslite.fusion.store_values import SCORES, VoxelScoreTable
+from gausslite.fusion.score_index import SCORES, VoxelScoreTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)

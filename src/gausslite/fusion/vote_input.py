@@ -11,8 +11,8 @@ from numpy import ndarray
 from gausslite.domain.gaussians import Gaussians, move_gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, select_keys, select_voxels
 from gausslite.fusion.frames import FrameAlignment
+from gausslite.fusion.score_index import SCORES, VoxelScoreTable
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import SCORES, VoxelScoreTable
 
 SLICE_VOXELS = 128
 _Cells = dict[int, tuple[int, int]]
@@ -167,7 +167,7 @@ class VoteInput:
     def _gaussians_in_frame(self, agent_id: str, batch: VoxelBatch) -> Gaussians:
         """Return the Gaussians in the fused frame, in their order."""
         alignment = self._frames.get(agent_id, FrameAlignment(0))
-        segments = alignment.segment_of(self._store.stored(agent_id, batch.keys)["update_seqs"])
+        segments = alignment.segment_of(self._store.scores_of(agent_id, batch.keys)["update_seqs"])
         used = np.unique(segments)
         if len(used) == 1:
             return move_gaussians(batch.gaussians, alignment.transform(int(used[0])))

@@ -112,7 +112,7 @@ def compare_store(agents: Mapping[str, AgentAcknowledgements], store: Path) -> S
 
 def _compare_agent(agent_id: str, acknowledged: AgentAcknowledgements, store: SqliteStore) -> StoreComparison:
     batch = store.batch(agent_id)
-    seqs = store.stored(agent_id, batch.keys)["update_seqs"].tolist()
+    seqs = store.scores_of(agent_id, batch.keys)["update_seqs"].tolist()
     held = {
         key: StoredVoxel(seq, kappa_sum, records)
         for key, seq, kappa_sum, records in zip(

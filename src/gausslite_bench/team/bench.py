@@ -10,10 +10,9 @@ import numpy as np
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, select_voxels
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
 from gausslite.fusion.refinement import RefineSettings, refine
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite.mission.settings import MissionSettings
 from gausslite.render.choose import choose_rasterizer
 from gausslite.render.map_viewer import MapViewer

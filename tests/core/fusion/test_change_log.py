@@ -14,9 +14,8 @@ from gausslite.domain.errors import RevisionGoneError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batch, merge_batches, select_voxels
 from gausslite.fusion.change_log import ChangeLog
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.vote import FusedMap, fuse, rank_voxels
 
 GRID = VoxelGrid(0.10)

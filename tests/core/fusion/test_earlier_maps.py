@@ -10,10 +10,9 @@ from fusion_running import GRID, keys, make_subset
 from gausslite.domain.errors import InvalidInputError
 from gausslite.fusion.earlier_map import earlier_map_of
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
 EARLIER = "ant:earlier"
@@ -47,14 +46,14 @@ def test_an_earlier_map_stays_until_it_is_outgrown_also_after_a_restart(tmp_path
     send(engine, session, 1, {0: [1], 1: [30], 30: [2]})
     expected = {**dict.fromkeys(range(20), 20), 1: 30, 30: 2}
     assert fused_kappas(engine) == expected
-    engine.close()
+    engine.store.close()
     engine = engine_on(SqliteStore(tmp_path / "store.sqlite"))
     assert fused_kappas(engine) == expected
     assert {each.agent_id: each.won_voxels for each in engine.status().agents} == {"ant": 2, EARLIER: 19}
     send(engine, session, 2, {cell: [25] for cell in range(20)})
     assert [each.agent_id for each in engine.status().agents] == ["ant"]
     assert fused_kappas(engine) == {**dict.fromkeys(range(20), 25), 30: 2}
-    engine.close()
+    engine.store.close()
 
 
 def test_a_tombstone_of_the_new_map_leaves_the_earlier_one() -> None:
@@ -80,7 +79,7 @@ def test_of_many_maps_two_are_stored_and_the_best_of_each_voxel_stays() -> None:
 def test_watchers_get_what_a_new_map_changes() -> None:
     engine = engine_on()
     send(engine, reboot(engine), 1, {0: [5], 1: [5]})
-    revision = engine.revision
+    revision = engine.maps.revision()
     session = reboot(engine)
     send(engine, session, 1, {1: [9]})
     changes = engine.maps.changes(revision)

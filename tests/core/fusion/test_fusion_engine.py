@@ -24,9 +24,8 @@ from gausslite.domain.pose import transform_of
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, group_by_voxel, merge_batches, tombstones
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas, reconcile
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig, reconcile
 from gausslite.fusion.traffic import TrafficCounters
 
 GRID = VoxelGrid(0.10)
@@ -75,13 +74,13 @@ def test_a_mission_without_updates_has_an_empty_map() -> None:
     assert len(engine.maps.voted_map()) == len(engine.maps.union_map()) == 0
     assert engine.status().agents == ()
     assert len(engine.maps.changes().won.batch) == 0
-    engine.close()
+    engine.store.close()
 
 
 def test_the_first_agent_that_names_the_mission_fixes_it() -> None:
     engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     engine.join("ant", ANYTHING)
-    assert engine.mission_config == MissionConfig("mission", "world", 0.10)
+    assert engine.members.mission_config == MissionConfig("mission", "world", 0.10)
     with pytest.raises(MismatchError, match="'world' as agreed here, got 'odom'"):
         engine.join("bee", MissionConfig("", "odom", 0.10))
     assert reconcile(MissionConfig("", "", 0.1), MissionConfig("a", "b", 0.1)) == MissionConfig("a", "b", 0.1)
@@ -121,8 +120,8 @@ def test_every_error_message_is_one_short_line() -> None:
         lambda: engine.join("", ANYTHING),
         lambda: engine.join("bee", MissionConfig(LONG, "", 0.10)),
         lambda: engine.join("bee", MissionConfig("", "line\nbreak", 0.10)),
-        lambda: engine.require_mission(LONG),
-        lambda: engine.session(LONG),
+        lambda: engine.members.require_mission(LONG),
+        lambda: engine.members.sessions.get(LONG),
         lambda: engine.maps.voted_map(LONG),
         lambda: engine.maps.union_map("line\nbreak"),
         lambda: engine.contribute(ant, make_subset(LONG, 1, []), GRID),
@@ -133,7 +132,7 @@ def test_every_error_message_is_one_short_line() -> None:
         assert len(str(caught.value)) < 300
         assert "\n" not in str(caught.value)
     with pytest.raises(SessionUnknownError, match="join again"):
-        engine.session("gone")
+        engine.members.sessions.get("gone")
 
 
 def test_a_slow_disk_delays_no_question_about_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,10 +149,12 @@ def test_a_slow_disk_delays_no_question_about_a_session(monkeypatch: pytest.Monk
     monkeypatch.setattr(store, "save_record", save_slowly)
     report = ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ())
     with ThreadPoolExecutor(2) as threads:
-        reported = threads.submit(engine.report_objects, session.session_id, report)
+        reported = threads.submit(engine.objects.report, session, report)
         assert begun.wait(60)
         try:
-            found = threads.submit(lambda: (engine.session(session.session_id), engine.mission_config.mission_id))
+            found = threads.submit(
+                lambda: (engine.members.sessions.get(session.session_id), engine.members.mission_config.mission_id)
+            )
             assert found.result(30) == (session, "rescue")
         finally:
             released.set()

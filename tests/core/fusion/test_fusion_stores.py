@@ -25,10 +25,10 @@ from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, gather_rows, select_keys
 from gausslite.fusion.keyframe_pool import KeyframePool
-from gausslite.fusion.limits import Quotas
+from gausslite.fusion.limits import MissionConfig, Quotas, SessionRecord
+from gausslite.fusion.score_index import AgentTotals
 from gausslite.fusion.sqlite_store import SCHEMA_VERSION, SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import AgentTotals, MissionConfig, SessionRecord
 
 KEYS = (11, 22, 33)
 

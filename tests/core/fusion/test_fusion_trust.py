@@ -29,11 +29,10 @@ from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import RoiSubset
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.keyframe_pool import EncodedKeyframe
-from gausslite.fusion.limits import FusionSettings, Quotas
+from gausslite.fusion.limits import FusionSettings, MissionConfig, Quotas, SessionRecord
 from gausslite.fusion.membership import SessionRegistry
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite.fusion.updates import MAX_SEQ_STEP, MissionClock, UpdateChecks
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
@@ -71,7 +70,7 @@ def test_a_declared_kappa_sum_wins_no_voxel(declared: int, encoded: bool) -> Non
     liar = with_declared_sum(make_subset("liar", 1, {cell: [0] for cell in cells}), declared)
     session_id = join(engine, "liar")
     if encoded:
-        put = engine.enqueue_update(engine.session(session_id), encode_subset(liar, GRID))
+        put = engine.enqueue_update(engine.members.sessions.get(session_id), encode_subset(liar, GRID))
         engine.commit_updates()
         assert len(put.result().accepted) == 1000
     else:
@@ -89,14 +88,14 @@ def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -
     quotas = Quotas(kappa_at_join=100, kappa_per_second=10)
     checks = UpdateChecks(store, quotas, clock)
     checks.record_join("ant")
-    checks.require_plausible(received({0: [100], 1: []}))
+    checks.require_permitted(received({0: [100], 1: []}))
     with pytest.raises(QuotaError, match="'ant': expected a kappa of at most 100 this long after its first join"):
-        checks.require_plausible(received({0: [101]}))
+        checks.require_permitted(received({0: [101]}))
     clock.now_s += 5
     checks.record_join("ant")
-    checks.require_plausible(received({0: [150]}))
+    checks.require_permitted(received({0: [150]}))
     # a restarted server does not start again
-    UpdateChecks(store, quotas, clock).require_plausible(received({0: [150]}))
+    UpdateChecks(store, quotas, clock).require_permitted(received({0: [150]}))
 
 
 def test_a_wrong_wall_clock_neither_sets_the_mission_back_nor_far_ahead() -> None:
@@ -178,9 +177,10 @@ def test_what_is_being_written_when_its_agent_is_evicted_is_deleted_too(
 
     def write() -> None:
         if kind == "keyframe":
-            engine.add_keyframe(session, EncodedKeyframe("ant", 0, 1, 1, b"image"))
+            engine.keyframes.add(EncodedKeyframe("ant", 0, 1, 1, b"image"), session_id=session)
         else:
-            engine.report_objects(session, ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ()))
+            report = ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ())
+            engine.objects.report(SessionRecord(session, "ant"), report)
 
     monkeypatch.setattr(store, name, save_late)
     monkeypatch.setattr(store, "end_session", lambda session_id: (end_session(session_id), ended.set()))
@@ -294,7 +294,7 @@ def test_an_agent_that_is_gone_leaves_no_record(how: str) -> None:
     engine = new_engine(store)
     session = join(engine, "ant")
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
-    engine.report_objects(session, ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ()))
+    engine.objects.report(SessionRecord(session, "ant"), ObjectReport(TaskGraph("mug", "mug", ("mug",), (), ()), ()))
     assert {"objects", "join-token", "first-joined"} <= {
         name for name, records in all_records(store).items() if "ant" in records
     }
@@ -318,7 +318,7 @@ def test_a_joiner_that_is_gone_and_never_contributed_fixes_nothing() -> None:
     engine = new_engine(lease_s=0.0)
     engine.join("junk", MissionConfig("wrong", "wrong", GRID.size_m))
     session = engine.join("ant", MissionConfig("rescue", "map", GRID.size_m)).session.session_id
-    assert engine.mission_config.mission_id == "rescue"
+    assert engine.members.mission_config.mission_id == "rescue"
     engine.contribute(session, make_subset("ant", 1, {0: [1]}), GRID)
     with pytest.raises(MismatchError, match="expected 'map' as agreed here, got 'odom'"):
         engine.join("bee", MissionConfig("", "odom", GRID.size_m))

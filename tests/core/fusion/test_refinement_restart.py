@@ -17,9 +17,9 @@ from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import VoxelBatch, select_voxels
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import MapLayer
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
+from gausslite.fusion.score_index import VoxelScoreTable
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig, VoxelScoreTable
 
 ANYTHING = MissionConfig("", "", GRID.size_m)
 Shown = dict[int, tuple[bytes, bytes]]
@@ -47,7 +47,7 @@ def shown(engine: FusionEngine) -> Shown:
 
 
 def restart(engine: FusionEngine, path: Path) -> FusionEngine:
-    engine.close()
+    engine.store.close()
     return open_engine(path)
 
 
@@ -59,7 +59,7 @@ def test_the_refined_map_is_the_same_after_a_restart_at_every_step(tmp_path: Pat
     engine.contribute(bee, make_subset("bee", 1, {cell: [2] for cell in range(5)}), GRID)
     with pytest.raises(MismatchError, match="expected a refinement first"):
         engine.maps.refined_map()
-    revision = engine.revision
+    revision = engine.maps.revision()
     voted = engine.maps.voted_map().gaussians
     # changes during the refinement: a newer update, a new voxel, a removed one
     engine.contribute(ant, make_subset("ant", 2, {1: [6] * 3, 20: [5], 2: []}), GRID)
@@ -89,7 +89,7 @@ def test_the_refined_map_is_the_same_after_a_restart_at_every_step(tmp_path: Pat
     # the vote is again what the refinement started from, so the refinement is shown again
     assert {key for key in before if before[key] != after[key]} == set(keys(6).tolist())
     assert after[keys(6).item()][1][:12] == np.array([1, 0, 0], np.float32).tobytes()
-    engine.close()
+    engine.store.close()
 
 
 class WatchedStore(SqliteStore):
@@ -123,7 +123,7 @@ def test_a_refinement_reads_and_shows_tiles_and_messages_in_between_are_shown_an
     engine = FusionEngine(store, FusionSettings(grid=GRID))
     ant, bee = (engine.join(name, ANYTHING).session.session_id for name in ("ant", "bee"))
     engine.contribute(ant, make_subset("ant", 1, {cell: [5] for cell in range(200)}), GRID)
-    revision = engine.revision
+    revision = engine.maps.revision()
     store.largest_read = 0
     voted = engine.maps.voted_map()
     # of all voxels, except one that the refinement loses
@@ -146,7 +146,7 @@ def test_a_refinement_reads_and_shows_tiles_and_messages_in_between_are_shown_an
     assert before.keys() - red_voxels == set(keys(3, 40, 150, 180).tolist())
     engine = restart(engine, path)
     assert shown(engine) == before
-    engine.close()
+    engine.store.close()
 
 
 def test_a_damaged_refinement_is_refused() -> None:

@@ -13,7 +13,7 @@ from support.sample_batches import make_batch, random_subset
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
 from gausslite.codec.subset_codec import decode_stored, decode_subset, encode_subset
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
-from gausslite.fusion import store_rows
+from gausslite.fusion import update_log
 from gausslite.fusion.score_index import voxel_records
 from gausslite.fusion.store import FusionStore
 
@@ -24,7 +24,7 @@ Latest = dict[str, dict[int, tuple[int, int, int, bytes]]]
 @pytest.fixture(params=["memory", "sqlite", "postgres"])
 def open_store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> OpenStore:
     """Opens a store that moves rows often."""
-    monkeypatch.setattr(store_rows, "_SPARE_UNITS", 60)
+    monkeypatch.setattr(update_log, "_SPARE_UNITS", 60)
     return opener(request.param, request)
 
 
@@ -63,11 +63,11 @@ def require_latest(store: FusionStore, latest: Latest) -> None:
     assert set(batches) == {agent_id for agent_id, own in latest.items() if own}
     for agent_id, batch in batches.items():
         own = latest[agent_id]
-        seqs = store.stored(agent_id, batch.keys)["update_seqs"].tolist()
+        seqs = store.scores_of(agent_id, batch.keys)["update_seqs"].tolist()
         assert dict(zip(batch.keys.tolist(), rows_of(batch, seqs), strict=True)) == own
         some = np.array(sorted(own)[::2], np.int64)
         part = store.batch(agent_id, some)
-        assert rows_of(part, store.stored(agent_id, part.keys)["update_seqs"].tolist()) == [own[key] for key in some]
+        assert rows_of(part, store.scores_of(agent_id, part.keys)["update_seqs"].tolist()) == [own[key] for key in some]
 
 
 def rows_of(batch: VoxelBatch, seqs: list[int]) -> list[tuple[int, int, int, bytes]]:

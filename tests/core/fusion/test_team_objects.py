@@ -19,10 +19,9 @@ from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.task import Predicate, Relation, TaskGraph
 from gausslite.domain.voxels import AxisAlignedBox
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig, SessionRecord
 from gausslite.fusion.objects import MAX_COMPARISONS, MergedObjects, find_objects, group_boxes, merge_objects
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig
 
 GRAPH = TaskGraph("t", "Pick up the mug on the table", ("mug",), ("table",), (Relation(Predicate.ON, "mug", "table"),))
 ANYTHING = MissionConfig("", "", 0.10)
@@ -187,15 +186,15 @@ def test_reports_survive_in_the_store_and_end_with_the_agent(tmp_path: Path) -> 
     store = SqliteStore(path)
     engine = FusionEngine(store, FusionSettings())
     session = engine.join("ant", ANYTHING).session.session_id
-    engine.report_objects(session, report(landmark("mug", (1, 2, 3))))
+    engine.objects.report(SessionRecord(session, "ant"), report(landmark("mug", (1, 2, 3))))
     store.close()
     store = SqliteStore(path)
     engine = FusionEngine(store, FusionSettings())
     [mug] = engine.query_objects("mug")
     assert mug.landmark.centroid_m == (1.0, 2.0, 3.0)
     # a join with the same task keeps the objects of the report; another task has none yet
-    assert len(engine.reported_objects("ant", GRAPH)) == 1
-    assert engine.reported_objects("ant", replace(GRAPH, targets=("cup",))) == ()
+    assert len(engine.objects.of_task("ant", GRAPH)) == 1
+    assert engine.objects.of_task("ant", replace(GRAPH, targets=("cup",))) == ()
     engine.leave(session, forget=True)
     assert engine.query_objects() == ()
     assert store.records("objects") == {}

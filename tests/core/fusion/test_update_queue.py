@@ -19,9 +19,9 @@ from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, tombstones
 from gausslite.fusion.engine import FusionEngine
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig, PutOutcome
+from gausslite.fusion.update_log import PutOutcome
 from gausslite.fusion.updates import SLICE_VOXELS, PendingUpdate, UpdateQueue
 from gausslite.fusion.vote import fuse
 
@@ -48,7 +48,9 @@ def served(queue: UpdateQueue, max_voxels: int) -> list[str]:
     group = queue.take(max_voxels)
     for update in group:
         part = update.next_slice().voxels
-        queue.put_back(update, update.add_outcome(PutOutcome(part.keys, part.keys[:0])))
+        if update.add_outcome(PutOutcome(part.keys, part.keys[:0])):
+            update.future.set_result(update.outcome())
+        queue.put_back(update)
     return [update.subset.agent_id for update in group]
 
 
@@ -93,7 +95,9 @@ def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tup
             part = update.next_slice().voxels
             is_done = update.add_outcome(PutOutcome(part.keys, part.keys[:0]))
             done += [update] * is_done
-            queue.put_back(update, is_done)
+            if is_done:
+                update.future.set_result(update.outcome())
+            queue.put_back(update)
     for name in "abc":
         assert [u for u in done if u.subset.agent_id == name] == [u for u in updates if u.subset.agent_id == name]
     assert all(u.outcome().accepted.tolist() == u.subset.voxels.keys.tolist() for u in done)
@@ -122,7 +126,8 @@ def test_messages_wait_encoded_and_their_bytes_are_limited() -> None:
     # a message that is taken is decoded, so it makes room for another one
     [taken] = queue.take(1)
     queue.add(pending("ant", b"small"))
-    queue.put_back(taken, True)
+    taken.future.set_result(None)
+    queue.put_back(taken)
 
 
 def test_a_message_costs_what_its_header_declares() -> None:
@@ -139,7 +144,8 @@ def test_a_message_costs_what_its_header_declares() -> None:
     while queue.has_waiting:
         [update] = queue.take(1)
         order.append(update.agent_id)
-        queue.put_back(update, True)
+        update.future.set_result(None)
+        queue.put_back(update)
     # together, the small ones cost less than one that is short but declares much
     assert order == [*["ant"] * 20, "hog", "hog"]
 
@@ -149,7 +155,7 @@ def test_a_late_message_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     session = engine.join("ant", ANY).session
     for seq in (1, 2):
         engine.enqueue_update(session, encoded("ant", seq, {0: 2}))
-    for update in engine._ingest._queue._pending["ant"]:
+    for update in engine.queue._pending["ant"]:
         update.queued_s -= 60.0
     engine.commit_updates()
     [line] = [record.getMessage() for record in caplog.records if "late" in record.getMessage()]

@@ -91,7 +91,7 @@ def test_a_quarantine_is_in_the_agents_log_and_in_the_status(
     ):
         link.enqueue(make_batch({1: [5]}))
         assert link.drain(WAIT_S)
-        fusion.servicer.engine._alignments.put("robot", quarantined)
+        fusion.servicer.engine.frames.add("robot", quarantined)
         wait_until(lambda: f"uplink: {reason}" in caplog.text)
         assert main(["status", fusion.client.address]) == 0
     assert "frame quarantined: contradicts ant, bee: 0.61 m and 20 deg" in capsys.readouterr().out

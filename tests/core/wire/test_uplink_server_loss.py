@@ -11,11 +11,11 @@ from waiting import wait_until
 
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.store_maintenance import back_up, restore
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.spool import Purpose, Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
+from gausslite_operations.store_maintenance import back_up, restore
 
 QUICK = UplinkSettings(interval_s=0.02, first_backoff_s=0.05, check_interval_s=0.1)
 

@@ -21,8 +21,8 @@ from gausslite.codec.stored_voxels import StoredSubset
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.fusion import traffic
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import PutOutcome
 from gausslite.fusion.traffic import Acknowledgements, StorageProbe
+from gausslite.fusion.update_log import PutOutcome
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire import server
 from gausslite.wire.clients import FusionClient

@@ -20,10 +20,9 @@ from gausslite.domain.voxels import RoiSubset, empty_batch, group_by_voxel
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import FrameFit
 from gausslite.fusion.fused_map import MapLayer
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.refinement import MapRenderer
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
 from gausslite_fusion_server import servicer

@@ -14,10 +14,9 @@ from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
-from gausslite.fusion.limits import FusionSettings
+from gausslite.fusion.limits import FusionSettings, MissionConfig
 from gausslite.fusion.refinement import RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_values import MissionConfig
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.gaussians_pb2 import MapBlock
 from gausslite.wire.map_changes import EncodedPartCache

@@ -6,13 +6,13 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any
 
 from gausslite.domain.errors import UnavailableError
-from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.traffic import ACKNOWLEDGEMENT_BOUNDS_S, Acknowledgements, AgentContribution, MissionStatus
 from gausslite.process import import_extra
 from gausslite.wire.channel import host_and_port
+from gausslite_fusion_server.stores import FindCounts, FindEngine
 
 _log = logging.getLogger(__name__)
 
@@ -42,27 +42,12 @@ _OF_MISSION: tuple[tuple[str, str, Callable[[MissionStatus, bool], float]], ...]
 )
 
 
-class MessageCounts(NamedTuple):
-    """Of a server that shares a mission: messages of agents, parts sent to owners and stored as one, and parts refused
-    because their voxels are another server's.
-    """
-
-    received: int
-    sent: int
-    stored: int
-    foreign: int
-
-
 _OF_SHARE = (
     ("messages_received", "messages that agents sent to this server"),
     ("parts_sent", "parts of them sent to other servers, which own their voxels"),
     ("parts_stored", "parts of messages stored as the owner of their voxels"),
     ("parts_foreign", "parts of messages refused, because this server does not own their voxels"),
 )
-
-
-FindEngine = Callable[[], FusionEngine]
-FindCounts = Callable[[], MessageCounts]
 
 
 class MissionCollector:
@@ -104,16 +89,13 @@ class MissionCollector:
 
 @contextmanager
 def metrics_server(
-    address: str | None, engine: FindEngine, acknowledgements: Acknowledgements, counts: FindCounts | None = None
+    address: str, engine: FindEngine, acknowledgements: Acknowledgements, counts: FindCounts | None = None
 ) -> Iterator[int]:
     """Serve /metrics on HOST:PORT while the context is open, with the figures of the process; gives the actual port.
 
-    engine: returns the mission, or this server's part of it. Without an address nothing is served, and the port is 0.
+    engine: returns the mission, or this server's part of it.
     Raises InvalidInputError without prometheus-client or for another address, UnavailableError if it is in use.
     """
-    if address is None:
-        yield 0
-        return
     host, port = host_and_port("--metrics", address)
     prometheus = import_extra("prometheus_client", "metrics", "--metrics")
     registry = prometheus.CollectorRegistry()

@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from threading import RLock
 from typing import Any
 
 import google_crc32c
@@ -22,10 +21,9 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec.stored_voxels import VOXELS, StoredSubset, StoredVoxels, join_elements
-from gausslite.domain.errors import GaussLiteError, StorageError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
 from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of, tiles_of
-from gausslite.fusion.score_index import ScoreIndex, newer_voxels
-from gausslite.fusion.store_values import SCORES, PutOutcome, Scores
+from gausslite.fusion.score_index import SCORES, ScoreIndex, Scores, newer_voxels
 
 UpdateRow = tuple[int, str, int, bytes]
 """number, agent_id, checksum, voxels."""
@@ -41,7 +39,14 @@ _SPARE_UNITS = 1 << 8
 """About 5 kB of Gaussians, which may be outdated in each tile."""
 _VOXEL_UNITS = 2
 """The size of a voxel beside its Gaussians, in Gaussians."""
-_READ_ATTEMPTS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PutOutcome:
+    """The voxels of a message that were stored, and those that were stale; keys in ascending order."""
+
+    accepted: Int64[ndarray, " a"]
+    stale: Int64[ndarray, " s"]
 
 
 @dataclass(slots=True)
@@ -159,7 +164,7 @@ class UpdateLog:
         if own is not None and own.is_outdated:
             for number, data in read(sorted(own.sizes)).items():
                 voxels = StoredVoxels.from_row(data)
-                is_used = self.index.stored(agent_id, voxels.keys)["rows"] == number
+                is_used = self.index.scores_of(agent_id, voxels.keys)["rows"] == number
                 is_used &= ~np.isin(voxels.keys, part.keys)
                 if is_used.any():
                     parts.setdefault(voxels.size_m, []).append(voxels.take(np.flatnonzero(is_used)))
@@ -186,27 +191,14 @@ class UpdateLog:
             self._tiles[agent_id, tile].used += int(size)
 
 
-def read_batches(
-    log: UpdateLog,
-    index_lock: RLock,
-    read: ReadRows,
-    keys: Int64[ndarray, " k"] | None,
-    agents: Sequence[str] | None = None,
-) -> dict[str, VoxelBatch]:
-    """Return the updates of these agents, or of all, on these voxels, or on all. Raises StorageError for damaged rows.
-
-    index_lock: held while the log's index is read.
-    """
-    for _ in range(_READ_ATTEMPTS):
-        with index_lock:
-            names = log.index.agents if agents is None else agents
-            places = {agent_id: log.places(agent_id, keys) for agent_id in names}
-        numbers = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for _, rows in places.values())]))
-        data = read(numbers.tolist()) if len(numbers) else {}
-        # rows may have been moved after the index was asked
-        if len(data) == len(numbers):
-            return {agent_id: _batch_of(keys, rows, data) for agent_id, (keys, rows) in places.items()}
-    raise StorageError(f"store: expected rows that the index names, got {len(data)} of {len(numbers)}; try again")
+def require_storable(update: StoredSubset) -> None:
+    """Raise InvalidInputError if a number of the message does not fit the store's signed 64-bit columns."""
+    largest_sum = int(update.voxels.voxels["kappa_sums"].max(initial=0))
+    limit = int(np.iinfo(np.int64).max)
+    numbers = (("update_seq", update.update_seq), ("message_seq", update.message_seq), ("kappa_sum", largest_sum))
+    for name, value in numbers:
+        if value > limit:
+            raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")
 
 
 def require_intact(rows: Iterable[UpdateRow], damaged: Callable[[str], StorageError]) -> Iterator[UpdateRow]:
@@ -228,8 +220,8 @@ def data_checksum(owner: str, name: str | int, data: bytes) -> int:
     return int(google_crc32c.extend(google_crc32c.value(f"{owner}\0{name}".encode()), data))
 
 
-def _batch_of(keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mapping[int, bytes]) -> VoxelBatch:
-    """Return the voxels with these ascending keys, each from its row."""
+def batch_of(keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mapping[int, bytes]) -> VoxelBatch:
+    """Return the voxels with these ascending keys, each from its row. Raises StorageError for damaged rows."""
     try:
         batches = [voxels.batch() for voxels in _voxels_of(keys, rows, data)]
     except GaussLiteError as error:

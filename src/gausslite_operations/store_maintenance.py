@@ -13,7 +13,7 @@ from pathlib import Path
 from gausslite.domain.errors import StorageError
 from gausslite.fusion import sqlite_store
 from gausslite.fusion.store import SELECT_PARTS, join_parts
-from gausslite.fusion.store_rows import UpdateLog, UpdateRow, data_checksum, is_intact
+from gausslite.fusion.update_log import UpdateLog, UpdateRow, data_checksum, is_intact
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from support.sample_batches import random_subset
 
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.sqlite_store import SqliteStore
-from gausslite.fusion.store_maintenance import back_up, restore, verify
+from gausslite_operations.store_maintenance import back_up, restore, verify
 
 VOXELS = range(1, 41)
 
