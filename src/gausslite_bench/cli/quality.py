@@ -135,13 +135,13 @@ def _run(options: argparse.Namespace, study: Study) -> StudyResults:
     finished: list[FinishedTrial] = []
     unseen: list[UnseenRegionError] = []
     with progress_bar(sum(len(study.trials(plan)) for plan in study.plans), "trials", "trial") as bar:
-        for each in run_study(study, cache, lpips):
-            if isinstance(each, UnseenRegionError):
-                unseen.append(each)
-                print_above_bar(f"skipped: {each}")
+        for outcome in run_study(study, cache, lpips):
+            if isinstance(outcome, UnseenRegionError):
+                unseen.append(outcome)
+                print_above_bar(f"skipped: {outcome}")
                 continue
-            finished.append(each)
-            print_above_bar(_line(each))
+            finished.append(outcome)
+            print_above_bar(_line(outcome))
             bar.update()
     if not finished:
         raise unseen[0]

@@ -56,7 +56,7 @@ def run_fuzz(settings: FuzzSettings) -> Report:
             results.append({"target": target, **figures})
             if settings.out is not None:
                 _write_faults(settings.out, target, outcomes)
-    return Report({"targets": results}, is_good=not any(each["crashes"] or each["hangs"] for each in results))
+    return Report({"targets": results}, is_good=not any(row["crashes"] or row["hangs"] for row in results))
 
 
 def _fuzz_codec(corpus: Mapping[str, list[bytes]], mutator: Mutator, messages: int, note: Note) -> _Fuzzed:

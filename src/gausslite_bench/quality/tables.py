@@ -45,11 +45,11 @@ class StudyResults:
 
     def __init__(self, finished: Sequence[FinishedTrial]) -> None:
         self._results: dict[tuple[str, str, TrialBudget], list[TrialResult]] = {}
-        for each in finished:
-            key = each.trial.plan.name, each.trial.variant.label, each.trial.budget
-            self._results.setdefault(key, []).append(each.result)
+        for one in finished:
+            key = one.trial.plan.name, one.trial.variant.label, one.trial.budget
+            self._results.setdefault(key, []).append(one.result)
         self._finished = list(finished)
-        self.tasks = {each.trial.plan.name: each.trial.plan.task for each in finished}
+        self.tasks = {one.trial.plan.name: one.trial.plan.task for one in finished}
         self.scenes, self.variants, self.budgets = (
             list(dict.fromkeys(part)) for part in zip(*self._results, strict=True)
         )
@@ -57,7 +57,7 @@ class StudyResults:
     @property
     def has_fitted(self) -> bool:
         """True if a trial has scores with fitted views."""
-        return any(each.result.fitted is not None for each in self._finished)
+        return any(one.result.fitted is not None for one in self._finished)
 
     def values(self, scene: str, variant: str, metric: Metric, budget: TrialBudget) -> list[float]:
         """Return the metric of each seed that has it."""
@@ -89,7 +89,7 @@ class StudyResults:
 
     def trials_as_json(self) -> list[Mapping[str, object]]:
         """Return all trials as JSON values."""
-        return [_trial_as_json(each) for each in self._finished]
+        return [_trial_as_json(one) for one in self._finished]
 
 
 def _trial_as_json(each: FinishedTrial) -> Mapping[str, object]:
