@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
 
 from gausslite.config.task_parser import DefaultParser
 from gausslite.config.values import NONE
@@ -130,27 +129,6 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return run_service("gausslite-agent", serve)
 
 
-@dataclass(frozen=True, slots=True)
-class _Mission:
-    """The mission of this process, its frames, and the wait for the parser, which a stop cancels."""
-
-    mission: AgentMission
-    stream: FrameStream | None
-    first_parser: WaitingParser
-
-    def run(self) -> None:
-        """Map the source, or assign the first task and return."""
-        if self.stream is not None:
-            self.mission.run(self.stream)
-        else:
-            self.mission.assign_task()
-
-    def stop(self, grace_s: float) -> None:
-        """End the mission after its current frame, and waits for other services after `grace_s` seconds."""
-        self.mission.stop(grace_s)
-        self.first_parser.stop()
-
-
 async def _serve(settings: AgentSettings) -> int:
     """Build the agent, serve it and run its mission; close in reverse order. Returns the exit code."""
     _require_usable(settings)
@@ -191,7 +169,7 @@ async def _serve(settings: AgentSettings) -> int:
         if settings.view is not None:
             page = load_pages("--view").service_page(settings.view, settings.listen, is_agent=True, tls=settings.tls)
             stack.enter_context(page)
-        run_mission = functools.partial(_run_mission, _Mission(mission, stream, first_parser), settings)
+        run_mission = functools.partial(_run_mission, settings, mission, stream, first_parser)
         await serve_until_stopped(settings.listen, [servicer.service()], run_mission, settings.tls)
         lost = mission.describe_lost_data()
         if lost:
@@ -238,21 +216,25 @@ def _estimators(settings: AgentSettings, stream: FrameStream | None, prior: Prio
     return estimators
 
 
-async def _run_mission(mission: _Mission, settings: AgentSettings) -> None:
-    """Run the mission, then keep serving unless the agent should exit. On cancellation, end the mission."""
-    if not mission.mission.can_find:
+async def _run_mission(
+    settings: AgentSettings, mission: AgentMission, stream: FrameStream | None, first_parser: WaitingParser
+) -> None:
+    """Map the stream, or assign the first task, then serve unless the agent should exit. A cancellation ends all."""
+    if not mission.can_find:
         _log.warning("every AssignTask will fail: %s", NO_DETECTOR)
-    work = asyncio.ensure_future(asyncio.to_thread(mission.run))
+    begin = mission.assign_task if stream is None else functools.partial(mission.run, stream)
+    work = asyncio.ensure_future(asyncio.to_thread(begin))
     try:
-        with PeriodicSave(mission.mission.save_if_mapping, settings.save_interval_s):
+        with PeriodicSave(mission.save_if_mapping, settings.save_interval_s):
             await asyncio.shield(work)
-            if not settings.exit_when_done or mission.stream is None:
+            if not settings.exit_when_done or stream is None:
                 await asyncio.Event().wait()
     finally:
         # the mission still sends and writes its results, so nothing that it uses may be closed before it ends
         mission.stop(settings.link.grace_s)
+        first_parser.stop()
         await work
-        await asyncio.to_thread(mission.mission.finish)
+        await asyncio.to_thread(mission.finish)
 
 
 def _open_parser(settings: AgentSettings, stack: ExitStack) -> TaskParser:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import MISSING, asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,6 @@ from gausslite.mission.results import (
     MAP,
     PREVIEW,
     locked_folder,
-    peak_rss_mib,
     prepare_folder,
     require_absent,
     require_additional_file,
@@ -158,8 +157,9 @@ def run(options: argparse.Namespace) -> int:
 def _map(options: argparse.Namespace, run: OpenRun) -> int:
     # a signal while the results are written must not lose the rest of them
     with DeferredInterrupt() as interrupt:
-        mapped, history = _map_frames(options, run)
-        written = _write_results(options, mapped, history) if mapped.is_worth_keeping else None
+        timeline, recorder = Timeline(), MapRecorder()
+        mapped = _map_frames(options, run, timeline, recorder)
+        written = _write_results(options, mapped, timeline, recorder) if mapped.is_worth_keeping else None
     # an early end keeps the map so far; the exit code reports it
     if isinstance(mapped.result.stopped_by, KeyboardInterrupt):
         raise type(mapped.result.stopped_by)(_interrupted_text(options, mapped.result, written))
@@ -173,23 +173,15 @@ def _map(options: argparse.Namespace, run: OpenRun) -> int:
     return 0 if mapped.has_found_task else TASK_NOT_FOUND
 
 
-@dataclass(frozen=True, slots=True)
-class _History:
-    """What was recorded of each frame."""
-
-    timeline: Timeline = field(default_factory=Timeline)
-    maps: MapRecorder = field(default_factory=MapRecorder)
-
-
-def _map_frames(options: argparse.Namespace, run: OpenRun) -> tuple[MappedRun, _History]:
+def _map_frames(options: argparse.Namespace, run: OpenRun, timeline: Timeline, recorder: MapRecorder) -> MappedRun:
     """Map all frames with a bar. Raises DatasetError if frames exist and none of them can be used."""
-    history, mapper = _History(), run.scheduled.mapper
+    mapper = run.scheduled.mapper
     with _view(options.view, run.scheduled) as draw, MappingBar(len(run.stream)) as bar:
 
         def report(outcome: FrameOutcome) -> None:
             bar.count(outcome)
-            history.timeline.add(outcome)
-            history.maps.record(mapper.poses, mapper.gaussians)
+            timeline.add(outcome)
+            recorder.record(mapper.poses, mapper.gaussians)
             draw(outcome)
 
         mapped = run.map(print_above_bar, report, options.strict, options.save_state)
@@ -197,7 +189,7 @@ def _map_frames(options: argparse.Namespace, run: OpenRun) -> tuple[MappedRun, _
         raise mapped.corrupt.first_error
     if len(mapped.gaussians) == 0 and mapped.result.processed > 0:
         require_mappable_depth(mapped)
-    return mapped, history
+    return mapped
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,58 +202,43 @@ class _Written:
     scores: TrainingFit | None
 
 
-def _write_results(options: argparse.Namespace, mapped: MappedRun, history: _History) -> _Written:
+def _write_results(
+    options: argparse.Namespace, mapped: MappedRun, timeline: Timeline, recorder: MapRecorder
+) -> _Written:
     """Write map.ply, report.json, frames.csv, history, poses, keyframes and preview.png. Raises StorageError."""
     out, mapper, mission, prior = options.out, mapped.mapper, mapped.run.plan.mission, mapped.run.prior
     keyframes = mapper.keyframes()
     evaluator, missing = _evaluator()
-    views = [(keyframe.frame, keyframe.relevance.roi) for keyframe in keyframes]
-    viewer = view_map(mapped.gaussians, mission.backend, mission.threads)
-    prepare_folder(out)
-    scores = evaluator.training_fit(viewer, views) if evaluator is not None and views else None
     changes = compare_with_prior(prior, mapped.gaussians, mapper.objects, keyframes)
     notes = (*missing, *_notes(options, mapped))
     report: dict[str, object] = {
-        **mapped.run.report(),
-        "resumed_from": None if options.resume is None else str(options.resume),
-        **mapped.result.summary(),
-        **trajectory_report(mapped, evaluator),
-        **_map_report(mapped),
+        **mapped.report(trajectory_report(mapped, evaluator)),
         "objects": [object_as_json(landmark) for landmark in changes.objects],
         "nouns": [noun_as_json(noun) for noun in mapper.nouns],
         "notes": list(notes),
         **changes.report,
-        **({} if scores is None else {"training_views": asdict(scores)}),
     }
+    prepare_folder(out)
+    viewer = view_map(mapped.gaussians, mission.backend, mission.threads)
+    views = [(keyframe.frame, keyframe.relevance.roi) for keyframe in keyframes]
+    scores = evaluator.training_fit(viewer, views) if evaluator is not None and views else None
+    if scores is not None:
+        report["training_views"] = asdict(scores)
     stated = options.world_frame
     world_frame = default_world_frame(mapped.run.stream.source) if stated is None else str(stated)
     write_results(out, mapped.gaussians, report, world_frame)
     write_poses(out, mapper.poses, None if prior is None else prior.motion)
-    history.timeline.write(out)
-    history.maps.write(out)
+    timeline.write(out)
+    recorder.write(out)
     write_keyframes(out, keyframes)
     if evaluator is not None and views:
         write_png(out / PREVIEW, evaluator.preview(viewer, views))
     return _Written(report, notes, changes.lines, scores)
 
 
-def _map_report(mapped: MappedRun) -> dict[str, object]:
-    """Return the figures of the map as part of the report."""
-    graph, gaussians = mapped.run.scheduled.graph, mapped.gaussians
-    return {
-        "targets": [] if graph is None else list(graph.targets),
-        "loops": asdict(mapped.mapper.loops),
-        "frames_corrupt": mapped.corrupt.count,
-        "gaussians": len(gaussians),
-        "active_gaussians": int(gaussians.active.sum()),
-        "peak_rss_mib": peak_rss_mib(),
-        "memory_mib": mapped.mapper.memory_mib(),
-    }
-
-
 def _notes(options: argparse.Namespace, mapped: MappedRun) -> Iterator[str]:
     """Yield the messages on the recording, the task and the frames."""
-    result, graphs = mapped.result, mapped.run.scheduled.schedule
+    result = mapped.result
     yield from mapped.run.notes
     yield from mapped.mapper.notes
     if result.processed > 0 and not result.totals.region_seen:
@@ -269,7 +246,7 @@ def _notes(options: argparse.Namespace, mapped: MappedRun) -> Iterator[str]:
             yield "none of these frames shows an object of the task"
         elif has_regions(options):
             yield "none of these frames shows the selected region; check that it belongs to this sequence, in metres"
-    for frame, _ in graphs.switches:
+    for frame, _ in mapped.run.scheduled.schedule.switches:
         if frame > result.last_index:
             yield f"task-at {frame}: not reached, the last frame was {result.last_index}"
     median_m = _median_depth_m(mapped.mapper.keyframes())

@@ -6,8 +6,8 @@ Each step returns a new value and changes none. Checks come first, estimates of 
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from gausslite.mission.recording import (
     selected_regions,
     stated_values,
 )
-from gausslite.mission.results import prepare_folder
+from gausslite.mission.results import peak_rss_mib, prepare_folder
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionResult, MissionRunner
 from gausslite.mission.schedule import ScheduledTaskMapper, TaskSchedule
 from gausslite.mission.settings import (
@@ -345,6 +345,23 @@ class MappedRun:
     def is_worth_keeping(self) -> bool:
         """False if an error came before the first frame."""
         return self.result.processed > 0 or self.result.stopped_by is None
+
+    def report(self, trajectory: Mapping[str, object]) -> dict[str, object]:
+        """Return the settings, the tasks and the figures of frames, trajectory and map as part of report.json."""
+        graph, resume = self.run.scheduled.graph, self.run.plan.resume
+        return {
+            **self.run.report(),
+            "resumed_from": None if resume is None else str(resume),
+            **self.result.summary(),
+            **trajectory,
+            "targets": [] if graph is None else list(graph.targets),
+            "loops": asdict(self.mapper.loops),
+            "frames_corrupt": self.corrupt.count,
+            "gaussians": len(self.gaussians),
+            "active_gaussians": int(self.gaussians.active.sum()),
+            "peak_rss_mib": peak_rss_mib(),
+            "memory_mib": self.mapper.memory_mib(),
+        }
 
     @property
     def has_found_task(self) -> bool:
