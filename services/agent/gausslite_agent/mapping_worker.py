@@ -27,27 +27,20 @@ from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.prior_map import PriorMap
 from gausslite.mission.schedule import MapRecorder, Timeline
 from gausslite.mission.settings import MissionSettings
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.pointing import pointed_masks
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.background import IdleTraining, KeyframeUpload
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.settings import LoadSettings
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
-
-
-def _running_future() -> Future[FrameReport]:
-    """Return a future that its receiver cannot cancel."""
-    future: Future[FrameReport] = Future()
-    future.set_running_or_notify_cancel()
-    return future
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,33 +49,11 @@ class QueuedFrame:
 
     frame: Frame
     arrival_s: float
-    report: Future[FrameReport] = field(default_factory=_running_future)
+    report: Future[FrameReport] = field(default_factory=Future)
 
-
-class FrameQueue:
-    """Frames in order of arrival. Thread-safe."""
-
-    def __init__(self, max_frames: int) -> None:
-        self._max_frames = max_frames
-        self._frames: deque[QueuedFrame] = deque()
-        self._lock = threading.Lock()
-
-    def put(self, frame: QueuedFrame) -> QueuedFrame | None:
-        """Add a frame. Return the oldest, which is dropped, if the queue was full."""
-        with self._lock:
-            self._frames.append(frame)
-            return self._frames.popleft() if len(self._frames) > self._max_frames else None
-
-    def get(self) -> QueuedFrame | None:
-        """Remove and return the oldest frame; None if the queue is empty."""
-        with self._lock:
-            return self._frames.popleft() if self._frames else None
-
-    @property
-    def is_empty(self) -> bool:
-        """True if no frame waits."""
-        with self._lock:
-            return not self._frames
+    def __post_init__(self) -> None:
+        # else its receiver could cancel it
+        self.report.set_running_or_notify_cancel()
 
 
 _Result = TypeVar("_Result")
@@ -123,19 +94,16 @@ class MappingWorker:
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
-        self._queue = FrameQueue(self._load.queue_frames)
+        # guarded by the lock: frames arrive on several threads
+        self._queue: deque[QueuedFrame] = deque()
+        self._queue_lock = threading.Lock()
         self._worker = ThreadPoolExecutor(1, "mapper")
-        self._idle = IdleTraining(
-            self._load.idle_iterations,
-            self._idle_step,
-            self._publish_changes,
-            lambda: not self._queue.is_empty,
-            self._schedule,
-        )
+        # idle iterations that are left since the latest frame, whether one is queued, and whether some are unpublished
+        self._idle_left, self._idle_scheduled, self._idle_unpublished = 0, False, False
 
     def status(self) -> WorkerStatus:
         """Return a snapshot of the totals."""
-        return self._status.get()
+        return self._status.status
 
     def revision(self) -> int:
         """Return the map's revision. It increases, also across restarts."""
@@ -180,7 +148,9 @@ class MappingWorker:
         if self.status().graph is None:
             raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
         queued = QueuedFrame(frame, self._clock())
-        dropped = self._queue.put(queued)
+        with self._queue_lock:
+            self._queue.append(queued)
+            dropped = self._queue.popleft() if len(self._queue) > self._load.queue_frames else None
         if dropped is not None:
             self._report_dropped(dropped, f"the queue of {self._load.queue_frames} frames dropped its oldest")
         self._submit(self._map_next)
@@ -196,9 +166,9 @@ class MappingWorker:
 
     def end_idle_training(self) -> Future[None]:
         """End idle training until the next frame, and publish its changes."""
-        return self._submit(self._idle.stop)
+        return self._submit(self._end_idle_training)
 
-    def insert_team_voxels(self, received: VoxelBatch) -> Future[InsertedVoxels]:
+    def insert_team_voxels(self, received: VoxelBatch) -> Future[None]:
         """Insert voxels that a teammate trained more than this agent; between two frames."""
         return self._submit(lambda: self._insert_team_voxels(received))
 
@@ -218,7 +188,7 @@ class MappingWorker:
     def close(self) -> None:
         """End the worker after its current frame; waiting frames are dropped."""
         self._worker.shutdown(wait=True, cancel_futures=True)
-        while (queued := self._queue.get()) is not None:
+        while (queued := self._take()) is not None:
             self._report_dropped(queued, "the agent is shutting down")
 
     def _submit(self, work: Callable[[], _Result]) -> Future[_Result]:
@@ -227,10 +197,9 @@ class MappingWorker:
         except RuntimeError as error:
             raise UnavailableError("agent: shutting down; it accepts no more work") from error
 
-    def _schedule(self, work: Callable[[], None]) -> None:
-        # the executor accepts no work while the worker is closing
-        with suppress(UnavailableError):
-            self._submit(work)
+    def _take(self) -> QueuedFrame | None:
+        with self._queue_lock:
+            return self._queue.popleft() if self._queue else None
 
     def _assign(
         self, graph: TaskGraph | None, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM]
@@ -301,7 +270,7 @@ class MappingWorker:
         return time.monotonic() - start_s
 
     def _map_next(self) -> None:
-        queued = self._queue.get()
+        queued = self._take()
         if queued is None:
             return
         try:
@@ -312,7 +281,9 @@ class MappingWorker:
         except Exception as error:
             # the caller gets the error; the worker continues with the next frame
             queued.report.set_exception(error)
-        self._idle.start()
+        self._idle_left = self._load.idle_iterations
+        if not self._idle_scheduled and self._idle_left > 0:
+            self._train_idle()
 
     def _map(self, queued: QueuedFrame) -> FrameReport:
         assert self._task_mapper is not None
@@ -326,7 +297,7 @@ class MappingWorker:
         if outcome.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, outcome.skipped, gaussians=outcome.gaussians))
         if outcome.changed_roi is not None:
-            self._idle.mark_published()
+            self._idle_unpublished = False
         report = FrameReport(
             frame.index,
             Outcome.MAPPED,
@@ -338,11 +309,10 @@ class MappingWorker:
         )
         if self._keyframe_upload is not None:
             self._keyframe_upload.enqueue_newest(self._mapper.keyframes())
-        self._status.add_outcome(outcome)
         self._timeline.add(outcome)
         self._recorder.record(self._mapper.poses, self._mapper.gaussians)
         self._status.update(correction=self._correction(), corrected_at_s=time.monotonic())
-        self._count(report)
+        self._count(report, outcome)
         self._on_change()
         return report
 
@@ -383,26 +353,44 @@ class MappingWorker:
         if self.uplink is not None and graph is not None:
             self.uplink.report_objects(ObjectReport(graph, objects))
 
-    def _insert_team_voxels(self, received: VoxelBatch) -> InsertedVoxels:
+    def _insert_team_voxels(self, received: VoxelBatch) -> None:
         if self._task_mapper is None:
-            return InsertedVoxels(empty_batch(), 0)
-        inserted = self._task_mapper.insert_team_voxels(received, self.grid)
-        if inserted.gaussians:
-            count = self.status().team_gaussians + inserted.gaussians
+            return
+        inserted = self._task_mapper.insert_team_voxels(received, self.grid).gaussians
+        if inserted:
+            count = self.status().team_gaussians + inserted
             self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
             self._on_change()
-        return inserted
 
-    def _idle_step(self) -> bool:
-        if self._task_mapper is None or not self._task_mapper.idle_step():
-            return False
-        self._status.update(idle_iterations=self.status().idle_iterations + 1)
-        return True
+    def _train_idle(self) -> None:
+        """Train one iteration if no frame waits, and schedule the next behind all queued work.
 
-    def _publish_changes(self) -> None:
-        batch = None if self._task_mapper is None else self._task_mapper.changed_roi()
-        if batch is not None:
-            self._publish(batch)
+        An error is logged, because no caller waits for the result, and ends the iterations until the next frame.
+        """
+        self._idle_scheduled = not self._queue
+        if not self._idle_scheduled:
+            return
+        try:
+            if self._idle_left == 0 or self._task_mapper is None or not self._task_mapper.idle_step():
+                self._end_idle_training()
+                return
+            self._status.update(idle_iterations=self.status().idle_iterations + 1)
+            self._idle_left -= 1
+            self._idle_unpublished = True
+            # the executor accepts no work while the worker is closing
+            with suppress(UnavailableError):
+                self._submit(self._train_idle)
+        except Exception:
+            _log.exception("an idle iteration failed; idle training continues after the next frame")
+            self._idle_left, self._idle_scheduled = 0, False
+
+    def _end_idle_training(self) -> None:
+        self._idle_left, self._idle_scheduled = 0, False
+        if self._idle_unpublished and self._task_mapper is not None:
+            self._idle_unpublished = False
+            batch = self._task_mapper.changed_roi()
+            if batch is not None:
+                self._publish(batch)
 
     def _publish(self, batch: VoxelBatch) -> None:
         """Pass updates to the uplink. Those that its spool refuses are published again with the next frame."""
@@ -423,8 +411,8 @@ class MappingWorker:
     def _report_dropped(self, queued: QueuedFrame, reason: str) -> None:
         queued.report.set_result(self._count(FrameReport(queued.frame.index, Outcome.DROPPED, reason)))
 
-    def _count(self, report: FrameReport) -> FrameReport:
-        self._status.add_report(report, self._map_revision())
+    def _count(self, report: FrameReport, outcome: FrameOutcome | None = None) -> FrameReport:
+        self._status.count(report, self._map_revision(), outcome)
         return report
 
     def _map_revision(self) -> int:

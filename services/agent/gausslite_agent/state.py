@@ -154,42 +154,30 @@ class MissionStateMachine:
     """The current state of the mission. Thread-safe."""
 
     def __init__(self) -> None:
-        self._state = MissionState.WAITING_FOR_TASK
-        self._failure = ""
-        self._lock = threading.Lock()
-
-    @property
-    def state(self) -> MissionState:
+        self.state = MissionState.WAITING_FOR_TASK
         """The current state."""
-        with self._lock:
-            return self._state
-
-    @property
-    def failure(self) -> str:
+        self.failure = ""
         """The error that ended the mission; empty unless FAILED."""
-        with self._lock:
-            return self._failure
+        self._lock = threading.Lock()
 
     def enter(self, state: MissionState, failure: str = "") -> None:
         """Enter this state. Raises MismatchError if it cannot follow the current one; failure: the error of FAILED."""
         with self._lock:
-            if state not in _FOLLOWING[self._state]:
-                raise MismatchError(f"mission: expected a state that can follow {self._state.value}, got {state.value}")
-            self._state, self._failure = state, failure
+            if state not in _FOLLOWING[self.state]:
+                raise MismatchError(f"mission: expected a state that can follow {self.state.value}, got {state.value}")
+            self.state, self.failure = state, failure
 
     def require_accepting(self, what: str) -> None:
         """Raise MismatchError while the mission ends; what: the data that it would have accepted."""
-        with self._lock:
-            if self._state in _ENDING:
-                raise MismatchError(f"{what}: expected a mission that accepts it, got one that is {self._state.value}")
+        if (state := self.state) in _ENDING:
+            raise MismatchError(f"{what}: expected a mission that accepts it, got one that is {state.value}")
 
     def require_mapping(self) -> None:
         """Raise MismatchError if frames cannot be mapped now."""
-        with self._lock:
-            if self._state is not MissionState.MAPPING:
-                raise MismatchError(
-                    f"frames: expected a mission that is mapping, got one that is {self._state.value}; call AssignTask"
-                )
+        if (state := self.state) is not MissionState.MAPPING:
+            raise MismatchError(
+                f"frames: expected a mission that is mapping, got one that is {state.value}; call AssignTask"
+            )
 
 
 _AGES_KEPT = 1000
@@ -324,28 +312,20 @@ class WorkerStatus:
 
 
 class StatusHolder:
-    """The current WorkerStatus, for the worker and for the readers on other threads."""
+    """The current WorkerStatus. Thread-safe: frames are counted on the worker and where they arrive."""
 
     def __init__(self, status: WorkerStatus) -> None:
-        self._status = status
+        self.status = status
+        """The current one."""
         self._lock = threading.Lock()
-
-    def get(self) -> WorkerStatus:
-        """Return the current status."""
-        with self._lock:
-            return self._status
 
     def update(self, **changes: Any) -> None:
         """Replace these fields."""
         with self._lock:
-            self._status = replace(self._status, **changes)
+            self.status = replace(self.status, **changes)
 
-    def add_report(self, report: FrameReport, map_revision: int) -> None:
-        """Count one frame."""
+    def count(self, report: FrameReport, map_revision: int, outcome: FrameOutcome | None = None) -> None:
+        """Count one frame; outcome: that of a mapped one."""
         with self._lock:
-            self._status = replace(self._status.with_report(report), map_revision=map_revision)
-
-    def add_outcome(self, outcome: FrameOutcome) -> None:
-        """Count what one mapped frame skipped, detected and re-evaluated."""
-        with self._lock:
-            self._status = self._status.with_outcome(outcome)
+            status = self.status if outcome is None else self.status.with_outcome(outcome)
+            self.status = replace(status.with_report(report), map_revision=map_revision)

@@ -51,9 +51,7 @@ class BodyLayout:
     @property
     def widths(self) -> tuple[int, int, int, int, int, int]:
         """The fields as `_unpack` takes them."""
-        precision = self.precision
-        counts = self.voxels, self.gaussians
-        return *counts, self.kappa_bytes, self.target_bytes, precision.coarse_bits, precision.scale_code
+        return self.voxels, self.gaussians, self.kappa_bytes, self.target_bytes, *self.precision
 
     def voxel_columns(self) -> list[Column]:
         """Differences of keys, Σkappa minus that of the voxel's Gaussians, and counts."""
@@ -62,11 +60,8 @@ class BodyLayout:
     def label_columns(self) -> list[Column]:
         """Differences of kappa, targets, and active flags as bits."""
         n = self.gaussians
-        return [
-            Column(f"<u{self.kappa_bytes}", (n,)),
-            Column(f"<i{self.target_bytes}", (n,)),
-            Column("<u1", ((n + 7) // 8,)),
-        ]
+        sizes = (f"<u{self.kappa_bytes}", n), (f"<i{self.target_bytes}", n), ("<u1", (n + 7) // 8)
+        return [Column(dtype, (size,)) for dtype, size in sizes]
 
 
 def encode_voxels(batch: VoxelBatch) -> list[NDArray[Any]]:
@@ -135,5 +130,4 @@ def require_encodable(gaussians: Gaussians) -> None:
 
 def _sums(kappa: NDArray[np.uint32], offsets: Int64[ndarray, " v1"]) -> NDArray[np.uint64]:
     totals = np.concatenate([np.zeros(1, np.uint64), np.cumsum(kappa, dtype=np.uint64)])
-    sums: NDArray[np.uint64] = totals[offsets[1:]] - totals[offsets[:-1]]
-    return sums
+    return totals[offsets[1:]] - totals[offsets[:-1]]

@@ -6,7 +6,6 @@ import numpy as np
 
 from gausslite.codec.body_layout import (
     MAX_LABEL_BYTES,
-    VOXEL_BYTES,
     BodyLayout,
     decode_kappa_sums,
     decode_labels,
@@ -20,8 +19,6 @@ from gausslite.codec.stored_voxels import StoredVoxels
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
-
-__all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
 
 _WIDTHS = {"means_m": 3, "quats_wxyz": 4, "scales_m": 3, "opacities": 1, "rgb": 3}
 MAX_GAUSSIAN_BYTES = 4 * sum(_WIDTHS.values()) + MAX_LABEL_BYTES
@@ -41,17 +38,8 @@ def decode(body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int, st
     raw = decompress_columns(body, _columns(layout))
     keys, offsets = decode_voxels(raw[:3], layout)
     active, kappa, target = decode_labels(raw[-3:])
-    means_m, quats_wxyz, scales_m, opacities, rgb = (column.astype(np.float32) for column in raw[3:-3])
-    gaussians = Gaussians(
-        means_m=means_m,
-        quats_wxyz=quats_wxyz,
-        scales_m=scales_m,
-        opacities=opacities,
-        rgb=rgb,
-        active=active,
-        kappa=kappa,
-        target=target,
-    )
+    values = {name: column.astype(np.float32) for name, column in zip(_WIDTHS, raw[3:-3], strict=True)}
+    gaussians = Gaussians(**values, active=active, kappa=kappa, target=target)
     require_encodable(gaussians)
     batch = VoxelBatch(keys, decode_kappa_sums(raw[:3], kappa, offsets), raw[2].astype(np.uint32), gaussians)
     if not _are_inside(batch, grid):

@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gausslite.codec import _unpack, columns
 from gausslite.codec.body_layout import (
     MAX_LABEL_BYTES,
-    VOXEL_BYTES,
     BodyLayout,
     encode_differences,
     encode_labels,
@@ -28,8 +25,6 @@ from gausslite.codec.columns import Column, compress_columns, decompress
 from gausslite.codec.stored_voxels import CODES, VOXELS, StoredVoxels
 from gausslite.domain.errors import CodecError
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
-
-__all__ = ["MAX_GAUSSIAN_BYTES", "VOXEL_BYTES", "decode", "encode"]
 
 _SYMBOL_BYTES = 1 + 3 + 1 + 3 + 1 + 3
 _MAX_BIT_FIELD_BYTES = (3 * columns.MAX_FINE_BITS + 7) // 8
@@ -55,7 +50,7 @@ def encode(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> bytes:
         [
             *encode_voxels(batch),
             lengths,
-            *_scale_symbols(scales),
+            *(encode_differences(scales[:, 0]), scales[:, 1] - scales[:, 0], scales[:, 2] - scales[:, 0]),
             largest,
             *others.T,
             columns.encode_opacities(gaussians.opacities),
@@ -99,8 +94,3 @@ def _split(body: bytes) -> tuple[bytes, bytes]:
     if end > len(body):
         raise CodecError(f"subset: expected a frame of at most {len(body) - _FRAME_SIZE.size} bytes, got a longer one")
     return body[_FRAME_SIZE.size : end], body[end:]
-
-
-def _scale_symbols(codes: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    first = codes[:, 0]
-    return encode_differences(first), codes[:, 1] - first, codes[:, 2] - first

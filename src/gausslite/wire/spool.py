@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored import from_bytes, to_records
+from gausslite.codec.stored_voxels import from_records, to_records
 from gausslite.domain.errors import MismatchError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of
@@ -400,6 +400,6 @@ def _to_batch(purpose: Purpose, rows: list[tuple[Any, ...]]) -> SpoolBatch | Non
         return None
     keys, enqueue_counts, sums, counts, blobs = zip(*rows, strict=True)
     batch = VoxelBatch(
-        np.array(keys, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32), from_bytes(b"".join(blobs))
+        np.array(keys, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32), from_records(b"".join(blobs))
     )
     return SpoolBatch(purpose, batch, np.array(enqueue_counts, np.int64))

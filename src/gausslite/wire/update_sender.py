@@ -19,6 +19,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import UNKNOWN, FusionClient, Session
+from gausslite.wire.convert import enum_numbers
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 
 _log = logging.getLogger(__name__)
@@ -121,7 +122,7 @@ class SentPart:
 
 
 _MIN_SUBSET_BYTES = 1 << 16
-_PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
+_PURPOSES = enum_numbers(pb.Purpose, Purpose)
 Count = Callable[..., None]
 """Adds to the uplink's counters of these names."""
 
