@@ -57,7 +57,7 @@ class KeyframeUpload:
 def _selected_keyframes(uplink: Uplink) -> dict[int, SelectedKeyframe]:
     """Return the keyframes in the spool, those from before a restart."""
     known = {}
-    for selected_keyframe in uplink.selected_keyframes():
+    for selected_keyframe in uplink.spool.keyframes():
         message = geometry_pb2.EncodedFrame.FromString(selected_keyframe.data)
         try:
             T_world_camera = transform_from_message("keyframe t_world_camera", message.t_world_camera)

@@ -257,7 +257,7 @@ class MappingWorker:
         batch = self._sent_voxels.exclude_frozen(group_by_voxel(gaussians, self.grid))
         if self.uplink is None:
             return batch
-        return self._sent_voxels.add_tombstones(batch, self.uplink.spooled_voxels(purpose))
+        return self._sent_voxels.add_tombstones(batch, self.uplink.spool.voxels(purpose))
 
     def _save(self, path: Path, config: ResumeConfig, requested_task: str) -> float:
         graph, task_mapper = self.status().graph, self._task_mapper

@@ -130,4 +130,4 @@ def require_encodable(gaussians: Gaussians) -> None:
 
 def _sums(kappa: NDArray[np.uint32], offsets: Int64[ndarray, " v1"]) -> NDArray[np.uint64]:
     totals = np.concatenate([np.zeros(1, np.uint64), np.cumsum(kappa, dtype=np.uint64)])
-    return totals[offsets[1:]] - totals[offsets[:-1]]
+    return np.asarray(totals[offsets[1:]] - totals[offsets[:-1]])

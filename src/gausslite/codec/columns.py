@@ -115,12 +115,12 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 def encode_scales(scales_m: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
     """Encode scales on a logarithmic grid, clamped to SCALE_MIN_M and SCALE_MAX_M."""
     octaves = np.log2(np.clip(scales_m.astype(np.float64), SCALE_MIN_M, SCALE_MAX_M)) - SCALE_MIN_EXPONENT
-    return np.rint(octaves * SCALE_STEPS_PER_OCTAVE).astype(np.uint8)
+    return np.asarray(np.rint(octaves * SCALE_STEPS_PER_OCTAVE), np.uint8)
 
 
 def decode_scales(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
     """Decode scales in metres."""
-    return _SCALES_M[codes]
+    return np.asarray(_SCALES_M[codes])
 
 
 _SCALES_M = np.exp2(SCALE_MIN_EXPONENT + np.arange(256) / SCALE_STEPS_PER_OCTAVE).astype(np.float32)
@@ -134,7 +134,7 @@ def quat_steps(scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
     """
     # NumPy reduces three long rows much faster than many short ones
     axes = np.ascontiguousarray(scale_codes.T)
-    return _STEPS_BY_SPREAD[axes.max(axis=0) - axes.min(axis=0)]
+    return np.asarray(_STEPS_BY_SPREAD[axes.max(axis=0) - axes.min(axis=0)])
 
 
 _RATIOS = 2.0 ** (np.arange(256) / SCALE_STEPS_PER_OCTAVE)
@@ -167,7 +167,7 @@ def decode_quats(
     # a round Gaussian has no steps and no rotation
     full[rows, largest] = np.maximum(steps, 1)
     full[rows[:, None], _OTHERS[largest]] = offsets
-    return (full / np.linalg.norm(full, axis=1, keepdims=True)).astype(np.float32)
+    return np.asarray(full / np.linalg.norm(full, axis=1, keepdims=True), np.float32)
 
 
 def encode_opacities(opacities: Float32[ndarray, " n"]) -> UInt8[ndarray, " n"]:
@@ -188,7 +188,7 @@ def encode_rgb(rgb: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
     lime = green - middle
     luma = (middle + lime / 2 - _LUMA_MIN) * _LUMA_STEPS
     codes = np.stack([luma, *((chroma - _CHROMA_MIN) * _CHROMA_STEPS for chroma in (orange, lime))], axis=1)
-    return np.clip(np.rint(codes), 0, _MAX_COLOUR_CODE).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(codes), 0, _MAX_COLOUR_CODE), np.uint8)
 
 
 def decode_rgb(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
@@ -229,7 +229,7 @@ class PositionPrecision(NamedTuple):
         """Return the bits per axis of each Gaussian's position."""
         smallest = np.ascontiguousarray(scale_codes.T).min(axis=0).astype(np.int64)
         bits = -((smallest - self.scale_code) // SCALE_STEPS_PER_OCTAVE)
-        return np.clip(bits, self.coarse_bits, MAX_FINE_BITS)
+        return np.asarray(np.clip(bits, self.coarse_bits, MAX_FINE_BITS))
 
 
 def cells_of(

@@ -112,7 +112,7 @@ def declared_bytes(data: bytes) -> int:
         return 0
     header, limits = _Header(*_HEADER.unpack_from(data)), DEFAULT_LIMITS
     voxels, gaussians = min(header.voxels, limits.max_voxels), min(header.gaussians, limits.max_gaussians)
-    return voxels * VOXELS.itemsize + gaussians * CODES.itemsize
+    return int(voxels * VOXELS.itemsize + gaussians * CODES.itemsize)
 
 
 def _decode(data: bytes, limits: CodecLimits, stated_sums: bool) -> tuple[StoredSubset, str, VoxelGrid]:
