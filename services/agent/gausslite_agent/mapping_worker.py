@@ -7,6 +7,7 @@ map, so the mapper needs no lock.
 
 from __future__ import annotations
 
+import functools
 import logging
 import threading
 import time
@@ -16,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Concatenate, ParamSpec, TypeVar
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
@@ -57,8 +58,21 @@ class QueuedFrame:
 
 
 _Result = TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
 _log = logging.getLogger(__name__)
 LOCALISING = "the agent localises itself in the map of --prior"
+
+
+def _on_worker(
+    method: Callable[Concatenate[MappingWorker, _Arguments], _Result],
+) -> Callable[Concatenate[MappingWorker, _Arguments], Future[_Result]]:
+    """Let the method run on the worker thread, between two frames; its caller gets a future."""
+
+    @functools.wraps(method)
+    def queue(self: MappingWorker, /, *arguments: _Arguments.args, **more: _Arguments.kwargs) -> Future[_Result]:
+        return self._submit(lambda: method(self, *arguments, **more))
+
+    return queue
 
 
 class MappingWorker:
@@ -109,39 +123,66 @@ class MappingWorker:
         """Return the map's revision. It increases, also across restarts."""
         return self.status().map_revision
 
+    @_on_worker
     def assign(
         self, graph: TaskGraph | None, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()
-    ) -> Future[TaskGraph]:
-        """Switch to this task with the next frame; the map is kept and earlier keyframes are re-evaluated.
+    ) -> TaskGraph:
+        """Switch to this task with the next frame, and return it; the map is kept and earlier keyframes re-evaluated.
 
         A task that is equivalent to the current one changes nothing; without one, the current task stays, with what a
-        person points at. The future returns the graph; it raises InvalidInputError, ModelFileError and the like.
+        person points at. Raises InvalidInputError, ModelFileError and the like.
         """
-        return self._submit(lambda: self._assign(graph, pointed, excluded_m))
+        # before any change: a person may point at nothing
+        masks = pointed_masks(pointed, ()) if self._task_mapper is None else self._task_mapper.pointed_masks(pointed)
+        base = graph or self.status().graph or TaskGraph("", "", (), (), ())
+        extended = base.with_pointed(noun for noun, _, _ in masks)
+        task_mapper = self._switch(extended, is_extended=graph is None)
+        task_mapper.point_at(masks, excluded_m)
+        self._report_task(task_mapper)
+        return extended
 
-    def restore(self, saved: SavedMission) -> Future[None]:
-        """Continue a saved mission; call it before the first frame. The future raises MapFileError, StorageError."""
-        return self._submit(lambda: self._restore(saved))
+    @_on_worker
+    def restore(self, saved: SavedMission) -> None:
+        """Continue a saved mission; call it before the first frame. Raises MapFileError, StorageError."""
+        checkpoint = saved.checkpoint
+        task_mapper = self._switch(checkpoint.graph)
+        saved.run.restore(task_mapper)
+        # not before: the fusion server replaces what it has by each report
+        self._report_task(task_mapper)
+        self._last_index = checkpoint.last_index
+        # the clock may have been set back since the mission was saved
+        self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
+        self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
+        # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
+        # and the server may have voxels that the saved map does not
+        self._publish(self._voxels_to_send(self._mapper.gaussians(active_only=True), Purpose.ROI))
+        self._on_change()
 
-    def save(self, path: Path, config: ResumeConfig, requested_task: str) -> Future[float]:
-        """Save the mission after the current frame. The future returns the seconds that it took; 0 without a task.
+    @_on_worker
+    def save(self, path: Path, config: ResumeConfig, requested_task: str) -> float:
+        """Save the mission after the current frame; returns the seconds that it took, 0 without a task.
 
-        requested_task: the task of the command line. The future raises StorageError.
+        requested_task: the task of the command line. Raises StorageError.
         """
-        return self._submit(lambda: self._save(path, config, requested_task))
+        graph, task_mapper = self.status().graph, self._task_mapper
+        if graph is None or task_mapper is None:
+            return 0.0
+        start_s = time.monotonic()
+        checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
+        extra = checkpoint.state() if self.prior is None else {**checkpoint.state(), **self.prior.state()}
+        save_run(path, task_mapper, config, checkpoint.last_index, extra)
+        return time.monotonic() - start_s
 
-    def write_history(self, folder: Path) -> Future[None]:
-        """Write frames.csv and map_history.safetensors, since the program's start. The future raises StorageError."""
+    @_on_worker
+    def write_history(self, folder: Path) -> None:
+        """Write frames.csv and map_history.safetensors, since the program's start. Raises StorageError."""
+        self._timeline.write(folder)
+        self._recorder.write(folder)
 
-        def write() -> None:
-            self._timeline.write(folder)
-            self._recorder.write(folder)
-
-        return self._submit(write)
-
-    def camera_view(self) -> Future[CameraView | None]:
+    @_on_worker
+    def camera_view(self) -> CameraView | None:
         """Return what the camera sees, for a person; None before the first keyframe."""
-        return self._submit(lambda: None if self._task_mapper is None else self._task_mapper.camera_view())
+        return None if self._task_mapper is None else self._task_mapper.camera_view()
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame; return the future of its report. Raises MismatchError without a task, UnavailableError."""
@@ -168,22 +209,31 @@ class MappingWorker:
         """End idle training until the next frame, and publish its changes."""
         return self._submit(self._end_idle_training)
 
-    def insert_team_voxels(self, received: VoxelBatch) -> Future[None]:
-        """Insert voxels that a teammate trained more than this agent; between two frames."""
-        return self._submit(lambda: self._insert_team_voxels(received))
+    @_on_worker
+    def insert_team_voxels(self, received: VoxelBatch) -> None:
+        """Insert voxels that a teammate trained more than this agent."""
+        if self._task_mapper is None:
+            return
+        inserted = self._task_mapper.insert_team_voxels(received, self.grid).gaussians
+        if inserted:
+            count = self.status().team_gaussians + inserted
+            self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
+            self._on_change()
 
-    def handover_batch(self) -> Future[VoxelBatch]:
+    @_on_worker
+    def handover_batch(self) -> VoxelBatch:
         """Return updates of the whole map, except guesses and voxels of an earlier task sent with a higher Σkappa.
 
         Guesses: see `GaussianMapper.shared_gaussians`. Voxels of an earlier handover that the map has lost get
-        tombstones. The future raises StorageError.
+        tombstones. Raises StorageError.
         """
-        return self._submit(lambda: self._voxels_to_send(self._mapper.shared_gaussians()))
+        return self._voxels_to_send(self._mapper.shared_gaussians())
 
-    def select_keyframes(self) -> Future[None]:
+    @_on_worker
+    def select_keyframes(self) -> None:
         """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""
-        upload = self._keyframe_upload
-        return self.run(lambda mapper: None if upload is None else upload.enqueue_all(mapper.keyframes()))
+        if self._keyframe_upload is not None:
+            self._keyframe_upload.enqueue_all(self._mapper.keyframes())
 
     def close(self) -> None:
         """End the worker after its current frame; waiting frames are dropped."""
@@ -200,18 +250,6 @@ class MappingWorker:
     def _take(self) -> QueuedFrame | None:
         with self._queue_lock:
             return self._queue.popleft() if self._queue else None
-
-    def _assign(
-        self, graph: TaskGraph | None, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM]
-    ) -> TaskGraph:
-        # before any change: a person may point at nothing
-        masks = pointed_masks(pointed, ()) if self._task_mapper is None else self._task_mapper.pointed_masks(pointed)
-        base = graph or self.status().graph or TaskGraph("", "", (), (), ())
-        extended = base.with_pointed(noun for noun, _, _ in masks)
-        task_mapper = self._switch(extended, is_extended=graph is None)
-        task_mapper.point_at(masks, excluded_m)
-        self._report_task(task_mapper)
-        return extended
 
     def _switch(self, graph: TaskGraph, is_extended: bool = False) -> TaskMapper:
         """Make this the task of the next frame; return its mapper. is_extended: the same task with more targets."""
@@ -237,37 +275,12 @@ class MappingWorker:
         for noun in task_mapper.nouns:
             _log.info("%s", noun.match.describe())
 
-    def _restore(self, saved: SavedMission) -> None:
-        checkpoint = saved.checkpoint
-        task_mapper = self._switch(checkpoint.graph)
-        saved.run.restore(task_mapper)
-        # not before: the fusion server replaces what it has by each report
-        self._report_task(task_mapper)
-        self._last_index = checkpoint.last_index
-        # the clock may have been set back since the mission was saved
-        self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
-        self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
-        # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
-        # and the server may have voxels that the saved map does not
-        self._publish(self._voxels_to_send(self._mapper.gaussians(active_only=True), Purpose.ROI))
-        self._on_change()
-
     def _voxels_to_send(self, gaussians: Gaussians, purpose: Purpose | None = None) -> VoxelBatch:
         """Return updates of these voxels, and tombstones of others sent for this purpose. Raises StorageError."""
         batch = self._sent_voxels.exclude_frozen(group_by_voxel(gaussians, self.grid))
         if self.uplink is None:
             return batch
         return self._sent_voxels.add_tombstones(batch, self.uplink.spool.voxels(purpose))
-
-    def _save(self, path: Path, config: ResumeConfig, requested_task: str) -> float:
-        graph, task_mapper = self.status().graph, self._task_mapper
-        if graph is None or task_mapper is None:
-            return 0.0
-        start_s = time.monotonic()
-        checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
-        extra = checkpoint.state() if self.prior is None else {**checkpoint.state(), **self.prior.state()}
-        save_run(path, task_mapper, config, checkpoint.last_index, extra)
-        return time.monotonic() - start_s
 
     def _map_next(self) -> None:
         queued = self._take()
@@ -352,15 +365,6 @@ class MappingWorker:
         graph = self.status().graph
         if self.uplink is not None and graph is not None:
             self.uplink.report_objects(ObjectReport(graph, objects))
-
-    def _insert_team_voxels(self, received: VoxelBatch) -> None:
-        if self._task_mapper is None:
-            return
-        inserted = self._task_mapper.insert_team_voxels(received, self.grid).gaussians
-        if inserted:
-            count = self.status().team_gaussians + inserted
-            self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
-            self._on_change()
 
     def _train_idle(self) -> None:
         """Train one iteration if no frame waits, and schedule the next behind all queued work.

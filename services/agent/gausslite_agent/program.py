@@ -277,12 +277,8 @@ def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: Exit
     link = settings.link
     if link.fusion is None or link.team_map == NONE:
         return
-    follower = TeamMapFollower(
-        FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls),
-        settings.agent_id,
-        link.team_map,
-        worker,
-    )
+    client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
+    follower = TeamMapFollower(client, settings.agent_id, link.team_map, worker)
     stack.callback(follower.close)
 
 

@@ -119,13 +119,11 @@ class MissionSummary:
             f"{uplink.keyframes_sent} keyframes in {size_text(uplink.keyframe_bytes)}, "
             f"a handover of {size_text(uplink.handover_bytes)}"
         )
-        return f"{mapped}; sent {sent}; {self._left(uplink)}"
-
-    def _left(self, uplink: UplinkCounters) -> str:
         if self.is_complete:
-            return "nothing was left"
+            return f"{mapped}; sent {sent}; nothing was left"
         stays = f"in {self.spool} until the agent runs again" if self.spool is not None else "lost when the agent ends"
-        return f"left {uplink.voxels_waiting} voxels and {uplink.keyframes_waiting} keyframes, {stays}"
+        left = f"{uplink.voxels_waiting} voxels and {uplink.keyframes_waiting} keyframes"
+        return f"{mapped}; sent {sent}; left {left}, {stays}"
 
 
 class MissionState(Enum):
@@ -284,28 +282,20 @@ class WorkerStatus:
         """Return the percentile of the latest frames' ages; 0 before the first."""
         return float(np.percentile(self.ages_s, percent)) if self.ages_s else 0.0
 
-    def with_report(self, report: FrameReport) -> WorkerStatus:
-        """Return the totals with one more frame."""
-        if report.outcome is not Outcome.MAPPED:
-            return replace(self, **{report.outcome.value: getattr(self, report.outcome.value) + 1})
+    def with_mapped(self, outcome: FrameOutcome, age_s: float) -> WorkerStatus:
+        """Return the totals with one more mapped frame."""
+        timing = outcome.timing
         return replace(
             self,
             mapped=self.mapped + 1,
-            gaussians=report.gaussians,
-            iterations=self.iterations + report.iterations,
-            busy_s=self.busy_s + report.seconds,
-            roi_share_sum=self.roi_share_sum + report.roi_share,
-            ages_s=(*self.ages_s[1 - _AGES_KEPT :], report.age_s),
-        )
-
-    def with_outcome(self, outcome: FrameOutcome) -> WorkerStatus:
-        """Return the totals with the skipped stages, detections and keyframes of one mapped frame."""
-        skipped = outcome.timing.skipped_stages
-        return replace(
-            self,
-            under_trained=self.under_trained + outcome.timing.under_trained,
-            publishing_skipped=self.publishing_skipped + (SkippableStage.PUBLISHING in skipped),
-            seeding_skipped=self.seeding_skipped + (SkippableStage.SEEDING in skipped),
+            gaussians=outcome.gaussians,
+            iterations=self.iterations + outcome.iterations,
+            busy_s=self.busy_s + timing.seconds,
+            roi_share_sum=self.roi_share_sum + outcome.roi_share,
+            ages_s=(*self.ages_s[1 - _AGES_KEPT :], age_s),
+            under_trained=self.under_trained + timing.under_trained,
+            publishing_skipped=self.publishing_skipped + (SkippableStage.PUBLISHING in timing.skipped_stages),
+            seeding_skipped=self.seeding_skipped + (SkippableStage.SEEDING in timing.skipped_stages),
             max_detection_lag=max(self.max_detection_lag, outcome.detection_lag_frames or 0),
             keyframes_reevaluated=self.keyframes_reevaluated + outcome.reevaluation.keyframes,
         )
@@ -327,5 +317,9 @@ class StatusHolder:
     def count(self, report: FrameReport, map_revision: int, outcome: FrameOutcome | None = None) -> None:
         """Count one frame; outcome: that of a mapped one."""
         with self._lock:
-            status = self.status if outcome is None else self.status.with_outcome(outcome)
-            self.status = replace(status.with_report(report), map_revision=map_revision)
+            if outcome is not None:
+                status = self.status.with_mapped(outcome, report.age_s)
+            else:
+                kind = report.outcome.value
+                status = replace(self.status, **{kind: getattr(self.status, kind) + 1})
+            self.status = replace(status, map_revision=map_revision)

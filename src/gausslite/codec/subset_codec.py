@@ -4,7 +4,7 @@
              | u8 scale code | u32 voxels | u32 Gaussians | u32 body bytes | f64 voxel size | u64 message_seq
              | u64 update_seq | u8 agent bytes | u8 session bytes
     names    agent id, session id (UTF-8)
-    body     one zstd frame with the columns, and bit fields (`quantised_body.py`, `lossless_body.py`)
+    body     one zstd frame with the columns, and bit fields (`body.py`)
     trailer  u32 CRC32C of everything before it
 
 Numbers are little-endian. The counts determine the size of the columns, so a message with wrong sizes is refused before
@@ -18,14 +18,11 @@ from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import IntEnum
-from types import ModuleType
 
 import google_crc32c
 import numpy as np
 
-from gausslite.codec import lossless_body, quantised_body
-from gausslite.codec.body_layout import VOXEL_BYTES, BodyLayout, require_encodable
+from gausslite.codec.body import CODERS, VOXEL_BYTES, BodyLayout, SubsetCoding, require_encodable
 from gausslite.codec.columns import MAX_COARSE_BITS, PositionPrecision
 from gausslite.codec.stored_voxels import CODES, VOXELS, StoredSubset
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
@@ -38,13 +35,6 @@ _HEADER = struct.Struct("<4sHBBBBBIIIdQQBB")
 _TRAILER = struct.Struct("<I")
 _MAX_NAME_BYTES = 255
 _FRAME_BYTES = 256
-
-
-class SubsetCoding(IntEnum):
-    """How a message stores Gaussians: quantised to the precision that views need, or without any loss."""
-
-    QUANTISED = 0
-    LOSSLESS = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +65,7 @@ def encode_subset(subset: RoiSubset, grid: VoxelGrid, coding: SubsetCoding = Sub
     batch = subset.batch
     require_encodable(batch.gaussians)
     layout = BodyLayout.of(batch, PositionPrecision.of(len(batch.gaussians), int((batch.counts > 0).sum()), grid))
-    body = _coder(coding).encode(batch, grid, layout)
+    body = CODERS[coding].encode(batch, grid, layout)
     agent, session = _name_bytes("agent_id", subset.agent_id), _name_bytes("session_id", subset.session_id)
     precision, of_message = layout.precision, (grid.size_m, subset.message_seq, subset.update_seq)
     header = _Header(
@@ -123,14 +113,10 @@ def _decode(data: bytes, limits: CodecLimits, stated_sums: bool) -> tuple[Stored
     body = data[body_start : -_TRAILER.size]
     with _codec_errors():
         grid = VoxelGrid(header.size_m)
-        voxels = _coder(header.coding).decode(body, grid, layout, header.update_seq, stated_sums)
+        voxels = CODERS[header.coding].decode(body, grid, layout, header.update_seq, stated_sums)
         names = data[names_start:body_start]
         agent_id, session_id = names[: header.agent_bytes].decode(), names[header.agent_bytes :].decode()
         return StoredSubset(agent_id, header.message_seq, header.update_seq, voxels), session_id, grid
-
-
-def _coder(coding: int) -> ModuleType:
-    return lossless_body if coding == SubsetCoding.LOSSLESS else quantised_body
 
 
 @contextmanager
@@ -151,7 +137,7 @@ def split_batch(
     A voxel too large for one message keeps its most opaque Gaussians; its Σkappa stays the total of all.
     """
     capacity = (max_bytes - _HEADER.size - _TRAILER.size - 2 * _MAX_NAME_BYTES - _FRAME_BYTES) * 255 // 256
-    gaussian_bytes = _coder(coding).MAX_GAUSSIAN_BYTES
+    gaussian_bytes = CODERS[coding].gaussian_bytes
     max_count = (capacity - VOXEL_BYTES) // gaussian_bytes
     if max_count < 1:
         raise InvalidInputError(f"max_bytes: expected at least 1100, so that a Gaussian fits, got {max_bytes}")
@@ -178,7 +164,7 @@ def _checked_header(data: bytes, limits: CodecLimits) -> _Header:
         raise CodecError(f"subset: expected {_MAGIC!r} version {VERSION}, got {magic!r} version {version}")
     if google_crc32c.value(data[: -_TRAILER.size]) != _TRAILER.unpack_from(data, len(data) - _TRAILER.size)[0]:
         raise ChecksumError("subset: CRC32C does not match; the message was damaged")
-    if header.coding not in iter(SubsetCoding):
+    if header.coding not in CODERS:
         raise CodecError(f"subset: expected coding 0 or 1, got {header.coding}")
     if header.kappa_bytes not in (1, 2, 4) or header.target_bytes not in (1, 2):
         raise CodecError(f"subset: unknown column widths kappa {header.kappa_bytes}, target {header.target_bytes}")

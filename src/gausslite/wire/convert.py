@@ -63,10 +63,8 @@ def _motion_from_message(message: geometry_pb2.EncodedFrame) -> CameraMotion | N
         if message.readout_seconds != 0.0 or message.exposure_seconds != 0.0:
             raise InvalidInputError("frame twist: expected one with readout_seconds or exposure_seconds, got none")
         return None
-    twist = Twist(
-        _velocity("linear_m_s", message.twist.linear_m_s), _velocity("angular_rad_s", message.twist.angular_rad_s)
-    )
-    return CameraMotion(twist, message.readout_seconds, message.exposure_seconds)
+    velocities = (_velocity(name, getattr(message.twist, name)) for name in ("linear_m_s", "angular_rad_s"))
+    return CameraMotion(Twist(*velocities), message.readout_seconds, message.exposure_seconds)
 
 
 def _velocity(name: str, point: geometry_pb2.Point) -> Float64[ndarray, "3"]:

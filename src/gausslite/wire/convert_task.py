@@ -130,13 +130,10 @@ def assigned_from_message(
     """Decode the request of an AssignTask call; a text is parsed. Raises TaskError, InvalidInputError."""
     pointed = tuple(map(_pointed_from_message, message.pointed))
     excluded_m = tuple(_surface_point_from_message("excluded", point) for point in message.excluded)
-    match message.WhichOneof("task"):
-        case "text":
-            return AssignedTask(parse(message.text), pointed, excluded_m)
-        case "graph":
-            return AssignedTask(graph_from_message(message.graph), pointed, excluded_m)
-        case _:
-            return AssignedTask(None, pointed, excluded_m)
+    kind = message.WhichOneof("task")
+    if kind == "text":
+        return AssignedTask(parse(message.text), pointed, excluded_m)
+    return AssignedTask(graph_from_message(message.graph) if kind else None, pointed, excluded_m)
 
 
 def _pointed_to_message(pointed: PointedObject) -> agent_service_pb2.PointedObject:
