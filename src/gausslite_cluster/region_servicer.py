@@ -11,8 +11,9 @@ from typing import Any
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
+from gausslite.codec.body import SubsetCoding
 from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
-from gausslite.codec.subset_codec import SubsetCoding, encode_subset, split_batch
+from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
-from gausslite.codec.subset_codec import SubsetCoding, decode_subset, encode_subset
+from gausslite.codec.body import SubsetCoding
+from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -23,7 +23,7 @@ from gausslite.wire.clients import AgentClient
 from gausslite.wire.server import Service
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import ChangeNotifier
-from gausslite_agent.background import KeyframeUpload
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.servicer import AgentServicer

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gausslite.codec.body_layout import BodyLayout, decode_differences, decode_kappa_sums, decode_labels, decode_voxels
+from gausslite.codec.body import BodyLayout, decode_differences, decode_kappa_sums, decode_labels, decode_voxels
 from gausslite.codec.columns import (
     MAX_COARSE_BITS,
     MAX_FINE_BITS,

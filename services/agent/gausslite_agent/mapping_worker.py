@@ -7,6 +7,7 @@ map, so the mapper needs no lock.
 
 from __future__ import annotations
 
+import functools
 import logging
 import threading
 import time
@@ -16,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Concatenate, ParamSpec, TypeVar
 
 from gausslite.domain.errors import InvalidInputError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.frame import Frame
@@ -27,27 +28,20 @@ from gausslite.domain.relevance import CameraView, PointedObject, PointM
 from gausslite.domain.task import TaskGraph
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, replace_voxels
 from gausslite.mapping.mapper import GaussianMapper
-from gausslite.mapping.voxel_exchange import InsertedVoxels, SentVoxelTracker
+from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import EstimatorBuilder, build_mapper, build_tracker
 from gausslite.mission.checkpoint import ResumeConfig, save_run
 from gausslite.mission.frame_scheduler import Clock, FrameScheduler
 from gausslite.mission.prior_map import PriorMap
 from gausslite.mission.schedule import MapRecorder, Timeline
 from gausslite.mission.settings import MissionSettings
-from gausslite.mission.task_mapper import TaskMapper
+from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.perception.pointing import pointed_masks
 from gausslite.wire.spool import Purpose
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.background import IdleTraining, KeyframeUpload
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.settings import LoadSettings
 from gausslite_agent.state import FrameReport, MissionCheckpoint, Outcome, SavedMission, StatusHolder, WorkerStatus
-
-
-def _running_future() -> Future[FrameReport]:
-    """Return a future that its receiver cannot cancel."""
-    future: Future[FrameReport] = Future()
-    future.set_running_or_notify_cancel()
-    return future
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,38 +50,29 @@ class QueuedFrame:
 
     frame: Frame
     arrival_s: float
-    report: Future[FrameReport] = field(default_factory=_running_future)
+    report: Future[FrameReport] = field(default_factory=Future)
 
-
-class FrameQueue:
-    """Frames in order of arrival. Thread-safe."""
-
-    def __init__(self, max_frames: int) -> None:
-        self._max_frames = max_frames
-        self._frames: deque[QueuedFrame] = deque()
-        self._lock = threading.Lock()
-
-    def put(self, frame: QueuedFrame) -> QueuedFrame | None:
-        """Add a frame. Return the oldest, which is dropped, if the queue was full."""
-        with self._lock:
-            self._frames.append(frame)
-            return self._frames.popleft() if len(self._frames) > self._max_frames else None
-
-    def get(self) -> QueuedFrame | None:
-        """Remove and return the oldest frame; None if the queue is empty."""
-        with self._lock:
-            return self._frames.popleft() if self._frames else None
-
-    @property
-    def is_empty(self) -> bool:
-        """True if no frame waits."""
-        with self._lock:
-            return not self._frames
+    def __post_init__(self) -> None:
+        # else its receiver could cancel it
+        self.report.set_running_or_notify_cancel()
 
 
 _Result = TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
 _log = logging.getLogger(__name__)
 LOCALISING = "the agent localises itself in the map of --prior"
+
+
+def _on_worker(
+    method: Callable[Concatenate[MappingWorker, _Arguments], _Result],
+) -> Callable[Concatenate[MappingWorker, _Arguments], Future[_Result]]:
+    """Let the method run on the worker thread, between two frames; its caller gets a future."""
+
+    @functools.wraps(method)
+    def queue(self: MappingWorker, /, *arguments: _Arguments.args, **more: _Arguments.kwargs) -> Future[_Result]:
+        return self._submit(lambda: method(self, *arguments, **more))
+
+    return queue
 
 
 class MappingWorker:
@@ -123,64 +108,90 @@ class MappingWorker:
         # the start time, so that revisions from before a restart are never repeated
         self._first_revision = time.time_ns() // 1000
         self._status = StatusHolder(WorkerStatus(map_revision=self._first_revision))
-        self._queue = FrameQueue(self._load.queue_frames)
+        # guarded by the lock: frames arrive on several threads
+        self._queue: deque[QueuedFrame] = deque()
+        self._queue_lock = threading.Lock()
         self._worker = ThreadPoolExecutor(1, "mapper")
-        self._idle = IdleTraining(
-            self._load.idle_iterations,
-            self._idle_step,
-            self._publish_changes,
-            lambda: not self._queue.is_empty,
-            self._schedule,
-        )
+        # idle iterations that are left since the latest frame, whether one is queued, and whether some are unpublished
+        self._idle_left, self._idle_scheduled, self._idle_unpublished = 0, False, False
 
     def status(self) -> WorkerStatus:
         """Return a snapshot of the totals."""
-        return self._status.get()
+        return self._status.status
 
     def revision(self) -> int:
         """Return the map's revision. It increases, also across restarts."""
         return self.status().map_revision
 
+    @_on_worker
     def assign(
         self, graph: TaskGraph | None, pointed: Sequence[PointedObject] = (), excluded_m: Sequence[PointM] = ()
-    ) -> Future[TaskGraph]:
-        """Switch to this task with the next frame; the map is kept and earlier keyframes are re-evaluated.
+    ) -> TaskGraph:
+        """Switch to this task with the next frame, and return it; the map is kept and earlier keyframes re-evaluated.
 
         A task that is equivalent to the current one changes nothing; without one, the current task stays, with what a
-        person points at. The future returns the graph; it raises InvalidInputError, ModelFileError and the like.
+        person points at. Raises InvalidInputError, ModelFileError and the like.
         """
-        return self._submit(lambda: self._assign(graph, pointed, excluded_m))
+        # before any change: a person may point at nothing
+        masks = pointed_masks(pointed, ()) if self._task_mapper is None else self._task_mapper.pointed_masks(pointed)
+        base = graph or self.status().graph or TaskGraph("", "", (), (), ())
+        extended = base.with_pointed(noun for noun, _, _ in masks)
+        task_mapper = self._switch(extended, is_extended=graph is None)
+        task_mapper.point_at(masks, excluded_m)
+        self._report_task(task_mapper)
+        return extended
 
-    def restore(self, saved: SavedMission) -> Future[None]:
-        """Continue a saved mission; call it before the first frame. The future raises MapFileError, StorageError."""
-        return self._submit(lambda: self._restore(saved))
+    @_on_worker
+    def restore(self, saved: SavedMission) -> None:
+        """Continue a saved mission; call it before the first frame. Raises MapFileError, StorageError."""
+        checkpoint = saved.checkpoint
+        task_mapper = self._switch(checkpoint.graph)
+        saved.run.restore(task_mapper)
+        # not before: the fusion server replaces what it has by each report
+        self._report_task(task_mapper)
+        self._last_index = checkpoint.last_index
+        # the clock may have been set back since the mission was saved
+        self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
+        self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
+        # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
+        # and the server may have voxels that the saved map does not
+        self._publish(self._voxels_to_send(self._mapper.gaussians(active_only=True), Purpose.ROI))
+        self._on_change()
 
-    def save(self, path: Path, config: ResumeConfig, requested_task: str) -> Future[float]:
-        """Save the mission after the current frame. The future returns the seconds that it took; 0 without a task.
+    @_on_worker
+    def save(self, path: Path, config: ResumeConfig, requested_task: str) -> float:
+        """Save the mission after the current frame; returns the seconds that it took, 0 without a task.
 
-        requested_task: the task of the command line. The future raises StorageError.
+        requested_task: the task of the command line. Raises StorageError.
         """
-        return self._submit(lambda: self._save(path, config, requested_task))
+        graph, task_mapper = self.status().graph, self._task_mapper
+        if graph is None or task_mapper is None:
+            return 0.0
+        start_s = time.monotonic()
+        checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
+        extra = checkpoint.state() if self.prior is None else {**checkpoint.state(), **self.prior.state()}
+        save_run(path, task_mapper, config, checkpoint.last_index, extra)
+        return time.monotonic() - start_s
 
-    def write_history(self, folder: Path) -> Future[None]:
-        """Write frames.csv and map_history.safetensors, since the program's start. The future raises StorageError."""
+    @_on_worker
+    def write_history(self, folder: Path) -> None:
+        """Write frames.csv and map_history.safetensors, since the program's start. Raises StorageError."""
+        self._timeline.write(folder)
+        self._recorder.write(folder)
 
-        def write() -> None:
-            self._timeline.write(folder)
-            self._recorder.write(folder)
-
-        return self._submit(write)
-
-    def camera_view(self) -> Future[CameraView | None]:
+    @_on_worker
+    def camera_view(self) -> CameraView | None:
         """Return what the camera sees, for a person; None before the first keyframe."""
-        return self._submit(lambda: None if self._task_mapper is None else self._task_mapper.camera_view())
+        return None if self._task_mapper is None else self._task_mapper.camera_view()
 
     def submit(self, frame: Frame) -> Future[FrameReport]:
         """Queue a frame; return the future of its report. Raises MismatchError without a task, UnavailableError."""
         if self.status().graph is None:
             raise MismatchError("frames: expected a task first, got none yet; call AssignTask")
         queued = QueuedFrame(frame, self._clock())
-        dropped = self._queue.put(queued)
+        with self._queue_lock:
+            self._queue.append(queued)
+            dropped = self._queue.popleft() if len(self._queue) > self._load.queue_frames else None
         if dropped is not None:
             self._report_dropped(dropped, f"the queue of {self._load.queue_frames} frames dropped its oldest")
         self._submit(self._map_next)
@@ -196,29 +207,38 @@ class MappingWorker:
 
     def end_idle_training(self) -> Future[None]:
         """End idle training until the next frame, and publish its changes."""
-        return self._submit(self._idle.stop)
+        return self._submit(self._end_idle_training)
 
-    def insert_team_voxels(self, received: VoxelBatch) -> Future[InsertedVoxels]:
-        """Insert voxels that a teammate trained more than this agent; between two frames."""
-        return self._submit(lambda: self._insert_team_voxels(received))
+    @_on_worker
+    def insert_team_voxels(self, received: VoxelBatch) -> None:
+        """Insert voxels that a teammate trained more than this agent."""
+        if self._task_mapper is None:
+            return
+        inserted = self._task_mapper.insert_team_voxels(received, self.grid).gaussians
+        if inserted:
+            count = self.status().team_gaussians + inserted
+            self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
+            self._on_change()
 
-    def handover_batch(self) -> Future[VoxelBatch]:
+    @_on_worker
+    def handover_batch(self) -> VoxelBatch:
         """Return updates of the whole map, except guesses and voxels of an earlier task sent with a higher Σkappa.
 
         Guesses: see `GaussianMapper.shared_gaussians`. Voxels of an earlier handover that the map has lost get
-        tombstones. The future raises StorageError.
+        tombstones. Raises StorageError.
         """
-        return self._submit(lambda: self._voxels_to_send(self._mapper.shared_gaussians()))
+        return self._voxels_to_send(self._mapper.shared_gaussians())
 
-    def select_keyframes(self) -> Future[None]:
+    @_on_worker
+    def select_keyframes(self) -> None:
         """Select the keyframes to hand over from all that the mapper keeps, and pass them to the uplink."""
-        upload = self._keyframe_upload
-        return self.run(lambda mapper: None if upload is None else upload.enqueue_all(mapper.keyframes()))
+        if self._keyframe_upload is not None:
+            self._keyframe_upload.enqueue_all(self._mapper.keyframes())
 
     def close(self) -> None:
         """End the worker after its current frame; waiting frames are dropped."""
         self._worker.shutdown(wait=True, cancel_futures=True)
-        while (queued := self._queue.get()) is not None:
+        while (queued := self._take()) is not None:
             self._report_dropped(queued, "the agent is shutting down")
 
     def _submit(self, work: Callable[[], _Result]) -> Future[_Result]:
@@ -227,22 +247,9 @@ class MappingWorker:
         except RuntimeError as error:
             raise UnavailableError("agent: shutting down; it accepts no more work") from error
 
-    def _schedule(self, work: Callable[[], None]) -> None:
-        # the executor accepts no work while the worker is closing
-        with suppress(UnavailableError):
-            self._submit(work)
-
-    def _assign(
-        self, graph: TaskGraph | None, pointed: Sequence[PointedObject], excluded_m: Sequence[PointM]
-    ) -> TaskGraph:
-        # before any change: a person may point at nothing
-        masks = pointed_masks(pointed, ()) if self._task_mapper is None else self._task_mapper.pointed_masks(pointed)
-        base = graph or self.status().graph or TaskGraph("", "", (), (), ())
-        extended = base.with_pointed(noun for noun, _, _ in masks)
-        task_mapper = self._switch(extended, is_extended=graph is None)
-        task_mapper.point_at(masks, excluded_m)
-        self._report_task(task_mapper)
-        return extended
+    def _take(self) -> QueuedFrame | None:
+        with self._queue_lock:
+            return self._queue.popleft() if self._queue else None
 
     def _switch(self, graph: TaskGraph, is_extended: bool = False) -> TaskMapper:
         """Make this the task of the next frame; return its mapper. is_extended: the same task with more targets."""
@@ -268,40 +275,15 @@ class MappingWorker:
         for noun in task_mapper.nouns:
             _log.info("%s", noun.match.describe())
 
-    def _restore(self, saved: SavedMission) -> None:
-        checkpoint = saved.checkpoint
-        task_mapper = self._switch(checkpoint.graph)
-        saved.run.restore(task_mapper)
-        # not before: the fusion server replaces what it has by each report
-        self._report_task(task_mapper)
-        self._last_index = checkpoint.last_index
-        # the clock may have been set back since the mission was saved
-        self._first_revision = max(self._first_revision, checkpoint.map_revision + 1)
-        self._status.update(gaussians=self._mapper.count, map_revision=self._map_revision())
-        # the spool drops what it has sent; the rest was in flight, or was published after the mission was saved
-        # and the server may have voxels that the saved map does not
-        self._publish(self._voxels_to_send(self._mapper.gaussians(active_only=True), Purpose.ROI))
-        self._on_change()
-
     def _voxels_to_send(self, gaussians: Gaussians, purpose: Purpose | None = None) -> VoxelBatch:
         """Return updates of these voxels, and tombstones of others sent for this purpose. Raises StorageError."""
         batch = self._sent_voxels.exclude_frozen(group_by_voxel(gaussians, self.grid))
         if self.uplink is None:
             return batch
-        return self._sent_voxels.add_tombstones(batch, self.uplink.spooled_voxels(purpose))
-
-    def _save(self, path: Path, config: ResumeConfig, requested_task: str) -> float:
-        graph, task_mapper = self.status().graph, self._task_mapper
-        if graph is None or task_mapper is None:
-            return 0.0
-        start_s = time.monotonic()
-        checkpoint = MissionCheckpoint(self._last_index, graph, requested_task, self.revision())
-        extra = checkpoint.state() if self.prior is None else {**checkpoint.state(), **self.prior.state()}
-        save_run(path, task_mapper, config, checkpoint.last_index, extra)
-        return time.monotonic() - start_s
+        return self._sent_voxels.add_tombstones(batch, self.uplink.spool.voxels(purpose))
 
     def _map_next(self) -> None:
-        queued = self._queue.get()
+        queued = self._take()
         if queued is None:
             return
         try:
@@ -312,7 +294,9 @@ class MappingWorker:
         except Exception as error:
             # the caller gets the error; the worker continues with the next frame
             queued.report.set_exception(error)
-        self._idle.start()
+        self._idle_left = self._load.idle_iterations
+        if not self._idle_scheduled and self._idle_left > 0:
+            self._train_idle()
 
     def _map(self, queued: QueuedFrame) -> FrameReport:
         assert self._task_mapper is not None
@@ -326,7 +310,7 @@ class MappingWorker:
         if outcome.skipped is not None:
             return self._count(FrameReport(frame.index, Outcome.SKIPPED, outcome.skipped, gaussians=outcome.gaussians))
         if outcome.changed_roi is not None:
-            self._idle.mark_published()
+            self._idle_unpublished = False
         report = FrameReport(
             frame.index,
             Outcome.MAPPED,
@@ -338,11 +322,10 @@ class MappingWorker:
         )
         if self._keyframe_upload is not None:
             self._keyframe_upload.enqueue_newest(self._mapper.keyframes())
-        self._status.add_outcome(outcome)
         self._timeline.add(outcome)
         self._recorder.record(self._mapper.poses, self._mapper.gaussians)
         self._status.update(correction=self._correction(), corrected_at_s=time.monotonic())
-        self._count(report)
+        self._count(report, outcome)
         self._on_change()
         return report
 
@@ -383,26 +366,35 @@ class MappingWorker:
         if self.uplink is not None and graph is not None:
             self.uplink.report_objects(ObjectReport(graph, objects))
 
-    def _insert_team_voxels(self, received: VoxelBatch) -> InsertedVoxels:
-        if self._task_mapper is None:
-            return InsertedVoxels(empty_batch(), 0)
-        inserted = self._task_mapper.insert_team_voxels(received, self.grid)
-        if inserted.gaussians:
-            count = self.status().team_gaussians + inserted.gaussians
-            self._status.update(team_gaussians=count, gaussians=self._mapper.count, map_revision=self._map_revision())
-            self._on_change()
-        return inserted
+    def _train_idle(self) -> None:
+        """Train one iteration if no frame waits, and schedule the next behind all queued work.
 
-    def _idle_step(self) -> bool:
-        if self._task_mapper is None or not self._task_mapper.idle_step():
-            return False
-        self._status.update(idle_iterations=self.status().idle_iterations + 1)
-        return True
+        An error is logged, because no caller waits for the result, and ends the iterations until the next frame.
+        """
+        self._idle_scheduled = not self._queue
+        if not self._idle_scheduled:
+            return
+        try:
+            if self._idle_left == 0 or self._task_mapper is None or not self._task_mapper.idle_step():
+                self._end_idle_training()
+                return
+            self._status.update(idle_iterations=self.status().idle_iterations + 1)
+            self._idle_left -= 1
+            self._idle_unpublished = True
+            # the executor accepts no work while the worker is closing
+            with suppress(UnavailableError):
+                self._submit(self._train_idle)
+        except Exception:
+            _log.exception("an idle iteration failed; idle training continues after the next frame")
+            self._idle_left, self._idle_scheduled = 0, False
 
-    def _publish_changes(self) -> None:
-        batch = None if self._task_mapper is None else self._task_mapper.changed_roi()
-        if batch is not None:
-            self._publish(batch)
+    def _end_idle_training(self) -> None:
+        self._idle_left, self._idle_scheduled = 0, False
+        if self._idle_unpublished and self._task_mapper is not None:
+            self._idle_unpublished = False
+            batch = self._task_mapper.changed_roi()
+            if batch is not None:
+                self._publish(batch)
 
     def _publish(self, batch: VoxelBatch) -> None:
         """Pass updates to the uplink. Those that its spool refuses are published again with the next frame."""
@@ -423,8 +415,8 @@ class MappingWorker:
     def _report_dropped(self, queued: QueuedFrame, reason: str) -> None:
         queued.report.set_result(self._count(FrameReport(queued.frame.index, Outcome.DROPPED, reason)))
 
-    def _count(self, report: FrameReport) -> FrameReport:
-        self._status.add_report(report, self._map_revision())
+    def _count(self, report: FrameReport, outcome: FrameOutcome | None = None) -> FrameReport:
+        self._status.count(report, self._map_revision(), outcome)
         return report
 
     def _map_revision(self) -> int:

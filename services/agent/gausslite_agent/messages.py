@@ -10,26 +10,14 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.convert import encode_colour, encode_depth, transform_to_message, values_of
+from gausslite.wire.convert import encode_colour, encode_depth, enum_numbers, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
 from gausslite.wire.update_sender import UplinkCounters
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport, MissionState, MissionSummary, Outcome, WorkerStatus
 
-_STATES = {
-    MissionState.WAITING_FOR_TASK: pb.AGENT_STATE_WAITING_FOR_TASK,
-    MissionState.MAPPING: pb.AGENT_STATE_MAPPING,
-    MissionState.DRAINING: pb.AGENT_STATE_DRAINING,
-    MissionState.HANDING_OVER: pb.AGENT_STATE_HANDING_OVER,
-    MissionState.ENDED: pb.AGENT_STATE_ENDED,
-    MissionState.FAILED: pb.AGENT_STATE_FAILED,
-}
-_OUTCOMES = {
-    Outcome.MAPPED: pb.FRAME_OUTCOME_MAPPED,
-    Outcome.SKIPPED: pb.FRAME_OUTCOME_SKIPPED,
-    Outcome.DROPPED: pb.FRAME_OUTCOME_DROPPED,
-    Outcome.REJECTED: pb.FRAME_OUTCOME_REJECTED,
-}
+_STATES = enum_numbers(pb.AgentState, MissionState)
+_OUTCOMES = enum_numbers(pb.FrameOutcome, Outcome)
 
 
 def report_to_message(report: FrameReport) -> pb.IngestFramesResponse:

@@ -118,8 +118,7 @@ class AgentMission:
         # set while no source is mapped
         self._replay_ended = threading.Event()
         self._replay_ended.set()
-        self._stopping = threading.Event()
-        self._stop_deadline_s: float | None = None
+        self._stopping, self._was_stopped = threading.Event(), False
         self._ending = threading.Lock()
         # the first request to end this mission; it counts also if the thread that maps the source ends the mission
         self._requested: EndRequest | None = None
@@ -131,14 +130,10 @@ class AgentMission:
         return self._state_machine.state
 
     @property
-    def failure(self) -> str:
-        """The error that ended the mission; empty unless it failed."""
-        return self._state_machine.failure
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """Messages for the operator about the mission itself."""
-        failed = (f"the mission failed: {self.failure}",) if self.failure else ()
+        failure = self._state_machine.failure
+        failed = (f"the mission failed: {failure}",) if failure else ()
         return (*failed, *self._source_notes, *(() if self.can_find else (NO_DETECTOR,)))
 
     @property
@@ -148,7 +143,7 @@ class AgentMission:
 
     def stop(self, grace_s: float = 0.0) -> None:
         """End the mission after the current frame; sending ends after `grace_s` seconds, also if it has begun."""
-        self._stop_deadline_s = time.monotonic() + grace_s
+        self._was_stopped = True
         self._stopping.set()
         if self._worker.uplink is not None:
             self._worker.uplink.limit_drain(grace_s)
@@ -220,7 +215,7 @@ class AgentMission:
         Raises MismatchError before the first task, StorageError if the results cannot be written; the mission is FAILED
         then and can be ended again.
         """
-        if self._state_machine.state is MissionState.WAITING_FOR_TASK:
+        if self.state is MissionState.WAITING_FOR_TASK:
             raise MismatchError("mission: expected a task first, got none yet; call AssignTask")
         self._requested = self._requested or request
         self._stopping.set()
@@ -231,7 +226,7 @@ class AgentMission:
         """End the mission because the process ends; one without a task has nothing to send or write."""
         self._stopping.set()
         self._replay_ended.wait()
-        if self._state_machine.state is not MissionState.WAITING_FOR_TASK:
+        if self.state is not MissionState.WAITING_FOR_TASK:
             self._end(self.end_by_options, None)
 
     def describe_lost_data(self) -> str:
@@ -257,7 +252,7 @@ class AgentMission:
 
     def save_if_mapping(self) -> float:
         """Do the same, unless the mission is not mapping now."""
-        return self.save() if self._state_machine.state is MissionState.MAPPING else 0.0
+        return self.save() if self.state is MissionState.MAPPING else 0.0
 
     def _require_later(self, time_ns: int) -> None:
         latest_ns = self._latest_ns
@@ -271,7 +266,7 @@ class AgentMission:
         self._latest_ns = time_ns
 
     def _begin(self) -> None:
-        if self._state_machine.state is not MissionState.MAPPING:
+        if self.state is not MissionState.MAPPING:
             self._summary = self._requested = None
             self._latest_ns = _BEFORE_ALL_NS
             self._state_machine.enter(MissionState.MAPPING)
@@ -326,8 +321,8 @@ class AgentMission:
         self.save()
         if self._worker.uplink is not None:
             self._send_all(self._worker.uplink, request)
-        if ended_by is None and (self._settings.source is not None or self._stop_deadline_s is not None):
-            ended_by = _INTERRUPTED if self._stopping.is_set() else None
+        if self._stopping.is_set() and (self._settings.source is not None or self._was_stopped):
+            ended_by = ended_by or _INTERRUPTED
         gaussians = self._worker.run(lambda mapper: mapper.gaussians()).result()
         status, uplink = self._worker.status(), self._worker.uplink
         for note in status.task_notes:

@@ -30,7 +30,7 @@ from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.uplink import Uplink
 from gausslite.wire.views import ChangeNotifier
-from gausslite_agent.background import KeyframeUpload
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import NO_DETECTOR, AgentMission
 from gausslite_agent.servicer import AgentServicer
@@ -259,14 +259,8 @@ def _follow_team_map(settings: AgentSettings, worker: MappingWorker, stack: Exit
     link = settings.link
     if link.fusion is None or link.team_map == NONE:
         return
-    follower = TeamMapFollower(
-        FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls),
-        settings.agent_id,
-        link.grid,
-        link.team_map,
-        lambda: worker.status().graph,
-        lambda batch: worker.insert_team_voxels(batch).result(),
-    )
+    client = FusionClient(link.fusion, mission_id=link.mission_id, tls=settings.tls)
+    follower = TeamMapFollower(client, settings.agent_id, link.team_map, worker)
     stack.callback(follower.close)
 
 

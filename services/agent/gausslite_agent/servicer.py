@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Hashable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +18,6 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.task import TaskGraph, TaskParser
 from gausslite.domain.voxel_changes import RevisionLog, VoxelChangeTracker, VoxelSignatures
 from gausslite.domain.voxels import (
-    AxisAlignedBox,
     VoxelBatch,
     VoxelGrid,
     VoxelIndex,
@@ -55,16 +54,6 @@ from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapChanges:
-    """The voxels that lead from a revision (0: nothing) to another one, of the whole map or of the task's region."""
-
-    roi_only: bool
-    since_revision: int
-    revision: int
-    batch: VoxelBatch
-
-
 class MapChangeLog:
     """The map's voxels at its latest revision, and the revision at which each last changed. Not thread-safe."""
 
@@ -94,11 +83,8 @@ class MapChangeLog:
             self._log = RevisionLog(revision)
         self._log.record(signatures.keys[changed].tolist(), removed.tolist(), revision)
 
-    def since(self, revision: int) -> MapChanges:
+    def since(self, revision: int) -> VoxelBatch:
         """Return updates of all voxels that changed after a revision; 0: the whole map. Raises RevisionGoneError."""
-        return MapChanges(self._roi_only, revision, self.revision, self._batch_since(revision))
-
-    def _batch_since(self, revision: int) -> VoxelBatch:
         if revision == 0:
             return self._batch
         if self._log is None:
@@ -110,30 +96,25 @@ class MapChangeLog:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentMapReader:
-    """Reads the part of changes in a region for one watcher. The cache is that of all watchers."""
+    """Reads voxels that lead to a revision. key: what they are, in the cache of all watchers' encoded parts."""
 
-    changed: MapChanges
-    region: AxisAlignedBox | None
-    grid: VoxelGrid
-    agent_id: str
+    revision: int
+    batch: VoxelBatch
+    key: tuple[Hashable, ...]
+    encode: Callable[[VoxelBatch], tuple[EncodedPart, ...]]
     cache: EncodedPartCache
 
     def snapshot(self) -> tuple[int, Parts]:
-        """Return the revision of the changes and, in parts, their voxels: the whole map."""
-        return self.changed.revision, self._parts()
+        """Return the revision and, in parts, the voxels: the whole map."""
+        return self.revision, self._parts()
 
     def changes(self, since_revision: int) -> tuple[int, Parts]:
-        """Return the revision of the changes and, in parts, their voxels; none if the watcher has this revision."""
-        is_current = since_revision == self.changed.revision
-        return self.changed.revision, () if is_current else self._parts()
+        """Return the revision and, in parts, the voxels; none if the watcher has this revision."""
+        return self.revision, () if since_revision == self.revision else self._parts()
 
     def _parts(self) -> Iterator[tuple[EncodedPart, ...]]:
-        changed, batch = self.changed, self.changed.batch
-        if self.region is not None:
-            batch = crop_to_box(batch, self.region, self.grid)
-        key = changed.roi_only, self.region, changed.since_revision, changed.revision
-        for number, part in enumerate(split_batch(batch, BLOCK_BYTES)):
-            yield self.cache.get((*key, number), partial(encode_parts, part, self.grid, self.agent_id))
+        for number, part in enumerate(split_batch(self.batch, BLOCK_BYTES)):
+            yield self.cache.get((*self.key, self.revision, number), partial(self.encode, part))
 
 
 _OUTCOMES_AHEAD = 16
@@ -255,18 +236,21 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
     ) -> AsyncIterator[pb.WatchMapResponse]:
         """Yield a snapshot of the map, then its changes. A slow reader gets merged changes; nothing is queued."""
         region = box_from_message(request.region) if request.HasField("region") else None
-        change_log = self._change_logs[request.roi_only]
+        change_log, grid = self._change_logs[request.roi_only], self._worker.grid
+
+        def read_changes(since_revision: int) -> AgentMapReader:
+            # the mapper is only copied on its thread, and once for all watchers of a revision
+            if change_log.revision < self._worker.revision():
+                copied = self._worker.run(lambda mapper: (mapper.gaussians(), self._worker.revision()))
+                change_log.update(*copied.result())
+            batch = change_log.since(since_revision)
+            cropped = batch if region is None else crop_to_box(batch, region, grid)
+            encode = partial(encode_parts, grid=grid, sender=self._agent_id)
+            key = request.roi_only, region, since_revision
+            return AgentMapReader(change_log.revision, cropped, key, encode, self._encoded_parts)
 
         async def read(since_revision: int) -> AgentMapReader:
-            def read_changes() -> MapChanges:
-                # the mapper is only copied on its thread, and once for all watchers of a revision
-                if change_log.revision < self._worker.revision():
-                    copied = self._worker.run(lambda mapper: (mapper.gaussians(), self._worker.revision()))
-                    change_log.update(*copied.result())
-                return change_log.since(since_revision)
-
-            changes = await asyncio.get_running_loop().run_in_executor(self._comparing, read_changes)
-            return AgentMapReader(changes, region, self._worker.grid, self._agent_id, self._encoded_parts)
+            return await asyncio.get_running_loop().run_in_executor(self._comparing, read_changes, since_revision)
 
         blocks = follow(read, self._worker.revision, request.since_revision, self._changes, asyncio.to_thread)
         async for block in blocks:

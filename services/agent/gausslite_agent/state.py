@@ -119,13 +119,11 @@ class MissionSummary:
             f"{uplink.keyframes_sent} keyframes in {size_text(uplink.keyframe_bytes)}, "
             f"a handover of {size_text(uplink.handover_bytes)}"
         )
-        return f"{mapped}; sent {sent}; {self._left(uplink)}"
-
-    def _left(self, uplink: UplinkCounters) -> str:
         if self.is_complete:
-            return "nothing was left"
+            return f"{mapped}; sent {sent}; nothing was left"
         stays = f"in {self.spool} until the agent runs again" if self.spool is not None else "lost when the agent ends"
-        return f"left {uplink.voxels_waiting} voxels and {uplink.keyframes_waiting} keyframes, {stays}"
+        left = f"{uplink.voxels_waiting} voxels and {uplink.keyframes_waiting} keyframes"
+        return f"{mapped}; sent {sent}; left {left}, {stays}"
 
 
 class MissionState(Enum):
@@ -154,42 +152,30 @@ class MissionStateMachine:
     """The current state of the mission. Thread-safe."""
 
     def __init__(self) -> None:
-        self._state = MissionState.WAITING_FOR_TASK
-        self._failure = ""
-        self._lock = threading.Lock()
-
-    @property
-    def state(self) -> MissionState:
+        self.state = MissionState.WAITING_FOR_TASK
         """The current state."""
-        with self._lock:
-            return self._state
-
-    @property
-    def failure(self) -> str:
+        self.failure = ""
         """The error that ended the mission; empty unless FAILED."""
-        with self._lock:
-            return self._failure
+        self._lock = threading.Lock()
 
     def enter(self, state: MissionState, failure: str = "") -> None:
         """Enter this state. Raises MismatchError if it cannot follow the current one; failure: the error of FAILED."""
         with self._lock:
-            if state not in _FOLLOWING[self._state]:
-                raise MismatchError(f"mission: expected a state that can follow {self._state.value}, got {state.value}")
-            self._state, self._failure = state, failure
+            if state not in _FOLLOWING[self.state]:
+                raise MismatchError(f"mission: expected a state that can follow {self.state.value}, got {state.value}")
+            self.state, self.failure = state, failure
 
     def require_accepting(self, what: str) -> None:
         """Raise MismatchError while the mission ends; what: the data that it would have accepted."""
-        with self._lock:
-            if self._state in _ENDING:
-                raise MismatchError(f"{what}: expected a mission that accepts it, got one that is {self._state.value}")
+        if (state := self.state) in _ENDING:
+            raise MismatchError(f"{what}: expected a mission that accepts it, got one that is {state.value}")
 
     def require_mapping(self) -> None:
         """Raise MismatchError if frames cannot be mapped now."""
-        with self._lock:
-            if self._state is not MissionState.MAPPING:
-                raise MismatchError(
-                    f"frames: expected a mission that is mapping, got one that is {self._state.value}; call AssignTask"
-                )
+        if (state := self.state) is not MissionState.MAPPING:
+            raise MismatchError(
+                f"frames: expected a mission that is mapping, got one that is {state.value}; call AssignTask"
+            )
 
 
 _AGES_KEPT = 1000
@@ -296,56 +282,44 @@ class WorkerStatus:
         """Return the percentile of the latest frames' ages; 0 before the first."""
         return float(np.percentile(self.ages_s, percent)) if self.ages_s else 0.0
 
-    def with_report(self, report: FrameReport) -> WorkerStatus:
-        """Return the totals with one more frame."""
-        if report.outcome is not Outcome.MAPPED:
-            return replace(self, **{report.outcome.value: getattr(self, report.outcome.value) + 1})
+    def with_mapped(self, outcome: FrameOutcome, age_s: float) -> WorkerStatus:
+        """Return the totals with one more mapped frame."""
+        timing = outcome.timing
         return replace(
             self,
             mapped=self.mapped + 1,
-            gaussians=report.gaussians,
-            iterations=self.iterations + report.iterations,
-            busy_s=self.busy_s + report.seconds,
-            roi_share_sum=self.roi_share_sum + report.roi_share,
-            ages_s=(*self.ages_s[1 - _AGES_KEPT :], report.age_s),
-        )
-
-    def with_outcome(self, outcome: FrameOutcome) -> WorkerStatus:
-        """Return the totals with the skipped stages, detections and keyframes of one mapped frame."""
-        skipped = outcome.timing.skipped_stages
-        return replace(
-            self,
-            under_trained=self.under_trained + outcome.timing.under_trained,
-            publishing_skipped=self.publishing_skipped + (SkippableStage.PUBLISHING in skipped),
-            seeding_skipped=self.seeding_skipped + (SkippableStage.SEEDING in skipped),
+            gaussians=outcome.gaussians,
+            iterations=self.iterations + outcome.iterations,
+            busy_s=self.busy_s + timing.seconds,
+            roi_share_sum=self.roi_share_sum + outcome.roi_share,
+            ages_s=(*self.ages_s[1 - _AGES_KEPT :], age_s),
+            under_trained=self.under_trained + timing.under_trained,
+            publishing_skipped=self.publishing_skipped + (SkippableStage.PUBLISHING in timing.skipped_stages),
+            seeding_skipped=self.seeding_skipped + (SkippableStage.SEEDING in timing.skipped_stages),
             max_detection_lag=max(self.max_detection_lag, outcome.detection_lag_frames or 0),
             keyframes_reevaluated=self.keyframes_reevaluated + outcome.reevaluation.keyframes,
         )
 
 
 class StatusHolder:
-    """The current WorkerStatus, for the worker and for the readers on other threads."""
+    """The current WorkerStatus. Thread-safe: frames are counted on the worker and where they arrive."""
 
     def __init__(self, status: WorkerStatus) -> None:
-        self._status = status
+        self.status = status
+        """The current one."""
         self._lock = threading.Lock()
-
-    def get(self) -> WorkerStatus:
-        """Return the current status."""
-        with self._lock:
-            return self._status
 
     def update(self, **changes: Any) -> None:
         """Replace these fields."""
         with self._lock:
-            self._status = replace(self._status, **changes)
+            self.status = replace(self.status, **changes)
 
-    def add_report(self, report: FrameReport, map_revision: int) -> None:
-        """Count one frame."""
+    def count(self, report: FrameReport, map_revision: int, outcome: FrameOutcome | None = None) -> None:
+        """Count one frame; outcome: that of a mapped one."""
         with self._lock:
-            self._status = replace(self._status.with_report(report), map_revision=map_revision)
-
-    def add_outcome(self, outcome: FrameOutcome) -> None:
-        """Count what one mapped frame skipped, detected and re-evaluated."""
-        with self._lock:
-            self._status = self._status.with_outcome(outcome)
+            if outcome is not None:
+                status = self.status.with_mapped(outcome, report.age_s)
+            else:
+                kind = report.outcome.value
+                status = replace(self.status, **{kind: getattr(self.status, kind) + 1})
+            self.status = replace(status, map_revision=map_revision)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,10 +16,10 @@ from gausslite.domain.gaussians import move_gaussians
 from gausslite.domain.objects import TeamObject
 from gausslite.domain.pose import inverse
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, VoxelGrid, empty_batch, group_by_voxel, select_voxels
-from gausslite.mapping.voxel_exchange import InsertedVoxels
+from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch, VoxelGrid, group_by_voxel, select_voxels
 from gausslite.wire.clients import FusionClient
 from gausslite.wire.convert import MapUpdate, transform_from_message
+from gausslite_agent.mapping_worker import MappingWorker
 
 _MARGIN_M = 0.05
 
@@ -64,15 +63,6 @@ def _grown(box: AxisAlignedBox) -> AxisAlignedBox:
 
 _log = logging.getLogger(__name__)
 _INTERVAL_S = 2.0
-InsertVoxels = Callable[[VoxelBatch], InsertedVoxels]
-
-
-@dataclass(slots=True)
-class TeamMapCounters:
-    """Inserted Gaussians by the teammate that trained them, and the received Gaussians of the region."""
-
-    inserted: Counter[str] = field(default_factory=Counter)
-    received: int = 0
 
 
 class TeamMapFollower:
@@ -81,19 +71,8 @@ class TeamMapFollower:
     layer: "vote" for the teammates' voxels as they trained them, "refined" also for the refinement of own voxels.
     """
 
-    def __init__(
-        self,
-        client: FusionClient,
-        agent_id: str,
-        grid: VoxelGrid,
-        layer: str,
-        task: Callable[[], TaskGraph | None],
-        insert: InsertVoxels,
-    ) -> None:
-        """task: returns the agent's current task; insert: inserts voxels and waits for the result."""
-        self._client, self._agent_id, self._grid, self._layer = client, agent_id, grid, layer
-        self._task, self._insert = task, insert
-        self.counters = TeamMapCounters()
+    def __init__(self, client: FusionClient, agent_id: str, layer: str, worker: MappingWorker) -> None:
+        self._client, self._agent_id, self._layer, self._worker = client, agent_id, layer, worker
         self._region = TeamRegion()
         self._revision = 0
         self._last_error = ""
@@ -109,7 +88,7 @@ class TeamMapFollower:
 
     def follow_once(self) -> None:
         """Read the changes since the last call and insert those of the task's region. Raises GaussLiteError."""
-        graph = self._task()
+        graph = self._worker.status().graph
         if graph is None or self._agent_id in self._client.unlocalised():
             return
         region = TeamRegion.of(graph, self._client.query_objects())
@@ -137,21 +116,22 @@ class TeamMapFollower:
         T_agent_fused = inverse(self._own_frame())
         exclude = "" if self._layer == "refined" else self._agent_id
         updates = self._client.watch(self._revision, region.bounds, self._layer, exclude)
-        for update in _until_complete(updates):
+        for update in updates:
             if update.batch is not None:
                 self._insert_region(update, region, T_agent_fused)
             self._revision = update.revision
+            if update.last:
+                # the revision is complete; the stream ends with its iterator
+                return
 
     def _insert_region(self, update: MapUpdate, region: TeamRegion, T_agent_fused: Float64[ndarray, "4 4"]) -> None:
         assert update.batch is not None
         winners = np.array([*update.winners, *[""] * (len(update.batch) - len(update.winners))])
         for agent_id in sorted(set(winners.tolist())):
-            batch = region.select(select_voxels(update.batch, winners == agent_id), self._grid)
-            self.counters.received += len(batch.gaussians)
-            moved = group_by_voxel(move_gaussians(batch.gaussians, T_agent_fused), self._grid)
-            inserted = self._insert(moved) if len(moved) else InsertedVoxels(empty_batch(), 0)
-            if inserted.gaussians:
-                self.counters.inserted[agent_id] += inserted.gaussians
+            batch = region.select(select_voxels(update.batch, winners == agent_id), self._worker.grid)
+            moved = group_by_voxel(move_gaussians(batch.gaussians, T_agent_fused), self._worker.grid)
+            if len(moved):
+                self._worker.insert_team_voxels(moved).result()
 
     def _own_frame(self) -> Float64[ndarray, "4 4"]:
         """Return T_fused_agent of this agent, as the server estimates it."""
@@ -159,11 +139,3 @@ class TeamMapFollower:
             if agent.agent_id == self._agent_id and len(agent.alignment.t_fused_agent.row_major) == 16:
                 return transform_from_message("t_fused_agent", agent.alignment.t_fused_agent)
         return np.eye(4)
-
-
-def _until_complete(updates: Iterable[MapUpdate]) -> Iterable[MapUpdate]:
-    """Yield the parts of one revision, then close the stream."""
-    for update in updates:
-        yield update
-        if update.last:
-            break

@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import accumulate
+from typing import Any, NamedTuple
 
 import numpy as np
 import zstandard
@@ -60,9 +61,7 @@ def compress_columns(arrays: Sequence[NDArray[Any]], columns: Sequence[Column]) 
     packed = [
         _shuffle(np.ascontiguousarray(array, column.dtype)) for array, column in zip(arrays, columns, strict=True)
     ]
-    compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compressobj(
-        size=sum(len(column_bytes) for column_bytes in packed)
-    )
+    compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compressobj(size=sum(map(len, packed)))
     parts = []
     for column_bytes in packed:
         parts += [compressor.compress(column_bytes), compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
@@ -71,13 +70,9 @@ def compress_columns(arrays: Sequence[NDArray[Any]], columns: Sequence[Column]) 
 
 def decompress_columns(frame: bytes, columns: Sequence[Column]) -> list[NDArray[Any]]:
     """Return the arrays. Raises CodecError, before memory is allocated, if the frame declares another size."""
-    sizes = [column.byte_count for column in columns]
-    raw = decompress(frame, sum(sizes))
-    arrays, start = [], 0
-    for column, byte_count in zip(columns, sizes, strict=True):
-        arrays.append(_unshuffle(raw[start : start + byte_count], column))
-        start += byte_count
-    return arrays
+    ends = list(accumulate(column.byte_count for column in columns))
+    raw = decompress(frame, ends[-1])
+    return [_unshuffle(raw[end - column.byte_count : end], column) for column, end in zip(columns, ends, strict=True)]
 
 
 def decompress(frame: bytes, size: int) -> bytes:
@@ -120,14 +115,12 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 def encode_scales(scales_m: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
     """Encode scales on a logarithmic grid, clamped to SCALE_MIN_M and SCALE_MAX_M."""
     octaves = np.log2(np.clip(scales_m.astype(np.float64), SCALE_MIN_M, SCALE_MAX_M)) - SCALE_MIN_EXPONENT
-    codes: UInt8[ndarray, "n 3"] = np.rint(octaves * SCALE_STEPS_PER_OCTAVE).astype(np.uint8)
-    return codes
+    return np.asarray(np.rint(octaves * SCALE_STEPS_PER_OCTAVE), np.uint8)
 
 
 def decode_scales(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
     """Decode scales in metres."""
-    scales_m: Float32[ndarray, "n 3"] = _SCALES_M[codes]
-    return scales_m
+    return np.asarray(_SCALES_M[codes])
 
 
 _SCALES_M = np.exp2(SCALE_MIN_EXPONENT + np.arange(256) / SCALE_STEPS_PER_OCTAVE).astype(np.float32)
@@ -141,16 +134,11 @@ def quat_steps(scale_codes: UInt8[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
     """
     # NumPy reduces three long rows much faster than many short ones
     axes = np.ascontiguousarray(scale_codes.T)
-    steps: Int64[ndarray, " n"] = _STEPS_BY_SPREAD[axes.max(axis=0) - axes.min(axis=0)]
-    return steps
+    return np.asarray(_STEPS_BY_SPREAD[axes.max(axis=0) - axes.min(axis=0)])
 
 
-def _steps_by_spread() -> Int64[ndarray, " 256"]:
-    ratios = 2.0 ** (np.arange(256) / SCALE_STEPS_PER_OCTAVE)
-    return np.minimum(np.ceil(_QUAT_PRECISION / 2 * (ratios - 1 / ratios)), MAX_QUAT_STEPS).astype(np.int64)
-
-
-_STEPS_BY_SPREAD = _steps_by_spread()
+_RATIOS = 2.0 ** (np.arange(256) / SCALE_STEPS_PER_OCTAVE)
+_STEPS_BY_SPREAD = np.minimum(np.ceil(_QUAT_PRECISION / 2 * (_RATIOS - 1 / _RATIOS)), MAX_QUAT_STEPS).astype(np.int64)
 QUAT_STEPS = _STEPS_BY_SPREAD.astype(np.uint8).tobytes()
 """The steps by the difference between the largest and the smallest code of a scale, a byte each."""
 
@@ -179,8 +167,7 @@ def decode_quats(
     # a round Gaussian has no steps and no rotation
     full[rows, largest] = np.maximum(steps, 1)
     full[rows[:, None], _OTHERS[largest]] = offsets
-    quats_wxyz: Float32[ndarray, "n 4"] = (full / np.linalg.norm(full, axis=1, keepdims=True)).astype(np.float32)
-    return quats_wxyz
+    return np.asarray(full / np.linalg.norm(full, axis=1, keepdims=True), np.float32)
 
 
 def encode_opacities(opacities: Float32[ndarray, " n"]) -> UInt8[ndarray, " n"]:
@@ -199,17 +186,9 @@ def encode_rgb(rgb: Float32[ndarray, "n 3"]) -> UInt8[ndarray, "n 3"]:
     orange = red - blue
     middle = blue + orange / 2
     lime = green - middle
-    luma = middle + lime / 2
-    codes = np.stack(
-        [
-            (luma - _LUMA_MIN) * _LUMA_STEPS,
-            (orange - _CHROMA_MIN) * _CHROMA_STEPS,
-            (lime - _CHROMA_MIN) * _CHROMA_STEPS,
-        ],
-        axis=1,
-    )
-    clamped: UInt8[ndarray, "n 3"] = np.clip(np.rint(codes), 0, _MAX_COLOUR_CODE).astype(np.uint8)
-    return clamped
+    luma = (middle + lime / 2 - _LUMA_MIN) * _LUMA_STEPS
+    codes = np.stack([luma, *((chroma - _CHROMA_MIN) * _CHROMA_STEPS for chroma in (orange, lime))], axis=1)
+    return np.asarray(np.clip(np.rint(codes), 0, _MAX_COLOUR_CODE), np.uint8)
 
 
 def decode_rgb(codes: UInt8[ndarray, "n 3"]) -> Float32[ndarray, "n 3"]:
@@ -228,8 +207,7 @@ _CELL_SHARE = 0.5
 _FRACTIONS = 1 << (MAX_FINE_BITS + 1)
 
 
-@dataclass(frozen=True, slots=True)
-class PositionPrecision:
+class PositionPrecision(NamedTuple):
     """Bits per axis of the positions of a message.
 
     coarse_bits: those of the Morton code. scale_code: code of the scale that equals two voxels; a Gaussian whose
@@ -251,8 +229,7 @@ class PositionPrecision:
         """Return the bits per axis of each Gaussian's position."""
         smallest = np.ascontiguousarray(scale_codes.T).min(axis=0).astype(np.int64)
         bits = -((smallest - self.scale_code) // SCALE_STEPS_PER_OCTAVE)
-        clipped: Int64[ndarray, " n"] = np.clip(bits, self.coarse_bits, MAX_FINE_BITS)
-        return clipped
+        return np.asarray(np.clip(bits, self.coarse_bits, MAX_FINE_BITS))
 
 
 def cells_of(

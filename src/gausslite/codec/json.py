@@ -53,15 +53,9 @@ def graph_from_json(value: Mapping[str, Any]) -> TaskGraph:
 
 
 def _relation_as_json(relation: Relation) -> dict[str, Any]:
-    value: dict[str, Any] = {
-        "predicate": str(relation.predicate),
-        "target": relation.target,
-        "anchor": relation.anchor,
-    }
-    if relation.negated:
-        value["negated"] = True
-    bounds_m = {"min_m": relation.min_m, "max_m": relation.max_m}
-    return value | {name: bound_m for name, bound_m in bounds_m.items() if bound_m is not None}
+    required = {"predicate": str(relation.predicate), "target": relation.target, "anchor": relation.anchor}
+    optional = {"negated": relation.negated or None, "min_m": relation.min_m, "max_m": relation.max_m}
+    return required | {name: value for name, value in optional.items() if value is not None}
 
 
 def _relation_from_json(value: Mapping[str, Any] | list[str]) -> Relation:
@@ -72,14 +66,8 @@ def _relation_from_json(value: Mapping[str, Any] | list[str]) -> Relation:
     if unknown:
         raise ValueError(f"relation: expected predicate, target, anchor, negated, min_m and max_m, got {unknown}")
     min_m, max_m = (None if value.get(name) is None else float(value[name]) for name in ("min_m", "max_m"))
-    return Relation(
-        Predicate(value["predicate"]),
-        str(value["target"]),
-        str(value["anchor"]),
-        bool(value.get("negated", False)),
-        min_m,
-        max_m,
-    )
+    nouns, negated = (str(value["target"]), str(value["anchor"])), bool(value.get("negated", False))
+    return Relation(Predicate(value["predicate"]), *nouns, negated, min_m, max_m)
 
 
 def _attributes_as_json(attributes: ObjectAttributes) -> dict[str, str]:
@@ -90,11 +78,9 @@ def _attributes_as_json(attributes: ObjectAttributes) -> dict[str, str]:
 def _attributes_from_json(name: str, value: Mapping[str, Any]) -> ObjectAttributes:
     if not value or value.keys() - {"colour", "superlative"}:
         raise ValueError(f"attributes of {name!r}: expected colour, superlative or both, got {sorted(value)}")
-    superlative = value.get("superlative")
-    colour = value.get("colour")
-    return ObjectAttributes(
-        str(name), None if colour is None else str(colour), None if superlative is None else Superlative(superlative)
-    )
+    colour, superlative = value.get("colour"), value.get("superlative")
+    known = None if superlative is None else Superlative(superlative)
+    return ObjectAttributes(str(name), None if colour is None else str(colour), known)
 
 
 def _names(values: Any) -> tuple[str, ...]:
@@ -106,12 +92,8 @@ def _names(values: Any) -> tuple[str, ...]:
 def encode_object_report(report: ObjectReport) -> bytes:
     """Return the report as JSON."""
     graph = report.graph
-    value = {
-        "task_id": graph.task_id,
-        "text": graph.text,
-        **graph_as_json(graph),
-        "objects": [object_as_json(landmark) for landmark in report.objects],
-    }
+    names = {"task_id": graph.task_id, "text": graph.text}
+    value = {**names, **graph_as_json(graph), "objects": [object_as_json(landmark) for landmark in report.objects]}
     return json.dumps(value, ensure_ascii=False).encode()
 
 

@@ -53,7 +53,8 @@ def write_atomic_with(path: Path, write: Callable[[Path], object]) -> None:
         os.close(descriptor)
         temporary = Path(name)
         write(temporary)
-        _flush_to_disk(temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
         temporary.chmod(0o644)
         temporary.replace(path)
     except BaseException as error:
@@ -63,11 +64,6 @@ def write_atomic_with(path: Path, write: Callable[[Path], object]) -> None:
         if isinstance(error, OSError):
             raise _cannot_write(path, error) from error
         raise
-
-
-def _flush_to_disk(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 def _cannot_write(path: Path, error: OSError) -> StorageError:

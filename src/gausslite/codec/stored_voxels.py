@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,23 @@ from numpy import ndarray
 from numpy.typing import NDArray
 
 from gausslite.codec import columns
-from gausslite.codec.stored import RECORD, from_bytes, to_records
 from gausslite.domain.errors import StorageError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, gather_rows, tiles_of
+
+RECORD = np.dtype(
+    [
+        ("means_m", "<f4", (3,)),
+        ("quats_wxyz", "<f4", (4,)),
+        ("scales_m", "<f4", (3,)),
+        ("opacities", "<f4"),
+        ("rgb", "<f4", (3,)),
+        ("active", "?"),
+        ("kappa", "<u4"),
+        ("target", "<i2"),
+    ]
+)
+"""63 bytes per Gaussian, little-endian, without padding; storing changes no bit."""
 
 CODES = np.dtype(
     [
@@ -116,7 +129,7 @@ class StoredVoxels:
         if self.size_m:
             gaussians = decode_codes(keys, counts, self.gaussians, VoxelGrid(self.size_m))
         else:
-            gaussians = from_bytes(self.gaussians.tobytes())
+            gaussians = from_records(self.gaussians.tobytes())
         return VoxelBatch(keys, np.ascontiguousarray(self.voxels["kappa_sums"]), counts, gaussians)
 
     def by_tile(self) -> list[StoredVoxels]:
@@ -202,3 +215,21 @@ def decode_codes(
         kappa=codes["kappa"].astype(np.uint32),
         target=(label & (1 << TARGET_BITS) - 1).astype(np.int16) - np.int16(1),
     )
+
+
+def to_records(gaussians: Gaussians) -> NDArray[Any]:
+    """Return one packed row per Gaussian, in order."""
+    records = np.empty(len(gaussians), RECORD)
+    for name in RECORD.names or ():
+        records[name] = getattr(gaussians, name)
+    return records
+
+
+def from_records(data: bytes) -> Gaussians:
+    """Decode packed rows. Raises StorageError if the length is not a multiple of a row."""
+    if len(data) % RECORD.itemsize:
+        raise StorageError(
+            f"stored voxel: expected a multiple of {RECORD.itemsize} bytes, got {len(data)}; the store is damaged"
+        )
+    records = np.frombuffer(data, RECORD)
+    return Gaussians(*(np.ascontiguousarray(records[field.name]) for field in fields(Gaussians)))

@@ -4,7 +4,7 @@
              | u8 scale code | u32 voxels | u32 Gaussians | u32 body bytes | f64 voxel size | u64 message_seq
              | u64 update_seq | u8 agent bytes | u8 session bytes
     names    agent id, session id (UTF-8)
-    body     one zstd frame with the columns, and bit fields (`quantised_body.py`, `lossless_body.py`)
+    body     one zstd frame with the columns, and bit fields (`body.py`)
     trailer  u32 CRC32C of everything before it
 
 Numbers are little-endian. The counts determine the size of the columns, so a message with wrong sizes is refused before
@@ -14,17 +14,15 @@ memory is allocated.
 from __future__ import annotations
 
 import struct
+from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import IntEnum
 
 import google_crc32c
 import numpy as np
-from numpy.typing import NDArray
 
-from gausslite.codec import lossless_body, quantised_body
-from gausslite.codec.body_layout import BodyLayout, require_encodable
+from gausslite.codec.body import CODERS, VOXEL_BYTES, BodyLayout, SubsetCoding, require_encodable
 from gausslite.codec.columns import MAX_COARSE_BITS, PositionPrecision
 from gausslite.codec.stored_voxels import CODES, VOXELS, StoredSubset
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
@@ -39,13 +37,6 @@ _MAX_NAME_BYTES = 255
 _FRAME_BYTES = 256
 
 
-class SubsetCoding(IntEnum):
-    """How a message stores Gaussians: quantised to the precision that views need, or without any loss."""
-
-    QUANTISED = 0
-    LOSSLESS = 1
-
-
 @dataclass(frozen=True, slots=True)
 class CodecLimits:
     """Upper limits of one message that a receiver decodes."""
@@ -58,17 +49,11 @@ class CodecLimits:
 DEFAULT_LIMITS = CodecLimits()
 
 
-@dataclass(frozen=True, slots=True)
-class _Envelope:
-    """What surrounds the body of a message."""
-
-    coding: SubsetCoding
-    layout: BodyLayout
-    size_m: float
-    message_seq: int
-    update_seq: int
-    agent: bytes
-    session: bytes
+_Header = namedtuple(
+    "_Header",
+    "magic version coding kappa_bytes target_bytes coarse_bits scale_code voxels gaussians body_bytes size_m "
+    "message_seq update_seq agent_bytes session_bytes",
+)
 
 
 def encode_subset(subset: RoiSubset, grid: VoxelGrid, coding: SubsetCoding = SubsetCoding.QUANTISED) -> bytes:
@@ -80,14 +65,14 @@ def encode_subset(subset: RoiSubset, grid: VoxelGrid, coding: SubsetCoding = Sub
     batch = subset.batch
     require_encodable(batch.gaussians)
     layout = BodyLayout.of(batch, PositionPrecision.of(len(batch.gaussians), int((batch.counts > 0).sum()), grid))
-    body = (lossless_body if coding is SubsetCoding.LOSSLESS else quantised_body).encode(batch, grid, layout)
+    body = CODERS[coding].encode(batch, grid, layout)
     agent, session = _name_bytes("agent_id", subset.agent_id), _name_bytes("session_id", subset.session_id)
-    header = _HEADER.pack(
-        *(_MAGIC, VERSION, coding, layout.kappa_bytes, layout.target_bytes),
-        *(layout.precision.coarse_bits, layout.precision.scale_code, layout.voxels, layout.gaussians, len(body)),
-        *(grid.size_m, subset.message_seq, subset.update_seq, len(agent), len(session)),
+    precision, of_message = layout.precision, (grid.size_m, subset.message_seq, subset.update_seq)
+    header = _Header(
+        *(_MAGIC, VERSION, coding, layout.kappa_bytes, layout.target_bytes, *precision),
+        *(layout.voxels, layout.gaussians, len(body), *of_message, len(agent), len(session)),
     )
-    message: bytes = header + agent + session + body
+    message: bytes = _HEADER.pack(*header) + agent + session + body
     return message + _TRAILER.pack(google_crc32c.value(message))
 
 
@@ -115,19 +100,23 @@ def declared_bytes(data: bytes) -> int:
     """Return the size of a message's voxels and Gaussians in a store, as its header declares it, within the limits."""
     if len(data) < _HEADER.size:
         return 0
-    voxels, gaussians = _HEADER.unpack_from(data)[7:9]
-    voxels, gaussians = min(voxels, DEFAULT_LIMITS.max_voxels), min(gaussians, DEFAULT_LIMITS.max_gaussians)
+    header, limits = _Header(*_HEADER.unpack_from(data)), DEFAULT_LIMITS
+    voxels, gaussians = min(header.voxels, limits.max_voxels), min(header.gaussians, limits.max_gaussians)
     return int(voxels * VOXELS.itemsize + gaussians * CODES.itemsize)
 
 
 def _decode(data: bytes, limits: CodecLimits, stated_sums: bool) -> tuple[StoredSubset, str, VoxelGrid]:
-    envelope, body = _open_envelope(data, limits)
+    header = _checked_header(data, limits)
+    names_start, body_start = _HEADER.size, _HEADER.size + header.agent_bytes + header.session_bytes
+    precision = PositionPrecision(header.coarse_bits, header.scale_code)
+    layout = BodyLayout(header.voxels, header.gaussians, header.kappa_bytes, header.target_bytes, precision)
+    body = data[body_start : -_TRAILER.size]
     with _codec_errors():
-        grid = VoxelGrid(envelope.size_m)
-        coder = lossless_body if envelope.coding is SubsetCoding.LOSSLESS else quantised_body
-        voxels = coder.decode(body, grid, envelope.layout, envelope.update_seq, stated_sums)
-        agent_id, session_id = envelope.agent.decode(), envelope.session.decode()
-        return StoredSubset(agent_id, envelope.message_seq, envelope.update_seq, voxels), session_id, grid
+        grid = VoxelGrid(header.size_m)
+        voxels = CODERS[header.coding].decode(body, grid, layout, header.update_seq, stated_sums)
+        names = data[names_start:body_start]
+        agent_id, session_id = names[: header.agent_bytes].decode(), names[header.agent_bytes :].decode()
+        return StoredSubset(agent_id, header.message_seq, header.update_seq, voxels), session_id, grid
 
 
 @contextmanager
@@ -148,12 +137,12 @@ def split_batch(
     A voxel too large for one message keeps its most opaque Gaussians; its Σkappa stays the total of all.
     """
     capacity = (max_bytes - _HEADER.size - _TRAILER.size - 2 * _MAX_NAME_BYTES - _FRAME_BYTES) * 255 // 256
-    body = lossless_body if coding is SubsetCoding.LOSSLESS else quantised_body
-    max_count = (capacity - body.VOXEL_BYTES) // body.MAX_GAUSSIAN_BYTES
+    gaussian_bytes = CODERS[coding].gaussian_bytes
+    max_count = (capacity - VOXEL_BYTES) // gaussian_bytes
     if max_count < 1:
         raise InvalidInputError(f"max_bytes: expected at least 1100, so that a Gaussian fits, got {max_bytes}")
     batch = _limit_counts(batch, max_count)
-    costs = batch.counts.astype(np.int64) * body.MAX_GAUSSIAN_BYTES + body.VOXEL_BYTES
+    costs = batch.counts.astype(np.int64) * gaussian_bytes + VOXEL_BYTES
     parts, start, size = [], 0, 0
     for i, cost in enumerate(costs.tolist()):
         if size + cost > capacity:
@@ -163,45 +152,33 @@ def split_batch(
     return [*parts, _slice(batch, start, len(batch))] if len(batch) else []
 
 
-def _open_envelope(data: bytes, limits: CodecLimits) -> tuple[_Envelope, bytes]:
+def _checked_header(data: bytes, limits: CodecLimits) -> _Header:
+    """Return the header of a whole message within the limits. Raises CodecError, ChecksumError."""
     if len(data) > limits.max_bytes:
         raise CodecError(f"subset: expected at most {limits.max_bytes} bytes, got {len(data)}")
     if len(data) < _HEADER.size + _TRAILER.size:
         raise CodecError(f"subset: expected at least {_HEADER.size + _TRAILER.size} bytes, got {len(data)}")
-    magic, version, coding, *fields = _HEADER.unpack_from(data)
+    header = _Header(*_HEADER.unpack_from(data))
+    magic, version = header[:2]
     if magic != _MAGIC or version != VERSION:
         raise CodecError(f"subset: expected {_MAGIC!r} version {VERSION}, got {magic!r} version {version}")
     if google_crc32c.value(data[: -_TRAILER.size]) != _TRAILER.unpack_from(data, len(data) - _TRAILER.size)[0]:
         raise ChecksumError("subset: CRC32C does not match; the message was damaged")
-    kappa_bytes, target_bytes, coarse_bits, scale_code, voxels, gaussians, body_bytes, *fields = fields
-    if coding not in iter(SubsetCoding):
-        raise CodecError(f"subset: expected coding 0 or 1, got {coding}")
-    if kappa_bytes not in (1, 2, 4) or target_bytes not in (1, 2):
-        raise CodecError(f"subset: unknown column widths kappa {kappa_bytes}, target {target_bytes}")
-    if coarse_bits > MAX_COARSE_BITS:
-        raise CodecError(f"subset: expected at most {MAX_COARSE_BITS} coarse bits, got {coarse_bits}")
-    if voxels > limits.max_voxels or gaussians > limits.max_gaussians:
+    if header.coding not in CODERS:
+        raise CodecError(f"subset: expected coding 0 or 1, got {header.coding}")
+    if header.kappa_bytes not in (1, 2, 4) or header.target_bytes not in (1, 2):
+        raise CodecError(f"subset: unknown column widths kappa {header.kappa_bytes}, target {header.target_bytes}")
+    if header.coarse_bits > MAX_COARSE_BITS:
+        raise CodecError(f"subset: expected at most {MAX_COARSE_BITS} coarse bits, got {header.coarse_bits}")
+    if header.voxels > limits.max_voxels or header.gaussians > limits.max_gaussians:
         raise CodecError(
             f"subset: expected at most {limits.max_voxels} voxels and {limits.max_gaussians} Gaussians, "
-            f"got {voxels} and {gaussians}"
+            f"got {header.voxels} and {header.gaussians}"
         )
-    size_m, message_seq, update_seq, agent_bytes, session_bytes = fields
-    session_start = _HEADER.size + agent_bytes
-    body_start = session_start + session_bytes
-    if body_start + body_bytes + _TRAILER.size != len(data):
-        raise CodecError(f"subset: declares {body_start + body_bytes + _TRAILER.size} bytes, got {len(data)}")
-    layout = BodyLayout(voxels, gaussians, kappa_bytes, target_bytes, PositionPrecision(coarse_bits, scale_code))
-    agent, session = data[_HEADER.size : session_start], data[session_start:body_start]
-    envelope = _Envelope(
-        coding=SubsetCoding(coding),
-        layout=layout,
-        size_m=size_m,
-        message_seq=message_seq,
-        update_seq=update_seq,
-        agent=agent,
-        session=session,
-    )
-    return envelope, data[body_start : -_TRAILER.size]
+    size = _HEADER.size + header.agent_bytes + header.session_bytes + header.body_bytes + _TRAILER.size
+    if size != len(data):
+        raise CodecError(f"subset: declares {size} bytes, got {len(data)}")
+    return header
 
 
 def _name_bytes(name: str, value: str) -> bytes:
@@ -212,20 +189,17 @@ def _name_bytes(name: str, value: str) -> bytes:
 
 
 def _slice(batch: VoxelBatch, start: int, stop: int) -> VoxelBatch:
-    rows = np.arange(batch.offsets[start], batch.offsets[stop])
-    return VoxelBatch(
-        batch.keys[start:stop], batch.kappa_sums[start:stop], batch.counts[start:stop], batch.gaussians.take(rows)
-    )
+    rows, part = np.arange(batch.offsets[start], batch.offsets[stop]), slice(start, stop)
+    return VoxelBatch(batch.keys[part], batch.kappa_sums[part], batch.counts[part], batch.gaussians.take(rows))
 
 
 def _limit_counts(batch: VoxelBatch, max_count: int) -> VoxelBatch:
-    if not (batch.counts > max_count).any():
-        return batch
-    keep: NDArray[np.bool_] = np.ones(len(batch.gaussians), np.bool_)
+    keep = np.ones(len(batch.gaussians), np.bool_)
     for i in np.flatnonzero(batch.counts > max_count):
         begin, end = batch.offsets[i], batch.offsets[i + 1]
         faintest = np.argsort(-batch.gaussians.opacities[begin:end], kind="stable")[max_count:]
         keep[begin + faintest] = False
-    return VoxelBatch(
-        batch.keys, batch.kappa_sums, np.minimum(batch.counts, max_count).astype(np.uint32), batch.gaussians.take(keep)
-    )
+    if keep.all():
+        return batch
+    counts = np.minimum(batch.counts, max_count).astype(np.uint32)
+    return VoxelBatch(batch.keys, batch.kappa_sums, counts, batch.gaussians.take(keep))

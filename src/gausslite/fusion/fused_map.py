@@ -15,7 +15,7 @@ from numpy import ndarray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from gausslite.codec.stored import from_bytes, to_records
+from gausslite.codec.stored_voxels import from_records, to_records
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, MismatchError
 from gausslite.domain.gaussians import Gaussians
@@ -99,7 +99,7 @@ def load_refinement(store: FusionStore) -> StoredRefinement | None:
         return None
     try:
         columns = load(data)
-        gaussians = from_bytes(columns["records"].tobytes())
+        gaussians = from_records(columns["records"].tobytes())
         batch = VoxelBatch(columns["keys"], columns["kappa_sums"], columns["counts"], gaussians)
         return StoredRefinement(batch, columns["voted_keys"], columns["winner_hashes"])
     except (SafetensorError, KeyError, ValueError, GaussLiteError) as error:

@@ -18,8 +18,7 @@ from jaxtyping import Bool, Int32, Int64, UInt64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.codec.stored import RECORD, to_records
-from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels, join_elements
+from gausslite.codec.stored_voxels import RECORD, StoredSubset, StoredVoxels, join_elements, to_records
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch
 

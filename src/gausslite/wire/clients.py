@@ -119,7 +119,7 @@ class AgentClient(ServiceChannel):
         `Frame.motion` states.
         """
         requests = (
-            agent_pb.IngestFramesRequest(frame=convert.live_frame_to_message(frame, lens, lossless)) for frame in frames
+            agent_pb.IngestFramesRequest(frame=convert.frame_to_message(frame, lossless, lens=lens)) for frame in frames
         )
         return self._exchange(self._stub.IngestFrames, requests)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from enum import Enum
+from typing import Any, TypeVar
 
 import numpy as np
 from google.protobuf.json_format import MessageToDict
@@ -24,9 +25,20 @@ from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import gaussians_pb2, geometry_pb2
 
 _MAX_VELOCITY = 100.0
-_LENS_MODELS = {geometry_pb2.LENS_MODEL_RADTAN: LensModel.RADTAN, geometry_pb2.LENS_MODEL_FISHEYE: LensModel.FISHEYE}
-_LENS_NUMBERS = {model: number for number, model in _LENS_MODELS.items()}
 _CAMERA = tuple(field.name for field in fields(Camera))
+
+
+_Named = TypeVar("_Named", bound=Enum)
+
+
+def enum_numbers(kind: Any, values: Iterable[_Named]) -> dict[_Named, Any]:
+    """Return the number of each value in a protobuf enumeration, whose names begin with its own."""
+    prefix = kind.Name(0).removesuffix("UNSPECIFIED")
+    return {value: kind.Value(f"{prefix}{value.name}") for value in values}
+
+
+_LENS_NUMBERS = enum_numbers(geometry_pb2.LensModel, LensModel)
+_LENS_MODELS = {number: model for model, number in _LENS_NUMBERS.items()}
 
 
 def values_of(source: object, names: Iterable[str]) -> dict[str, Any]:
@@ -51,10 +63,8 @@ def _motion_from_message(message: geometry_pb2.EncodedFrame) -> CameraMotion | N
         if message.readout_seconds != 0.0 or message.exposure_seconds != 0.0:
             raise InvalidInputError("frame twist: expected one with readout_seconds or exposure_seconds, got none")
         return None
-    twist = Twist(
-        _velocity("linear_m_s", message.twist.linear_m_s), _velocity("angular_rad_s", message.twist.angular_rad_s)
-    )
-    return CameraMotion(twist, message.readout_seconds, message.exposure_seconds)
+    velocities = (_velocity(name, getattr(message.twist, name)) for name in ("linear_m_s", "angular_rad_s"))
+    return CameraMotion(Twist(*velocities), message.readout_seconds, message.exposure_seconds)
 
 
 def _velocity(name: str, point: geometry_pb2.Point) -> Float64[ndarray, "3"]:
@@ -225,16 +235,21 @@ def transform_from_message(name: str, message: geometry_pb2.RigidTransform) -> F
     return T
 
 
-def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False) -> geometry_pb2.EncodedFrame:
+def frame_to_message(
+    frame: Frame, lossless: bool = False, compact: bool = False, lens: Lens | None = None
+) -> geometry_pb2.EncodedFrame:
     """Encode a frame, and its motion if it states one, with JPEG colour (PNG if lossless) and depth in millimetres.
 
     compact: a third smaller, but encoding takes three times longer; for keyframes, which share a robot's bandwidth.
+    lens: of a live camera, None for a pinhole.
     """
-    motion, moved = frame.motion, dict[str, Any]()
+    motion, optional = frame.motion, dict[str, Any]()
+    if lens is not None:
+        optional["lens"] = geometry_pb2.Lens(model=_LENS_NUMBERS[lens.model], coefficients=lens.coefficients)
     if motion is not None:
         linear, angular = (point_to_message(xyz) for xyz in (motion.twist.linear_m_s, motion.twist.angular_rad_s))
         twist = geometry_pb2.Twist(linear_m_s=linear, angular_rad_s=angular)
-        moved = {"readout_seconds": motion.readout_s, "exposure_seconds": motion.exposure_s, "twist": twist}
+        optional |= {"readout_seconds": motion.readout_s, "exposure_seconds": motion.exposure_s, "twist": twist}
     return geometry_pb2.EncodedFrame(
         index=frame.index,
         capture_time_ns=frame.capture_time_ns,
@@ -242,7 +257,7 @@ def frame_to_message(frame: Frame, lossless: bool = False, compact: bool = False
         depth_png=encode_depth(frame.depth_m, KEYFRAME_PNG_COMPRESSION if compact else PNG_COMPRESSION),
         camera=camera_to_message(frame.camera),
         t_world_camera=transform_to_message(frame.T_world_camera),
-        **moved,
+        **optional,
     )
 
 
@@ -251,14 +266,6 @@ def frame_from_message(message: geometry_pb2.EncodedFrame) -> Frame:
     if message.HasField("lens"):
         raise InvalidInputError("frame lens: expected an undistorted image; only an agent's IngestFrames takes a lens")
     return _decode_images(message)
-
-
-def live_frame_to_message(frame: Frame, lens: Lens | None, lossless: bool = False) -> geometry_pb2.EncodedFrame:
-    """Encode a frame of a live camera with its lens; None for a pinhole."""
-    message = frame_to_message(frame, lossless)
-    if lens is not None:
-        message.lens.CopyFrom(geometry_pb2.Lens(model=_LENS_NUMBERS[lens.model], coefficients=lens.coefficients))
-    return message
 
 
 def live_frame_from_message(message: geometry_pb2.EncodedFrame) -> tuple[Frame, Lens | None]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from enum import StrEnum
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
@@ -31,22 +30,22 @@ from gausslite.domain.task import (
     require_graph,
 )
 from gausslite.v1 import agent_service_pb2, fusion_service_pb2, geometry_pb2, objects_pb2, task_pb2
-from gausslite.wire.convert import box_from_message, box_to_message, point_from_message, point_to_message, values_of
+from gausslite.wire.convert import (
+    box_from_message,
+    box_to_message,
+    enum_numbers,
+    point_from_message,
+    point_to_message,
+    values_of,
+)
 
-_Named = TypeVar("_Named", bound=StrEnum)
 _MAX_POINTED: Final = 64
 """Points and boxes of a task in all; a region grows around each of them, on the thread that maps frames."""
 
 
-def _numbers(kind: Any, values: Iterable[_Named]) -> dict[_Named, Any]:
-    """Return the number of each value in a protobuf enumeration, whose names begin with its own."""
-    prefix = kind.Name(0).removesuffix("UNSPECIFIED")
-    return {value: kind.Value(f"{prefix}{value.name}") for value in values}
-
-
-_PREDICATE_NUMBERS = _numbers(task_pb2.Predicate, Predicate)
-_ROLE_NUMBERS = _numbers(task_pb2.TargetRole, TargetRole)
-_SUPERLATIVE_NUMBERS: dict[Any, Any] = {None: 0, **_numbers(task_pb2.Superlative, Superlative)}
+_PREDICATE_NUMBERS = enum_numbers(task_pb2.Predicate, Predicate)
+_ROLE_NUMBERS = enum_numbers(task_pb2.TargetRole, TargetRole)
+_SUPERLATIVE_NUMBERS: dict[Any, Any] = {None: 0, **enum_numbers(task_pb2.Superlative, Superlative)}
 _PREDICATE_BY_NUMBER = {number: predicate for predicate, number in _PREDICATE_NUMBERS.items()}
 _ROLE_BY_NUMBER = {0: TargetRole.OBJECT, **{number: role for role, number in _ROLE_NUMBERS.items()}}
 _SUPERLATIVE_BY_NUMBER = {number: superlative for superlative, number in _SUPERLATIVE_NUMBERS.items()}
@@ -76,7 +75,7 @@ def graph_to_message(graph: TaskGraph) -> task_pb2.TaskGraph:
 
 def graph_from_message(message: task_pb2.TaskGraph) -> TaskGraph:
     """Decode a task graph and check it with `domain.task_limits`. Raises TaskError."""
-    _require_known_numbers(message)
+    _require_knownenum_numbers(message)
     names = {name: tuple(values) for name, values in values_of(message, _NAMES).items()}
     graph = TaskGraph(
         task_id=message.task_id,
@@ -131,13 +130,10 @@ def assigned_from_message(
     """Decode the request of an AssignTask call; a text is parsed. Raises TaskError, InvalidInputError."""
     pointed = tuple(map(_pointed_from_message, message.pointed))
     excluded_m = tuple(_surface_point_from_message("excluded", point) for point in message.excluded)
-    match message.WhichOneof("task"):
-        case "text":
-            return AssignedTask(parse(message.text), pointed, excluded_m)
-        case "graph":
-            return AssignedTask(graph_from_message(message.graph), pointed, excluded_m)
-        case _:
-            return AssignedTask(None, pointed, excluded_m)
+    kind = message.WhichOneof("task")
+    if kind == "text":
+        return AssignedTask(parse(message.text), pointed, excluded_m)
+    return AssignedTask(graph_from_message(message.graph) if kind else None, pointed, excluded_m)
 
 
 def _pointed_to_message(pointed: PointedObject) -> agent_service_pb2.PointedObject:
@@ -171,7 +167,7 @@ def _surface_point_from_message(name: str, message: geometry_pb2.Point) -> Point
     return point_m
 
 
-def _require_known_numbers(message: task_pb2.TaskGraph) -> None:
+def _require_knownenum_numbers(message: task_pb2.TaskGraph) -> None:
     for name, kind, numbers, known in (
         ("relation", Predicate, [relation.predicate for relation in message.relations], _PREDICATE_BY_NUMBER),
         ("roles", TargetRole, message.roles, _ROLE_BY_NUMBER),
@@ -191,11 +187,7 @@ def _relation_from_message(message: task_pb2.Relation) -> Relation:
     )
 
 
-_ROLES = {
-    ObjectRole.TARGET: objects_pb2.OBJECT_ROLE_TARGET,
-    ObjectRole.ANCHOR: objects_pb2.OBJECT_ROLE_ANCHOR,
-    ObjectRole.OTHER: objects_pb2.OBJECT_ROLE_OTHER,
-}
+_ROLES = enum_numbers(objects_pb2.ObjectRole, ObjectRole)
 _OBJECT_ROLE_BY_NUMBER = {number: role for role, number in _ROLES.items()}
 _LANDMARK = ("noun", "confidence", "first_seen_ns", "last_seen_ns")
 _OBSERVER = tuple(field.name for field in fields(ObjectObserver))

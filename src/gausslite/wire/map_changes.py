@@ -7,6 +7,7 @@ import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 from threading import Lock
 from typing import Protocol, runtime_checkable
 
@@ -46,28 +47,30 @@ def map_blocks(reader: MapReader, since_revision: int) -> Iterator[MapBlock]:
     What changes during a snapshot follows before the last block. So the watcher then has the map at the revision of the
     last block. Raises RevisionGoneError, InvalidInputError if the codec cannot encode the map.
     """
-    waiting: MapBlock | None = None
-    snapshot, revision = since_revision == 0, since_revision
-    if snapshot:
-        revision, parts = reader.snapshot()
-        for part in _flat(parts):
+    end, waiting = since_revision, None
+    for end, parts in _reads(reader, since_revision):
+        for data, provenance in chain.from_iterable(parts):
             if waiting is not None:
                 yield waiting
-            waiting = _block(part, revision, snapshot)
-    try:
-        end, parts = reader.changes(revision)
-    except RevisionGoneError:
-        if not snapshot:
-            raise
-        # more was removed during the snapshot than is recorded; from this revision the watcher gets a new one
-        end, parts = revision, ()
-    for part in _flat(parts):
-        if waiting is not None:
-            yield waiting
-        waiting = _block(part, end, snapshot)
-    waiting = waiting or MapBlock(snapshot=snapshot)
+            waiting = MapBlock(revision=end, snapshot=since_revision == 0, subset=data, provenance=provenance)
+    waiting = waiting or MapBlock(snapshot=since_revision == 0)
     waiting.revision, waiting.last = end, True
     yield waiting
+
+
+def _reads(reader: MapReader, since_revision: int) -> Iterator[tuple[int, Parts]]:
+    revision = since_revision
+    if since_revision == 0:
+        revision, parts = reader.snapshot()
+        yield revision, parts
+    try:
+        changes = reader.changes(revision)
+    except RevisionGoneError:
+        if since_revision > 0:
+            raise
+        # more was removed during the snapshot than is recorded; from its revision the watcher gets a new one
+        return
+    yield changes
 
 
 async def follow(
@@ -172,15 +175,6 @@ class EncodedPartCache:
 
 def _next_block(blocks: Iterator[MapBlock]) -> MapBlock | None:
     return next(blocks, None)
-
-
-def _flat(parts: Parts) -> Iterator[EncodedPart]:
-    for some in parts:
-        yield from some
-
-
-def _block(part: EncodedPart, revision: int, snapshot: bool) -> MapBlock:
-    return MapBlock(revision=revision, snapshot=snapshot, subset=part[0], provenance=part[1])
 
 
 def _size_bytes(parts: tuple[EncodedPart, ...]) -> int:

@@ -119,18 +119,16 @@ class FrameSender:
             self._count("offered")
             self._changed.notify_all()
 
-    def close(self, timeout_s: float) -> bool:
-        """Send the queued frames and stop; False if that takes longer. The stream then ends with the client's."""
+    def close(self, timeout_s: float) -> None:
+        """Send the queued frames and stop. What takes longer is dropped, and the stream ends with the client's."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
         self._thread.join(timeout_s)
-        finished = not self._thread.is_alive()
         with self._changed:
             self._queue.clear()
             self._changed.notify_all()
         self._stopped.set()
-        return finished
 
     def _run(self) -> None:
         delay = RetryDelay(_FIRST_RETRY_S)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import logging
 import os
 import signal
@@ -40,17 +39,24 @@ Check = Callable[[], None]
 """Raises GaussLiteError while the service cannot work."""
 
 
-class ReadinessWatch:
-    """Calls a service's check every 30 s, after `wake`, and every second while it fails. Use it on the event loop.
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A servicer's full name, a function that adds it to a server, and its checks.
 
     check: may block; it runs in a thread. check_progress: must not block; it is called every second.
     """
 
-    def __init__(
-        self, service: str, check: Check, check_progress: Check, set_serving: Callable[[bool], Awaitable[None]]
-    ) -> None:
-        self._service, self._check, self._check_progress = service, check, check_progress
-        self._set_serving = set_serving
+    name: str
+    register: Callable[[grpc.aio.Server], None]
+    check: Check | None = None
+    check_progress: Check = lambda: None
+
+
+class ReadinessWatch:
+    """Calls a service's check every 30 s, after `wake`, and every second while it fails. Use it on the event loop."""
+
+    def __init__(self, service: Service, health_servicer: Any) -> None:
+        self._service, self._health = service, health_servicer
         self._woken = asyncio.Event()
         self._checking: asyncio.Future[None] | None = None
         self._failing_since_s: float | None = None
@@ -72,25 +78,31 @@ class ReadinessWatch:
             is_due = self._woken.is_set() or self._failing_since_s is not None or time.monotonic() >= next_check_s
             self._woken.clear()
             try:
-                self._check_progress()
+                self._service.check_progress()
                 if is_due:
                     await self._check_in_time()
                     next_check_s = time.monotonic() + _CHECK_S
             except GaussLiteError as error:
                 if self._failing_since_s is None:
                     self._failing_since_s = time.monotonic()
-                    _log.error("%s is NOT_SERVING: %s", self._service, error)
-                    await self._set_serving(False)
+                    _log.error("%s is NOT_SERVING: %s", self._service.name, error)
+                    await self.set_serving(False)
             else:
                 if self._failing_since_s is not None:
                     failed_s, self._failing_since_s = time.monotonic() - self._failing_since_s, None
-                    _log.info("%s is SERVING again after %.0f s", self._service, failed_s)
-                    await self._set_serving(True)
+                    _log.info("%s is SERVING again after %.0f s", self._service.name, failed_s)
+                    await self.set_serving(True)
+
+    async def set_serving(self, is_serving: bool) -> None:
+        """Set the health of the service, and with it that of the whole server."""
+        state = health_pb2.HealthCheckResponse.SERVING if is_serving else health_pb2.HealthCheckResponse.NOT_SERVING
+        for name in ("", self._service.name):
+            await self._health.set(name, state)
 
     async def _check_in_time(self) -> None:
         """Wait for the running check, or for a new one. Raises UnavailableError if it takes too long."""
         if self._checking is None:
-            self._checking = asyncio.ensure_future(asyncio.to_thread(self._check))
+            self._checking = asyncio.ensure_future(asyncio.to_thread(self._service.check or (lambda: None)))
         done, _ = await asyncio.wait([self._checking], timeout=_CHECK_LIMIT_S)
         if not done:
             raise UnavailableError(f"the check has not ended within {_CHECK_LIMIT_S:g} s")
@@ -111,16 +123,6 @@ _OPTIONS = (
     # a second server must fail to bind the port instead of sharing it
     ("grpc.so_reuseport", 0),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Service:
-    """A servicer's full name, a function that adds it to a server, and its checks, see ReadinessWatch."""
-
-    name: str
-    register: Callable[[grpc.aio.Server], None]
-    check: Check | None = None
-    check_progress: Check = lambda: None
 
 
 class RunningServer:
@@ -162,22 +164,13 @@ async def start_server(
     """
     limits = limits or security.CallLimits()
     health_servicer = health.aio.HealthServicer()  # type: ignore[attr-defined]
-    watches = [
-        ReadinessWatch(
-            service.name,
-            service.check,
-            service.check_progress,
-            functools.partial(_set_health, health_servicer, service.name),
-        )
-        for service in services
-        if service.check is not None
-    ]
+    watches = [ReadinessWatch(service, health_servicer) for service in services]
     interceptor = CallInterceptor(security.CallUsage(limits), watches)
     server = grpc.aio.server(interceptors=[interceptor], options=(*_OPTIONS, *limits.connection_options))
     health_pb2_grpc.add_HealthServicer_to_server(health_servicer, server)
-    for service in services:
+    for service, watch in zip(services, watches, strict=True):
         service.register(server)
-        await _set_health(health_servicer, service.name, True)
+        await watch.set_serving(True)
     await health_servicer.set(LIVENESS, health_pb2.HealthCheckResponse.SERVING)
     names = [service.name for service in services]
     reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
@@ -188,7 +181,8 @@ async def start_server(
         servers[_bind(health_server, health_listen, None)] = health_server
     for started in servers.values():
         await started.start()
-    return RunningServer(servers, health_servicer, [asyncio.create_task(watch.run()) for watch in watches])
+    checked = [watch for service, watch in zip(services, watches, strict=True) if service.check is not None]
+    return RunningServer(servers, health_servicer, [asyncio.create_task(watch.run()) for watch in checked])
 
 
 async def serve_until_stopped(
@@ -231,6 +225,32 @@ async def serve_until_stopped(
             raise result
 
 
+@dataclass(frozen=True, slots=True)
+class _Method:
+    """A method of a servicer, by its full name."""
+
+    name: str
+    handler: Any
+
+    async def read_stream(self, context: Any, bandwidth: security.TokenBucket | None) -> AsyncIterator[Any]:
+        """Yield the requests at the caller's bandwidth; HTTP/2's flow control then slows the caller down."""
+        # gRPC's iterator would keep the bytes of a request while the method works on it
+        while (data := await context.read()) is not grpc.aio.EOF:  # type: ignore[attr-defined]
+            await security.wait_for_bandwidth(bandwidth, len(data))
+            request = self.decode(data)
+            del data
+            yield request
+
+    def decode(self, data: bytes) -> Any:
+        """Return the request. Raises InvalidInputError."""
+        try:
+            return self.handler.request_deserializer(data)
+        except DecodeError as error:
+            raise InvalidInputError(
+                f"{self.name}: expected its request message, got {len(data)} invalid bytes"
+            ) from error
+
+
 _ARITY = {False: "unary", True: "stream"}
 
 
@@ -244,95 +264,55 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]
     async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], handler_call_details: Any) -> Any:
         """Return a handler that runs the called method and converts its errors; foreign services stay unchanged."""
         handler = await continuation(handler_call_details)
-        method = handler_call_details.method
-        if handler is None or not method.startswith("/gausslite."):
+        call = _Method(handler_call_details.method, handler)
+        if handler is None or not call.name.startswith("/gausslite."):
             return handler
-        # requests are decoded inside the guard, because gRPC itself would answer UNKNOWN to an invalid message
-        message_codecs = {"request_deserializer": None, "response_serializer": handler.response_serializer}
-        guard = _Guard(method, handler, self._usage, self._rejections, self._watches)
         kind = f"{_ARITY[handler.request_streaming]}_{_ARITY[handler.response_streaming]}"
-        wrap = guard.stream_method if handler.response_streaming else guard.unary_method
-        return getattr(grpc, f"{kind}_rpc_method_handler")(wrap(getattr(handler, kind)), **message_codecs)
+        inner = getattr(handler, kind)
 
-
-@dataclass(frozen=True, slots=True)
-class _Guard:
-    """Runs one method of a servicer for callers that may call it, within their limits."""
-
-    method: str
-    handler: Any
-    usage: security.CallUsage
-    rejections: security.RejectionLog
-    watches: Sequence[ReadinessWatch]
-
-    def unary_method(self, inner: Any) -> Any:
-        async def guarded(request: Any, context: Any) -> Any:
-            async with self._admit(request, context) as decoded:
+        async def answer(request: Any, context: Any) -> Any:
+            async with self._admit(call, request, context) as decoded:
                 return await inner(decoded, context)
 
-        return guarded
-
-    def stream_method(self, inner: Any) -> Any:
-        async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
-            async with self._admit(request, context) as decoded:
+        async def answer_stream(request: Any, context: Any) -> AsyncIterator[Any]:
+            async with self._admit(call, request, context) as decoded:
                 async for response in inner(decoded, context):
                     yield response
 
-        return guarded
+        # requests are decoded inside, because gRPC itself would answer UNKNOWN to an invalid message
+        message_codecs = {"request_deserializer": None, "response_serializer": handler.response_serializer}
+        answers = answer_stream if handler.response_streaming else answer
+        return getattr(grpc, f"{kind}_rpc_method_handler")(answers, **message_codecs)
 
     @contextlib.asynccontextmanager
-    async def _admit(self, request: Any, context: Any) -> AsyncIterator[Any]:
+    async def _admit(self, call: _Method, request: Any, context: Any) -> AsyncIterator[Any]:
         """Give the decoded request, or stream of requests, at the caller's bandwidth; an error ends the call."""
         try:
             caller = security.Caller.of(context)
-            security.require_role(self.method, caller)
-            with self.usage.open_call(caller) as bandwidth:
-                if self.handler.request_streaming:
-                    yield self._read_stream(context, bandwidth)
+            security.require_role(call.name, caller)
+            with self._usage.open_call(caller) as bandwidth:
+                if call.handler.request_streaming:
+                    yield call.read_stream(context, bandwidth)
                 else:
                     await security.wait_for_bandwidth(bandwidth, len(request))
-                    yield self._decode(request)
+                    yield call.decode(request)
         except Exception as error:
-            await self._abort(error, context)
+            await self._abort(call.name, error, context)
 
-    async def _abort(self, error: Exception, context: Any) -> NoReturn:
+    async def _abort(self, method: str, error: Exception, context: Any) -> NoReturn:
         if isinstance(error, grpc.aio.AbortError):
             raise error
         if not isinstance(error, GaussLiteError):
-            _log.error("%s failed: %s: %s", self.method, type(error).__name__, error, exc_info=error)
-            error = GaussLiteError(f"{self.method}: unexpected error in the server; see its log")
+            _log.error("%s failed: %s: %s", method, type(error).__name__, error, exc_info=error)
+            error = GaussLiteError(f"{method}: unexpected error in the server; see its log")
         elif isinstance(error, StorageError):
             # the watch logs it once, not for every call
-            for watch in self.watches:
+            for watch in self._watches:
                 watch.wake()
         elif not isinstance(error, UnavailableError):
-            self.rejections.record(security.Caller.of(context).key, code_and_reason(error)[1], str(error))
+            self._rejections.record(security.Caller.of(context).key, code_and_reason(error)[1], str(error))
         await context.abort_with_status(to_status(error))
         raise error
-
-    async def _read_stream(self, context: Any, bandwidth: security.TokenBucket | None) -> AsyncIterator[Any]:
-        """Yield the requests at the caller's bandwidth; HTTP/2's flow control then slows the caller down."""
-        # gRPC's iterator would keep the bytes of a request while the method works on it
-        while (data := await context.read()) is not grpc.aio.EOF:  # type: ignore[attr-defined]
-            await security.wait_for_bandwidth(bandwidth, len(data))
-            request = self._decode(data)
-            del data
-            yield request
-
-    def _decode(self, data: bytes) -> Any:
-        try:
-            return self.handler.request_deserializer(data)
-        except DecodeError as error:
-            raise InvalidInputError(
-                f"{self.method}: expected its request message, got {len(data)} invalid bytes"
-            ) from error
-
-
-async def _set_health(health_servicer: Any, service: str, is_serving: bool) -> None:
-    """Set the health of a service, and with it that of the whole server."""
-    states = health_pb2.HealthCheckResponse
-    for name in ("", service):
-        await health_servicer.set(name, states.SERVING if is_serving else states.NOT_SERVING)
 
 
 def _bind(server: grpc.aio.Server, listen: str, tls: security.Tls | None) -> str:

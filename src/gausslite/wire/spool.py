@@ -21,7 +21,7 @@ import os
 import secrets
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored import from_bytes, to_records
+from gausslite.codec.stored_voxels import from_records, to_records
 from gausslite.domain.errors import MismatchError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of
@@ -89,6 +89,7 @@ SELECT place, key, {_WIRE_BYTES_PER_VOXEL} + {_WIRE_BYTES_PER_GAUSSIAN} * count,
 FROM voxel_updates WHERE pending = 1 AND purpose = ? AND place %s ORDER BY place, key LIMIT {_SLICE}
 """  # noqa: S608 - constants of this file
 _SELECT_EQUAL, _SELECT_NEXT = (_SELECT_SLICE % condition for condition in ("= ? AND key > ?", "> ?"))
+_RESEND = "UPDATE voxel_updates SET pending = 1, sent_kappa = -1, sends = 0, acknowledged_seq = NULL WHERE key = ?"
 _SELECT_PENDING = """
 SELECT key, enqueue_count, kappa_sum, count, gaussians FROM voxel_updates WHERE key = ? AND pending = 1
 """
@@ -147,7 +148,7 @@ class Spool:
         """Open or create the spool. Raises MismatchError if the file is another agent's or of another grid."""
         self._path, self.agent_id = path, agent_id
         self._error_prefix = "spool" if path is None else f"spool {path}"
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         with self._storage_errors():
             self._database = sqlite3.connect(":memory:" if path is None else path, check_same_thread=False)
             self._database.execute("PRAGMA journal_mode = WAL")
@@ -193,17 +194,12 @@ class Spool:
             (key, int(purpose), kappa_sum, stop - start, records[start:stop].tobytes())
             for key, kappa_sum, (start, stop) in zip(batch.keys.tolist(), sums, pairwise(offsets), strict=True)
         )
-        with self._transaction():
-            self._database.executemany(_ENQUEUE, rows)
+        self._update(_ENQUEUE, rows)
 
     def voxels(self, purpose: Purpose | None = None) -> Int64[ndarray, " v"]:
         """Return the keys of the voxels whose latest update has Gaussians, ascending; purpose: only updates for it."""
-        with self._transaction():
-            rows = self._database.execute(
-                "SELECT key FROM voxel_updates WHERE count > 0 AND (? IS NULL OR purpose = ?) ORDER BY key",
-                (purpose, purpose),
-            )
-            return np.array([key for (key,) in rows], np.int64)
+        query = "SELECT key FROM voxel_updates WHERE count > 0 AND (? IS NULL OR purpose = ?) ORDER BY key"
+        return np.array(self._select(query, purpose, purpose), np.int64).reshape(-1)
 
     def next_round(self, max_bytes: int, resend_threshold: float) -> SpoolRound | None:
         """Return what is due with the highest value per byte, about max_bytes, at least one; None if nothing is due.
@@ -211,15 +207,19 @@ class Spool:
         A voxel sent once is due if its Σkappa has changed by the share resend_threshold of the sent value; twice: by
         double the share; more often: by four times the share. Voxels of the handover follow when nothing else is due.
         """
-        due = heapq.merge(self._due_voxels(Purpose.ROI, resend_threshold), self._due_keyframes(), key=_place)
+        keyframes = [_Due(*row) for row in self._select(_DUE_KEYFRAMES)]
+        due = heapq.merge(self._due_voxels(Purpose.ROI, resend_threshold), keyframes, key=lambda due: due.place)
         purpose, chosen = Purpose.ROI, _take(due, max_bytes)
         if not chosen:
             purpose, chosen = Purpose.HANDOVER, _take(self._due_voxels(Purpose.HANDOVER, resend_threshold), max_bytes)
         if not chosen:
             return None
-        rows = self._rows(_SELECT_PENDING, sorted({item.key for item in chosen if not item.is_keyframe}))
-        keyframes = self._rows(f"{_SELECT_KEYFRAMES} WHERE frame_index = ?", [i.key for i in chosen if i.is_keyframe])
-        return SpoolRound(_to_batch(purpose, rows), tuple(SpooledKeyframe(*row) for row in keyframes))
+        # one key at a time, so that others may use the spool meanwhile
+        keys = sorted({item.key for item in chosen if not item.is_keyframe})
+        rows = [row for key in keys for row in self._select(_SELECT_PENDING, key)]
+        query = f"{_SELECT_KEYFRAMES} WHERE frame_index = ?"
+        frames = [row for item in chosen if item.is_keyframe for row in self._select(query, item.key)]
+        return SpoolRound(_to_batch(purpose, rows), tuple(SpooledKeyframe(*row) for row in frames))
 
     def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
         """Store a selected keyframe as pending, and delete the one that it replaces in the selection."""
@@ -230,33 +230,26 @@ class Spool:
 
     def mark_keyframes_done(self, keyframes: Iterable[SpooledKeyframe]) -> None:
         """Mark these keyframes as not pending, because the server has accepted or permanently rejected them."""
-        with self._transaction():
-            pairs = [(keyframe.enqueue_count, keyframe.frame_index) for keyframe in keyframes]
-            update = "UPDATE keyframes SET pending = (enqueue_count != ?) WHERE frame_index = ?"
-            self._database.executemany(update, pairs)
+        pairs = [(keyframe.enqueue_count, keyframe.frame_index) for keyframe in keyframes]
+        self._update("UPDATE keyframes SET pending = (enqueue_count != ?) WHERE frame_index = ?", pairs)
 
     def mark_keyframes_missing(self, stored: Iterable[int]) -> None:
         """Mark all keyframes as pending except those with these indices, which the server stores."""
-        with self._transaction():
-            missing = "UPDATE keyframes SET pending = 1 WHERE frame_index NOT IN (SELECT value FROM json_each(?))"
-            self._database.execute(missing, (json.dumps(list(stored)),))
+        missing = "UPDATE keyframes SET pending = 1 WHERE frame_index NOT IN (SELECT value FROM json_each(?))"
+        self._update(missing, [(json.dumps(list(stored)),)])
 
     def keyframes(self) -> list[SpooledKeyframe]:
         """Return all keyframes, in the order of their indices."""
-        with self._transaction():
-            rows = self._database.execute(f"{_SELECT_KEYFRAMES} ORDER BY frame_index")
-            return [SpooledKeyframe(*row) for row in rows]
+        return [SpooledKeyframe(*row) for row in self._select(f"{_SELECT_KEYFRAMES} ORDER BY frame_index")]
 
     def keyframe_indices(self) -> tuple[int, ...]:
         """Return the indices of all keyframes, ascending."""
-        with self._transaction():
-            rows = self._database.execute("SELECT frame_index FROM keyframes ORDER BY frame_index")
-            return tuple(index for (index,) in rows)
+        return tuple(index for (index,) in self._select("SELECT frame_index FROM keyframes ORDER BY frame_index"))
 
     @property
     def pending_keyframes(self) -> int:
         """The number of pending keyframes."""
-        return self._count_pending("keyframes")
+        return int(self._select("SELECT count(*) FROM keyframes WHERE pending = 1")[0][0])
 
     def is_stored_by(self, incarnation_id: str, highest_update_seq: int) -> bool:
         """Return whether a server with this content has every update that was acknowledged to this spool."""
@@ -266,8 +259,7 @@ class Spool:
 
     def acknowledged_digests(self) -> TileDigests:
         """Return the digests of the updates that were acknowledged."""
-        with self._transaction():
-            return TileDigests.of(*self._acknowledged())
+        return TileDigests.of(*self._acknowledged())
 
     def begin_sending_to(self, incarnation_id: str, highest_update_seq: int, lost: Int64[ndarray, " t"]) -> int:
         """Mark the voxels of the tiles in `lost` as pending and never sent; returns their number.
@@ -277,11 +269,8 @@ class Spool:
         with self._transaction():
             keys, _ = self._acknowledged()
             keys = keys[np.isin(tiles_of(keys), lost)]
-            resend = """
-                UPDATE voxel_updates SET pending = 1, sent_kappa = -1, sends = 0, acknowledged_seq = NULL WHERE key = ?
-            """
-            self._database.executemany(resend, ((key,) for key in keys.tolist()))
             acknowledged = min(int(self._property("acknowledged_seq") or 0), highest_update_seq)
+            self._database.executemany(_RESEND, ((key,) for key in keys.tolist()))
             properties = [("incarnation_id", incarnation_id), ("acknowledged_seq", acknowledged)]
             self._database.executemany("INSERT OR REPLACE INTO properties VALUES (?, ?)", properties)
         return len(keys)
@@ -302,13 +291,12 @@ class Spool:
         update = (
             "UPDATE voxel_updates SET pending = (enqueue_count != ?), sent_kappa = ?, sends = sends + 1 WHERE key = ?"
         )
-        with self._transaction():
-            self._database.executemany(update, triples)
+        self._update(update, triples)
 
     @property
     def pending_voxels(self) -> int:
         """The number of voxels whose latest update is pending."""
-        return self._count_pending("voxel_updates")
+        return int(self._select("SELECT count(*) FROM voxel_updates WHERE pending = 1")[0][0])
 
     def next_update_seq(self, above: int = 0) -> int:
         """Return a number greater than `above` and than all earlier numbers, also those from before a restart."""
@@ -324,40 +312,26 @@ class Spool:
 
     def _due_voxels(self, purpose: Purpose, resend_threshold: float) -> Iterator[_Due]:
         """Yield the due voxels, those of the highest value first. Between two slices, others may use the spool."""
-        parameters = resend_threshold, int(purpose)
+        order = resend_threshold, int(purpose)
         place, key = -math.inf, 0
-        while True:
-            with self._transaction():
-                rows = self._database.execute(_SELECT_EQUAL, (*parameters, place, key)).fetchall()
-                rows = rows or self._database.execute(_SELECT_NEXT, (*parameters, place)).fetchall()
-            if not rows:
-                return
+        while rows := self._select(_SELECT_EQUAL, *order, place, key) or self._select(_SELECT_NEXT, *order, place):
             for place, key, size_bytes, is_due in rows:
                 if is_due:
                     yield _Due(place, key, size_bytes)
 
-    def _due_keyframes(self) -> list[_Due]:
-        with self._transaction():
-            return [_Due(*row) for row in self._database.execute(_DUE_KEYFRAMES)]
-
-    def _rows(self, query: str, keys: Sequence[int]) -> list[tuple[Any, ...]]:
-        """Return the row of each key that has one, read in slices."""
-        rows = []
-        for start in range(0, len(keys), _SLICE):
-            with self._transaction():
-                rows += [row for key in keys[start : start + _SLICE] for row in self._database.execute(query, (key,))]
-        return rows
-
     def _acknowledged(self) -> tuple[Int64[ndarray, " k"], Int64[ndarray, " k"]]:
         """Return the voxels whose updates the server has stored, and the sequence numbers of these."""
         query = "SELECT key, acknowledged_seq FROM voxel_updates WHERE acknowledged_seq IS NOT NULL"
-        columns = np.array(self._database.execute(query).fetchall(), np.int64).reshape(-1, 2)
+        columns = np.array(self._select(query), np.int64).reshape(-1, 2)
         return columns[:, 0], columns[:, 1]
 
-    def _count_pending(self, table: str) -> int:
+    def _select(self, query: str, *parameters: object) -> list[tuple[Any, ...]]:
         with self._transaction():
-            query = f"SELECT count(*) FROM {table} WHERE pending = 1"  # noqa: S608 - constant names
-            return int(self._database.execute(query).fetchone()[0])
+            return self._database.execute(query, parameters).fetchall()
+
+    def _update(self, query: str, rows: Iterable[tuple[Any, ...]]) -> None:
+        with self._transaction():
+            self._database.executemany(query, rows)
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -379,10 +353,6 @@ class Spool:
         return None if row is None else row[0]
 
 
-def _place(due: _Due) -> float:
-    return due.place
-
-
 def _take(due: Iterable[_Due], max_bytes: int) -> list[_Due]:
     """Return the first items of about max_bytes together, at least one."""
     chosen: list[_Due] = []
@@ -400,6 +370,6 @@ def _to_batch(purpose: Purpose, rows: list[tuple[Any, ...]]) -> SpoolBatch | Non
         return None
     keys, enqueue_counts, sums, counts, blobs = zip(*rows, strict=True)
     batch = VoxelBatch(
-        np.array(keys, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32), from_bytes(b"".join(blobs))
+        np.array(keys, np.int64), np.array(sums, np.uint64), np.array(counts, np.uint32), from_records(b"".join(blobs))
     )
     return SpoolBatch(purpose, batch, np.array(enqueue_counts, np.int64))

@@ -25,6 +25,7 @@ _TABLE: tuple[tuple[type[GaussLiteError], grpc.StatusCode, str], ...] = (
     (errors.TaskError, grpc.StatusCode.INVALID_ARGUMENT, "TASK"),
     (errors.DatasetError, grpc.StatusCode.INVALID_ARGUMENT, "DATASET"),
     (errors.ModelFileError, grpc.StatusCode.INVALID_ARGUMENT, "MODEL_FILE"),
+    (errors.MissingPluginError, grpc.StatusCode.INVALID_ARGUMENT, "MISSING_PLUGIN"),
     (errors.MapFileError, grpc.StatusCode.INVALID_ARGUMENT, "MAP_FILE"),
     (errors.CodecError, grpc.StatusCode.INVALID_ARGUMENT, "CODEC"),
     (errors.InvalidInputError, grpc.StatusCode.INVALID_ARGUMENT, "INVALID_INPUT"),

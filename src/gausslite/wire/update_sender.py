@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from gausslite.domain.errors import GaussLiteError, InvalidInputError, PoseError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import UNKNOWN, FusionClient, Session
+from gausslite.wire.convert import enum_numbers
 from gausslite.wire.spool import Purpose, Spool, SpoolBatch
 
 _log = logging.getLogger(__name__)
@@ -116,32 +116,25 @@ class SentPart:
     """A message that waits for its outcome."""
 
     batch: SpoolBatch
-    size_bytes: int
+    request: pb.ContributeSubsetsRequest
     update_seq: int
 
 
 _MIN_SUBSET_BYTES = 1 << 16
-_PURPOSES = {Purpose.ROI: pb.PURPOSE_ROI, Purpose.HANDOVER: pb.PURPOSE_HANDOVER}
-Count = Callable[..., None]
-"""Adds to the uplink's counters of these names."""
+_PURPOSES = enum_numbers(pb.Purpose, Purpose)
 
 
 class UpdateSender:
-    """Used by the uplink's thread only; the properties may be read by others."""
+    """Used by the uplink's thread only; others may read the counters."""
 
-    def __init__(self, client: FusionClient, spool: Spool, grid: VoxelGrid, deadline_s: float, count: Count) -> None:
+    def __init__(self, client: FusionClient, spool: Spool, grid: VoxelGrid, deadline_s: float) -> None:
         self._client, self._spool, self._grid, self._deadline_s = client, spool, grid, deadline_s
-        self._count = count
-        self._agent_id = spool.agent_id
+        self.counters = UplinkCounters()
+        """What the outcomes of messages add to the uplink's."""
         self._roi_voxels: set[int] = set()
         self._resent_damaged: set[int] = set()
         self._message_seq = 0
         self._subset_bytes = MAX_SUBSET_BYTES
-
-    @property
-    def sent_roi_voxels(self) -> int:
-        """The number of voxels of the task's region that were sent at least once."""
-        return len(self._roi_voxels)
 
     def begin_session(self, max_subset_bytes: int) -> None:
         """Number the messages of a new session from 1; max_subset_bytes: the server's limit, 0 without one."""
@@ -152,15 +145,30 @@ class UpdateSender:
         """Send smaller messages from now on."""
         self._subset_bytes = max(_MIN_SUBSET_BYTES, self._subset_bytes // 2)
 
-    def encode(
-        self, due: SpoolBatch, session: Session
-    ) -> tuple[list[pb.ContributeSubsetsRequest], dict[int, SentPart]]:
-        """Return the messages of a round, and by sequence what each one holds; invalid updates are dropped."""
-        sent: dict[int, SentPart] = {}
-        return list(self._requests(due, session, sent)), sent
+    def encode(self, due: SpoolBatch, session: Session) -> dict[int, SentPart]:
+        """Return the messages of a round by their numbers; invalid updates are dropped."""
+        parts: dict[int, SentPart] = {}
+        start = 0
+        for part in split_batch(due.batch, self._subset_bytes):
+            spooled = SpoolBatch(due.purpose, part, due.enqueue_counts[start : start + len(part)])
+            start += len(part)
+            self._message_seq += 1
+            number, update_seq = self._message_seq, self._spool.next_update_seq(session.highest_update_seq)
+            subset = RoiSubset(self._spool.agent_id, session.session_id, number, update_seq, part)
+            try:
+                data = encode_subset(subset, self._grid)
+            except InvalidInputError as error:
+                self._drop(spooled, str(error))
+                continue
+            request = pb.ContributeSubsetsRequest(
+                session_id=session.session_id, sequence=number, purpose=_PURPOSES[due.purpose], subset=data
+            )
+            parts[number] = SentPart(spooled, request, update_seq)
+        return parts
 
-    def send(self, requests: list[pb.ContributeSubsetsRequest], sent: dict[int, SentPart]) -> None:
+    def send(self, sent: dict[int, SentPart]) -> None:
         """Send the messages on one stream and handle their outcomes. Raises the last error that needs a retry."""
+        requests = [part.request for part in sent.values()]
         error_to_retry: GaussLiteError | None = None
         try:
             for response in self._client.contribute(requests, self._deadline_s):
@@ -179,28 +187,6 @@ class UpdateSender:
         if error_to_retry is not None:
             raise error_to_retry
 
-    def _requests(
-        self, due: SpoolBatch, session: Session, sent: dict[int, SentPart]
-    ) -> Iterator[pb.ContributeSubsetsRequest]:
-        start = 0
-        for part in split_batch(due.batch, self._subset_bytes):
-            stop = start + len(part)
-            self._message_seq += 1
-            update_seq = self._spool.next_update_seq(session.highest_update_seq)
-            spooled = SpoolBatch(due.purpose, part, due.enqueue_counts[start:stop])
-            start = stop
-            try:
-                data = encode_subset(
-                    RoiSubset(self._agent_id, session.session_id, self._message_seq, update_seq, part), self._grid
-                )
-            except InvalidInputError as error:
-                self._drop(spooled, str(error))
-                continue
-            sent[self._message_seq] = SentPart(spooled, len(data), update_seq)
-            yield pb.ContributeSubsetsRequest(
-                session_id=session.session_id, sequence=self._message_seq, purpose=_PURPOSES[due.purpose], subset=data
-            )
-
     def _handle_outcome(self, outcome: pb.SubsetOutcome, sent: SentPart) -> GaussLiteError | None:
         """Mark one subset as acknowledged or dropped; returns the error if it must be sent again."""
         part = sent.batch
@@ -208,7 +194,7 @@ class UpdateSender:
         rejected = outcome.status == pb.SUBSET_STATUS_REJECTED
         if outcome.status == pb.SUBSET_STATUS_ACCEPTED:
             self._spool.record_acknowledged(part.batch.keys, sent.update_seq)
-        self._count_sent(part, sent.size_bytes, keys, rejected)
+        self._count_sent(part, len(sent.request.subset), keys, rejected)
         if rejected and outcome.reason in ("QUOTA", "STORAGE"):
             return QuotaError(outcome.message)
         if rejected and outcome.reason == "CHECKSUM" and not keys & self._resent_damaged:
@@ -224,12 +210,17 @@ class UpdateSender:
     def _drop(self, part: SpoolBatch, reason: str) -> None:
         _log.warning("uplink: updates of %d voxels are dropped: %s", len(part.batch), reason)
         self._spool.mark_done(part)
-        self._count(subsets_rejected=1)
+        self.counters = replace(self.counters, subsets_rejected=self.counters.subsets_rejected + 1)
 
     def _count_sent(self, part: SpoolBatch, size: int, keys: set[int], rejected: bool) -> None:
-        is_roi = part.purpose is Purpose.ROI
-        gaussians = 0 if rejected else len(part.batch.gaussians)
-        bytes_of_purpose = {"roi_bytes" if is_roi else "handover_bytes": size}
-        self._count(**bytes_of_purpose, gaussians_sent=gaussians, subsets_sent=1)
+        before, is_roi = self.counters, part.purpose is Purpose.ROI
         if is_roi and not rejected:
             self._roi_voxels |= keys
+        self.counters = replace(
+            before,
+            roi_bytes=before.roi_bytes + size * is_roi,
+            handover_bytes=before.handover_bytes + size * (not is_roi),
+            gaussians_sent=before.gaussians_sent + len(part.batch.gaussians) * (not rejected),
+            voxels_sent=len(self._roi_voxels),
+            subsets_sent=before.subsets_sent + 1,
+        )

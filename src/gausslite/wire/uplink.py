@@ -14,9 +14,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
-from jaxtyping import Int64
-from numpy import ndarray
-
 from gausslite.domain import errors
 from gausslite.domain.objects import ObjectReport
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid
@@ -24,7 +21,7 @@ from gausslite.v1 import geometry_pb2
 from gausslite.wire.channel import RetryDelay
 from gausslite.wire.clients import FusionClient, Session
 from gausslite.wire.security import TokenBucket
-from gausslite.wire.spool import Purpose, Spool, SpoolBatch, SpooledKeyframe
+from gausslite.wire.spool import Purpose, Spool, SpooledKeyframe
 from gausslite.wire.update_sender import UpdateSender, UplinkCounters, UplinkSettings
 
 _log = logging.getLogger(__name__)
@@ -45,12 +42,15 @@ class Uplink:
         has_restored_map: bool = False,
     ) -> None:
         """has_restored_map: the map was restored from a checkpoint, so that the updates sent before stay valid."""
-        self._client, self._agent_id, self._spool, self._grid = client, agent_id, spool, grid
+        self._client, self._agent_id, self._grid = client, agent_id, grid
+        self.spool = spool
+        """What waits, and what the server has."""
         self._settings = settings or UplinkSettings()
         self._has_restored_map = has_restored_map
-        self._counters = UplinkCounters()
+        self._connected, self._stopped_because = False, ""
+        self._joins = self._keyframe_bytes = 0
         self._session: Session | None = None
-        self._sender = UpdateSender(client, spool, grid, self._settings.deadline_s, self._count)
+        self._sender = UpdateSender(client, spool, grid, self._settings.deadline_s)
         self._token_bucket = TokenBucket(self._settings.kbps)
         self._retry_delay = RetryDelay(self._settings.first_backoff_s)
         self._last_error = ""
@@ -71,32 +71,18 @@ class Uplink:
     def enqueue(self, batch: VoxelBatch, purpose: Purpose = Purpose.ROI) -> None:
         """Queue voxel updates; each replaces a pending update of its voxel. Raises StorageError."""
         if len(batch):
-            self._spool.enqueue(batch, purpose)
-            with self._changed:
-                self._changed.notify_all()
-
-    def spooled_voxels(self, purpose: Purpose | None = None) -> Int64[ndarray, " v"]:
-        """Return the keys of the voxels that the server has or will have, ascending; purpose: only those sent for it.
-
-        Without a file, the spool has only the voxels of this process. Raises StorageError.
-        """
-        return self._spool.voxels(purpose)
+            self.spool.enqueue(batch, purpose)
+            self._wake()
 
     def report_objects(self, report: ObjectReport) -> None:
         """Send the agent's task and objects with the next round; a newer report replaces one that waits."""
-        with self._changed:
-            self._report = report
-            self._changed.notify_all()
+        self._report = report
+        self._wake()
 
     def enqueue_keyframe(self, keyframe: SpooledKeyframe, replaced: int | None = None) -> None:
         """Queue a selected keyframe; replaced: index of the one that it replaces. Raises StorageError."""
-        self._spool.enqueue_keyframe(keyframe, replaced)
-        with self._changed:
-            self._changed.notify_all()
-
-    def selected_keyframes(self) -> list[SpooledKeyframe]:
-        """Return all selected keyframes, also those from before a restart."""
-        return self._spool.keyframes()
+        self.spool.enqueue_keyframe(keyframe, replaced)
+        self._wake()
 
     def drain(self, timeout_s: float) -> bool:
         """Send everything pending, also small changes. True if the server has it all, False after the timeout."""
@@ -107,7 +93,7 @@ class Uplink:
             self._changed.notify_all()
             try:
                 # the limit may change during the wait
-                while not self._is_finished():
+                while self._has_pending() and not (self._closing or self._stopped_because):
                     remaining_s = min(deadline_s, self._drain_limit_s) - time.monotonic()
                     if remaining_s <= 0:
                         break
@@ -120,40 +106,38 @@ class Uplink:
         """Return the current totals."""
         with self._changed:
             return replace(
-                self._counters,
-                voxels_sent=self._sender.sent_roi_voxels,
-                voxels_waiting=self._spool.pending_voxels,
+                self._sender.counters,
+                voxels_waiting=self.spool.pending_voxels,
                 keyframes_sent=len(self._sent_keyframes),
-                keyframes_waiting=self._spool.pending_keyframes,
+                keyframes_waiting=self.spool.pending_keyframes,
+                keyframe_bytes=self._keyframe_bytes,
+                joins=self._joins,
+                connected=self._connected,
+                stopped_because=self._stopped_because,
             )
 
     def limit_drain(self, timeout_s: float) -> None:
         """Make the current and all later calls of `drain` return by then; sending continues until `close`."""
-        with self._changed:
-            self._drain_limit_s = time.monotonic() + timeout_s
-            self._changed.notify_all()
+        self._drain_limit_s = time.monotonic() + timeout_s
+        self._wake()
 
     def close(self) -> None:
         """Leave the session, end the thread and the connection; pending updates stay in the spool."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()
+        self._closing = True
+        self._wake()
         self._thread.join(_LEAVE_S)
         # cancels a call in flight, so that the thread does not block on the network
         self._client.close()
         self._thread.join()
-        self._spool.close()
+        self.spool.close()
 
-    def _count(self, **added: int) -> None:
+    def _wake(self) -> None:
+        """Let the thread and `drain` look again at what has changed."""
         with self._changed:
-            sums = {name: getattr(self._counters, name) + count for name, count in added.items()}
-            self._counters = replace(self._counters, **sums)
-
-    def _is_finished(self) -> bool:
-        return self._closing or bool(self._counters.stopped_because) or not self._has_pending()
+            self._changed.notify_all()
 
     def _has_pending(self) -> bool:
-        return self._has_report or self._spool.pending_voxels + self._spool.pending_keyframes > 0
+        return self._has_report or self.spool.pending_voxels + self.spool.pending_keyframes > 0
 
     def _run(self) -> None:
         try:
@@ -178,7 +162,7 @@ class Uplink:
     def _wait_until_due(self) -> bool:
         """Wait for updates, bandwidth and the next round's time; False if the uplink ends."""
         with self._changed:
-            while not self._closing and not self._counters.stopped_because:
+            while not self._closing and not self._stopped_because:
                 now_s = time.monotonic()
                 wait_s = max(self._next_round_s - now_s, self._token_bucket.seconds_until_positive(now_s))
                 check_in_s = self._next_check_s - now_s
@@ -193,19 +177,21 @@ class Uplink:
             self._check_server()
         resend_threshold = 0.0 if self._draining else self._settings.resend_threshold
         max_bytes = self._token_bucket.available_bytes(self._settings.round_bytes)
-        due = self._spool.next_round(max_bytes, resend_threshold)
+        due = self.spool.next_round(max_bytes, resend_threshold)
         if due is None and not self._has_report:
             return False
         is_new_session = self._session is None
         session = self._join_if_needed()
         if is_new_session:
             # the comparison of digests may have added updates
-            due = self._spool.next_round(max_bytes, resend_threshold)
+            due = self.spool.next_round(max_bytes, resend_threshold)
         self._send_report(session)
         if due is None:
             return True
         if due.voxels is not None:
-            self._send_voxels(due.voxels, session)
+            messages = self._sender.encode(due.voxels, session)
+            self._token_bucket.spend(sum(len(part.request.subset) for part in messages.values()))
+            self._sender.send(messages)
         if due.keyframes:
             self._send_keyframes(due.keyframes, session)
         return True
@@ -221,7 +207,7 @@ class Uplink:
         if kept.alignment.message != self._frame_message:
             self._frame_message = kept.alignment.message
             _log.warning("uplink: %s", self._frame_message or "frame: nothing contradicts it any more")
-        if not self._spool.is_stored_by(kept.incarnation_id, kept.highest_update_seq):
+        if not self.spool.is_stored_by(kept.incarnation_id, kept.highest_update_seq):
             self._forget_session()
             self._join_if_needed()
 
@@ -232,11 +218,11 @@ class Uplink:
 
     def _resend_missing(self, session: Session) -> None:
         """If the server may have lost updates, compare digests and mark as unsent what differs."""
-        if self._spool.is_stored_by(session.incarnation_id, session.highest_update_seq):
+        if self.spool.is_stored_by(session.incarnation_id, session.highest_update_seq):
             return
-        acknowledged = self._spool.acknowledged_digests()
+        acknowledged = self.spool.acknowledged_digests()
         stored = self._client.stored_digests(session.session_id) if len(acknowledged.tiles) else acknowledged
-        resent = self._spool.begin_sending_to(
+        resent = self.spool.begin_sending_to(
             session.incarnation_id, session.highest_update_seq, acknowledged.differing(stored)
         )
         if len(acknowledged.tiles):
@@ -258,41 +244,36 @@ class Uplink:
             _log.warning("uplink: the report of objects is dropped: %s", error)
         self._sent_report = report
 
-    def _send_voxels(self, due: SpoolBatch, session: Session) -> None:
-        requests, sent = self._sender.encode(due, session)
-        self._token_bucket.spend(sum(sent_update.size_bytes for sent_update in sent.values()))
-        self._sender.send(requests, sent)
-
     def _send_keyframes(self, due: Sequence[SpooledKeyframe], session: Session) -> None:
         """Send keyframes on one stream. A rejected keyframe is dropped, because it would be rejected again."""
         byte_count = sum(len(keyframe.data) for keyframe in due)
         self._token_bucket.spend(byte_count)
         messages = [geometry_pb2.EncodedFrame.FromString(keyframe.data) for keyframe in due]
-        selected = self._spool.keyframe_indices()
+        selected = self.spool.keyframe_indices()
         deadline_s = self._settings.deadline_s
         response = self._client.contribute_encoded_keyframes(session.session_id, messages, selected, deadline_s)
-        self._spool.mark_keyframes_done(due)
+        self.spool.mark_keyframes_done(due)
         for rejection in response.rejected:
             _log.warning("uplink: keyframe %d is dropped: %s", rejection.index, rejection.reason)
         rejected = {rejection.index for rejection in response.rejected}
         with self._changed:
             self._sent_keyframes |= {keyframe.frame_index for keyframe in due} - rejected
-            self._count(keyframe_bytes=byte_count)
+            self._keyframe_bytes += byte_count
 
     def _join_if_needed(self) -> Session:
         if self._session is None:
             # a robot with a new map cannot send tombstones for the updates of its earlier map
-            fresh = self._spool.is_new and not self._has_restored_map and self._counters.joins == 0
+            fresh = self.spool.is_new and not self._has_restored_map and self._joins == 0
             report, frame = self._report, self._settings.world_frame
             task = None if report is None else report.graph
             session = self._client.join(self._agent_id, self._grid, frame, fresh, task, self._settings.declared_frame)
             self._resend_missing(session)
             self._session = session
-            self._spool.mark_keyframes_missing(session.keyframes)
+            self.spool.mark_keyframes_missing(session.keyframes)
             self._sender.begin_session(session.max_subset_bytes)
             self._next_check_s = time.monotonic() + self._settings.check_interval_s
             with self._changed:
-                self._counters = replace(self._counters, connected=True, joins=self._counters.joins + 1)
+                self._connected, self._joins = True, self._joins + 1
         return self._session
 
     def _recover(self, error: errors.GaussLiteError) -> None:
@@ -308,7 +289,7 @@ class Uplink:
         if isinstance(error, (errors.QuotaError, errors.StorageError)):
             self._sender.halve_messages()
         with self._changed:
-            self._counters = replace(self._counters, connected=False)
+            self._connected = False
             self._next_round_s = time.monotonic() + self._retry_delay.after(error)
 
     def _end_round(self, sent: bool) -> None:
@@ -317,13 +298,12 @@ class Uplink:
             self._last_error = ""
         with self._changed:
             self._retry_delay.reset()
-            self._counters = replace(self._counters, connected=self._session is not None)
+            self._connected = self._session is not None
             if not (sent and self._draining):
                 self._next_round_s = time.monotonic() + max(self._settings.interval_s, _MIN_INTERVAL_S)
             self._changed.notify_all()
 
     def _stop(self, reason: str) -> None:
         _log.error("uplink stopped: %s", reason)
-        with self._changed:
-            self._counters = replace(self._counters, connected=False, stopped_because=reason)
-            self._changed.notify_all()
+        self._connected, self._stopped_because = False, reason
+        self._wake()

@@ -50,12 +50,6 @@ def camera_view_from_message(message: agent_pb.GetCameraViewResponse) -> CameraV
     """Decode a view; None for an agent without keyframes. Raises InvalidInputError, PoseError."""
     if not message.colour_jpeg:
         return None
-    for name, count, highest in (
-        ("path", len(message.path), MAX_POSES),
-        ("keyframes", len(message.keyframes), MAX_KEYFRAMES),
-    ):
-        if count > highest:
-            raise InvalidInputError(f"camera view {name}: expected at most {highest} poses, got {count}")
     camera = convert.camera_from_message(message.camera)
     return CameraView(
         rgb=convert.decode_colour(message.colour_jpeg, camera.width_px, camera.height_px),
@@ -64,8 +58,8 @@ def camera_view_from_message(message: agent_pb.GetCameraViewResponse) -> CameraV
         frame_index=message.frame_index,
         T_world_camera=convert.transform_from_message("camera view t_world_camera", message.t_world_camera),
         times_ns=np.array([view_pose.capture_time_ns for view_pose in message.path], np.int64),
-        path=_poses("camera view path", [view_pose.t_world_camera for view_pose in message.path]),
-        keyframes=_poses("camera view keyframes", list(message.keyframes)),
+        path=_poses("path", [view_pose.t_world_camera for view_pose in message.path], MAX_POSES),
+        keyframes=_poses("keyframes", list(message.keyframes), MAX_KEYFRAMES),
         detected=_detected_from_message(message.detected) if message.HasField("detected") else None,
     )
 
@@ -104,8 +98,10 @@ def _detected_from_message(message: agent_pb.DetectedImage) -> DetectedImage:
     return DetectedImage(message.frame_index, rgb, tuple(boxes))
 
 
-def _poses(name: str, messages: list[geometry_pb2.RigidTransform]) -> Float64[ndarray, "n 4 4"]:
-    poses = [convert.transform_from_message(name, message) for message in messages]
+def _poses(name: str, messages: list[geometry_pb2.RigidTransform], highest: int) -> Float64[ndarray, "n 4 4"]:
+    if len(messages) > highest:
+        raise InvalidInputError(f"camera view {name}: expected at most {highest} poses, got {len(messages)}")
+    poses = [convert.transform_from_message(f"camera view {name}", message) for message in messages]
     return np.array(poses, np.float64).reshape(-1, 4, 4)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.codec.stored import from_bytes
+from gausslite.codec.stored_voxels import from_records
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records
@@ -74,12 +74,12 @@ class AgentAcknowledgements:
         """Return the latest acknowledged content, with tombstones."""
         keys = sorted(self.voxels)
         voxels = [self.voxels[key] for key in keys]
-        parts = [from_bytes(voxel.records) for voxel in voxels]
+        parts = [from_records(voxel.records) for voxel in voxels]
         return VoxelBatch(
             np.array(keys, np.int64),
             np.array([voxel.kappa_sum for voxel in voxels], np.uint64),
             np.array([len(part) for part in parts], np.uint32),
-            from_bytes(b"".join(voxel.records for voxel in voxels)),
+            from_records(b"".join(voxel.records for voxel in voxels)),
         )
 
     def _acknowledge(self, message: bytes) -> None:

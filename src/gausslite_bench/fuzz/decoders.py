@@ -10,8 +10,7 @@ from pathlib import Path
 
 from gausslite.codec.json import decode_object_report
 from gausslite.codec.ply import gaussians_from_ply, world_frame_from_ply
-from gausslite.codec.stored import from_bytes
-from gausslite.codec.stored_voxels import StoredVoxels
+from gausslite.codec.stored_voxels import StoredVoxels, from_records
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.wire.convert import decode_frame
@@ -29,7 +28,7 @@ DECODERS: Mapping[str, Callable[[bytes], object]] = {
     "subset": decode_subset,
     "keyframe": decode_frame,
     "object-report": decode_object_report,
-    "records": from_bytes,
+    "records": from_records,
     "stored-row": lambda data: StoredVoxels.from_row(data).batch(),
     "ply": lambda data: (world_frame_from_ply(data), gaussians_from_ply(data)),
 }

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.sample_batches import make_batch
 
-from gausslite.codec.stored import RECORD, to_records
-from gausslite.codec.stored_voxels import CODES, VOXELS, StoredVoxels
-from gausslite.codec.subset_codec import SubsetCoding, decode_stored, decode_subset, encode_subset
+from gausslite.codec.body import SubsetCoding
+from gausslite.codec.stored_voxels import CODES, RECORD, VOXELS, StoredVoxels, to_records
+from gausslite.codec.subset_codec import decode_stored, decode_subset, encode_subset
 from gausslite.domain.errors import CodecError, StorageError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, tiles_of
 

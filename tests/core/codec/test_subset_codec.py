@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.sample_batches import make_batch
 
+from gausslite.codec.body import SubsetCoding
 from gausslite.codec.columns import OPACITY_BINS, RGB_MAX, RGB_MIN, SCALE_MIN_M
-from gausslite.codec.subset_codec import CodecLimits, SubsetCoding, decode_subset, encode_subset, split_batch
+from gausslite.codec.subset_codec import CodecLimits, decode_subset, encode_subset, split_batch
 from gausslite.domain.errors import ChecksumError, CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from support.reference_unpack import reference_unpack
 from support.sample_batches import make_batch
 
-from gausslite.codec import quantised_body
 from gausslite.codec._unpack import unpack
-from gausslite.codec.body_layout import BodyLayout
+from gausslite.codec.body import BodyLayout, encode_quantised, quantised_columns
 from gausslite.codec.columns import QUAT_STEPS, PositionPrecision, decompress
 from gausslite.domain.errors import CodecError
 from gausslite.domain.voxels import VoxelGrid
@@ -31,9 +30,9 @@ def body_of(case: tuple[float, int, int]) -> Body:
     grid = VoxelGrid(size_m)
     batch = make_batch(seed, n, grid, spread_m=3 * size_m)
     layout = BodyLayout.of(batch, PositionPrecision.of(n, len(batch), grid))
-    body = quantised_body.encode(batch, grid, layout)
+    body = encode_quantised(batch, grid, layout)
     end = 4 + struct.unpack_from("<I", body)[0]
-    size = sum(column.byte_count for column in quantised_body._columns(layout))
+    size = sum(column.byte_count for column in quantised_columns(layout))
     return layout, decompress(body[4:end], size), body[end:]
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gausslite.codec.subset_codec import SubsetCoding, decode_subset, encode_subset
+from gausslite.codec.body import SubsetCoding
+from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, group_by_voxel, merge_batches, tombstones
 

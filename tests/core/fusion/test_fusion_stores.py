@@ -19,8 +19,7 @@ import pytest
 from opened_stores import OpenStore, opener
 from support.sample_batches import make_batch, random_subset
 
-from gausslite.codec.stored import to_records
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.stored_voxels import StoredSubset, to_records
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, gather_rows, select_keys

@@ -175,7 +175,7 @@ def test_a_frames_motion_is_unchanged_by_a_round_trip() -> None:
 
 def test_a_live_frame_is_unchanged_by_a_round_trip() -> None:
     sent = replace(sample_frame(), motion=MOTION)
-    got, lens = convert.live_frame_from_message(convert.live_frame_to_message(sent, LENS, lossless=True))
+    got, lens = convert.live_frame_from_message(convert.frame_to_message(sent, lossless=True, lens=LENS))
     assert (got.camera, lens) == (sent.camera, LENS)
     np.testing.assert_array_equal(got.rgb, sent.rgb)
     assert got.motion is not None
@@ -184,7 +184,7 @@ def test_a_live_frame_is_unchanged_by_a_round_trip() -> None:
 
 def test_a_frame_with_a_lens_is_refused_where_nothing_corrects_it() -> None:
     with pytest.raises(InvalidInputError, match="frame lens"):
-        convert.frame_from_message(convert.live_frame_to_message(sample_frame(), LENS))
+        convert.frame_from_message(convert.frame_to_message(sample_frame(), lens=LENS))
 
 
 @pytest.mark.parametrize(
@@ -214,12 +214,12 @@ def test_a_wrong_lens_or_motion_is_refused_by_name(change: dict[str, object], ex
 def test_any_lens_gives_a_frame_or_an_error_about_it(coefficients: list[float], model: str) -> None:
     lens = Lens(LensModel(model), tuple(coefficients[: 8 if model == "radtan" else 4]))
     with contextlib.suppress(InvalidInputError):
-        live_frame = convert.live_frame_from_message(convert.live_frame_to_message(sample_frame(), lens))
+        live_frame = convert.live_frame_from_message(convert.frame_to_message(sample_frame(), lens=lens))
         frame = correct_live_frame(*live_frame)
         assert np.isfinite(frame.depth_m).all()
 
 
-FRAME_BYTES = convert.live_frame_to_message(replace(sample_frame(), motion=MOTION), LENS).SerializeToString()
+FRAME_BYTES = convert.frame_to_message(replace(sample_frame(), motion=MOTION), lens=LENS).SerializeToString()
 
 
 @given(st.data())

@@ -41,7 +41,7 @@ from gausslite.wire.server import serve_until_stopped
 from gausslite.wire.spool import Spool
 from gausslite.wire.update_sender import UplinkSettings
 from gausslite.wire.uplink import Uplink
-from gausslite_agent.background import KeyframeUpload
+from gausslite_agent.keyframe_upload import KeyframeUpload
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.settings import AgentSettings, parse_arguments
