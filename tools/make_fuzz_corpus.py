@@ -9,11 +9,11 @@ import shutil
 from collections.abc import Iterator
 
 import numpy as np
+from gausslite.codec.stored import to_records
 from google.protobuf.message import Message
 
 from gausslite.codec.json import encode_object_report
 from gausslite.codec.ply import ply_bytes
-from gausslite.codec.stored import to_records
 from gausslite.codec.subset_codec import SubsetCoding, decode_stored, encode_subset
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.frame import Frame
