@@ -17,7 +17,6 @@ from pathlib import Path
 
 import sitecustomize
 
-PACKAGES = ("gausslite", *(f"gausslite_{name}" for name in ("bench", "cluster", "gpu", "ros", "sim", "view")))
 PROGRAMS = ("gausslite_agent", "gausslite_fusion_server", "gausslite_parser")
 TASK = "Pick up the mug on the table"
 SOURCE, FRAMES = "sim:home", ("--frames", "0:3", "--size", "160x120")
@@ -26,7 +25,8 @@ SOURCE, FRAMES = "sim:home", ("--frames", "0:3", "--size", "160x120")
 def failed_imports() -> dict[str, str]:
     """Return the missing package, or the error, of each module that cannot be imported."""
     failed: dict[str, str] = {}
-    for package in (*PACKAGES, *PROGRAMS):
+    beside = Path(str(importlib.import_module("gausslite").__file__)).parents[1].glob("gausslite*/__init__.py")
+    for package in (*(path.parent.name for path in beside), *PROGRAMS):
         for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}."):
             try:
                 importlib.import_module(module.name)

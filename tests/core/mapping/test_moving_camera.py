@@ -40,7 +40,6 @@ def test_seeds_lie_on_the_surface_that_each_row_sees() -> None:
     assert np.ptp(still.means_m[:, 2]) > 0.08
 
 
-@pytest.mark.slow
 def test_the_map_renders_what_the_moving_camera_sees() -> None:
     frame = approaching_frame()
     mapper = GaussianMapper(MapperSettings(max_gaussians=4000), ReferenceRasterizer(), seed=0)
