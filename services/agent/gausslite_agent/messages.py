@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from gausslite.domain.camera import Camera
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.convert import encode_colour, encode_depth, enum_numbers, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
@@ -83,9 +82,3 @@ def view_to_message(
         depth_png=encode_depth(depth_m),
         map_revision=map_revision,
     )
-
-
-def blank_view(camera: Camera, map_revision: int) -> pb.RenderViewResponse:
-    """Return the view of an empty map."""
-    size = (camera.height_px, camera.width_px)
-    return view_to_message(np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), map_revision)

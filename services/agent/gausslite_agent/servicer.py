@@ -44,7 +44,6 @@ from gausslite.wire.update_sender import UplinkCounters
 from gausslite.wire.views import ChangeNotifier, camera_view_to_message
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.messages import (
-    blank_view,
     report_to_message,
     status_to_message,
     summary_to_message,
@@ -216,11 +215,12 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
         T_world_camera = transform_from_message("t_world_camera", request.t_world_camera)
 
         def render(mapper: GaussianMapper) -> pb.RenderViewResponse:
-            revision = self._worker.revision()
-            if mapper.count == 0:
-                return blank_view(camera, revision)
-            rendering = mapper.render(camera, T_world_camera)
-            return view_to_message(rendering.rgb, rendering.expected_depth_m(), revision)
+            revision, size = self._worker.revision(), (camera.height_px, camera.width_px)
+            rgb, depth_m = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
+            if mapper.count > 0:
+                rendering = mapper.render(camera, T_world_camera)
+                rgb, depth_m = rendering.rgb, rendering.expected_depth_m()
+            return view_to_message(rgb, depth_m, revision)
 
         return await asyncio.wrap_future(self._worker.run(render))
 

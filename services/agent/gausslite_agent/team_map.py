@@ -34,8 +34,12 @@ class TeamRegion:
     def of(cls, graph: TaskGraph, objects: Sequence[TeamObject]) -> TeamRegion:
         """Return the region of the objects whose noun is a target of the task, with a margin."""
         found = [team_object.landmark for team_object in objects if team_object.landmark.noun in graph.targets]
-        boxes = [(landmark.extent_m, graph.targets.index(landmark.noun)) for landmark in found]
-        return cls(tuple(sorted(((_grown(box), target) for box, target in boxes), key=lambda grown: grown[0].min_m)))
+        corners = [
+            (np.array(own.extent_m.min_m) - _MARGIN_M, np.array(own.extent_m.max_m) + _MARGIN_M) for own in found
+        ]
+        grown = [AxisAlignedBox.around(np.array(both)) for both in corners]
+        targets = [graph.targets.index(landmark.noun) for landmark in found]
+        return cls(tuple(sorted(zip(grown, targets, strict=True), key=lambda boxed: boxed[0].min_m)))
 
     @property
     def bounds(self) -> AxisAlignedBox | None:
@@ -55,10 +59,6 @@ class TeamRegion:
         of_gaussians = np.repeat(target[inside], chosen.counts)
         gaussians = replace(chosen.gaussians, active=np.ones(len(of_gaussians), np.bool_), target=of_gaussians)
         return VoxelBatch(chosen.keys, chosen.kappa_sums, chosen.counts, gaussians)
-
-
-def _grown(box: AxisAlignedBox) -> AxisAlignedBox:
-    return AxisAlignedBox.around(np.array([np.array(box.min_m) - _MARGIN_M, np.array(box.max_m) + _MARGIN_M]))
 
 
 _log = logging.getLogger(__name__)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from gausslite.config.command_parser import CommandParser
@@ -40,10 +41,8 @@ class ParserServicer(parser_service_pb2_grpc.ParserServiceServicer):
 
 def parser_service(parser: TaskParser) -> Service:
     """Return the service of this parser for a gRPC server."""
-    servicer = ParserServicer(parser)
-    return Service(
-        SERVICE_NAME, lambda server: parser_service_pb2_grpc.add_ParserServiceServicer_to_server(servicer, server)
-    )
+    add = parser_service_pb2_grpc.add_ParserServiceServicer_to_server
+    return Service(SERVICE_NAME, partial(add, ParserServicer(parser)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,7 @@ def graph_as_json(graph: TaskGraph) -> dict[str, Any]:
         "anchors": list(graph.anchors),
         "relations": [_relation_as_json(relation) for relation in graph.relations],
         "attributes": {attribute.name: _attributes_as_json(attribute) for attribute in graph.attributes},
-        "excluded": list(graph.excluded),
-        "context": list(graph.context),
-        "warnings": list(graph.warnings),
+        **{name: list(getattr(graph, name)) for name in ("excluded", "context", "warnings")},
     }
 
 
@@ -40,15 +38,12 @@ def graph_from_json(value: Mapping[str, Any]) -> TaskGraph:
         task_id=str(value.get("task_id", "")),
         text=str(value.get("text", "")),
         targets=targets,
-        anchors=_names(value.get("anchors", ())),
         relations=tuple(_relation_from_json(relation) for relation in value.get("relations", ())),
-        warnings=_names(value.get("warnings", ())),
         roles=tuple(TargetRole(roles.get(target, TargetRole.OBJECT)) for target in targets),
         attributes=tuple(
             _attributes_from_json(name, attributes) for name, attributes in value.get("attributes", {}).items()
         ),
-        excluded=_names(value.get("excluded", ())),
-        context=_names(value.get("context", ())),
+        **{name: _names(value.get(name, ())) for name in ("anchors", "excluded", "context", "warnings")},
     )
 
 

@@ -48,7 +48,7 @@ class Service:
 
     name: str
     register: Callable[[grpc.aio.Server], None]
-    check: Check | None = None
+    check: Check = lambda: None
     check_progress: Check = lambda: None
 
 
@@ -102,7 +102,7 @@ class ReadinessWatch:
     async def _check_in_time(self) -> None:
         """Wait for the running check, or for a new one. Raises UnavailableError if it takes too long."""
         if self._checking is None:
-            self._checking = asyncio.ensure_future(asyncio.to_thread(self._service.check or (lambda: None)))
+            self._checking = asyncio.ensure_future(asyncio.to_thread(self._service.check))
         done, _ = await asyncio.wait([self._checking], timeout=_CHECK_LIMIT_S)
         if not done:
             raise UnavailableError(f"the check has not ended within {_CHECK_LIMIT_S:g} s")
@@ -181,8 +181,7 @@ async def start_server(
         servers[_bind(health_server, health_listen, None)] = health_server
     for started in servers.values():
         await started.start()
-    checked = [watch for service, watch in zip(services, watches, strict=True) if service.check is not None]
-    return RunningServer(servers, health_servicer, [asyncio.create_task(watch.run()) for watch in checked])
+    return RunningServer(servers, health_servicer, [asyncio.create_task(watch.run()) for watch in watches])
 
 
 async def serve_until_stopped(
