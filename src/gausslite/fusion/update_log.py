@@ -201,14 +201,6 @@ def require_storable(update: StoredSubset) -> None:
             raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")
 
 
-def require_intact(rows: Iterable[UpdateRow], damaged: Callable[[str], StorageError]) -> Iterator[UpdateRow]:
-    """Yield the rows. Raises the StorageError that `damaged` makes of the name of a damaged one."""
-    for row in rows:
-        if not is_intact(row):
-            raise damaged(f"row {row[0]} of agent {row[1]!r}")
-        yield row
-
-
 def is_intact(row: UpdateRow) -> bool:
     """Return whether a row has its checksum."""
     number, agent_id, checksum, data = row

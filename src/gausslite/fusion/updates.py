@@ -278,11 +278,6 @@ class UpdateQueue:
             if not own:
                 self._wait(agent_id)
 
-    @property
-    def has_waiting(self) -> bool:
-        """Whether `take` would return a message."""
-        return bool(self._waiting)
-
     def take(self, max_bytes: int = _GROUP_BYTES) -> list[PendingUpdate]:
         """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue.
 

@@ -88,8 +88,7 @@ def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tup
     for update in updates:
         queue.add(update)
     done: list[PendingUpdate] = []
-    while queue.has_waiting:
-        taken = queue.take(group)
+    while taken := queue.take(group):
         assert len({update.subset.agent_id for update in taken}) == len(taken)
         for update in taken:
             part = update.next_slice().voxels
@@ -141,8 +140,8 @@ def test_a_message_costs_what_its_header_declares() -> None:
     for _ in range(20):
         queue.add(pending("ant", encoded("ant", 1, {0: 40})))
     order = []
-    while queue.has_waiting:
-        [update] = queue.take(1)
+    while taken := queue.take(1):
+        [update] = taken
         order.append(update.agent_id)
         update.future.set_result(None)
         queue.put_back(update)
