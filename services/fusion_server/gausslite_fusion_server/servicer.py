@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Any, TypeVar
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport
@@ -132,7 +132,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             self._aligning.cancel()
         self._map_changes.notify()
 
-    async def store_message(self, session: SessionRecord, message: bytes | StoredSubset) -> StoredCount:
+    async def store_message(self, session: SessionRecord, message: bytes | EncodedSubset) -> StoredCount:
         """Store a message, or a decoded part of one. Raises UnavailableError, and as FusionEngine.contribute."""
         self._gate.require_open()
         put = self.engine.enqueue_update(session, message)

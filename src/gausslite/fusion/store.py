@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import GaussLiteError, SessionUnknownError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
@@ -103,9 +103,9 @@ class FusionStore(ABC):
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
-        return self.put_all([StoredSubset.exact(subset)])[0]
+        return self.put_all([EncodedSubset.exact(subset)])[0]
 
-    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
+    def put_all(self, updates: Sequence[EncodedSubset]) -> list[PutOutcome]:
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
         for update in updates:
             require_storable(update)
