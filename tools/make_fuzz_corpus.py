@@ -9,12 +9,12 @@ import shutil
 from collections.abc import Iterator
 
 import numpy as np
-from gausslite.codec.stored import to_records
 from google.protobuf.message import Message
 
+from gausslite.codec.encoded_voxels import to_records
 from gausslite.codec.json import encode_object_report
 from gausslite.codec.ply import ply_bytes
-from gausslite.codec.subset_codec import SubsetCoding, decode_stored, encode_subset
+from gausslite.codec.subset_codec import SubsetCoding, encode_subset, unpack_subset
 from gausslite.domain.camera import Camera, CameraMotion, Lens, LensModel
 from gausslite.domain.frame import Frame
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
@@ -58,7 +58,7 @@ def codec_messages() -> Iterator[tuple[str, str, bytes]]:
     for name, subset, coding in subsets():
         message = encode_subset(subset, GRID, coding)
         yield "subset", name, message
-        yield "stored-row", name, decode_stored(message)[0].voxels.to_row()
+        yield "stored-row", name, unpack_subset(message)[0].voxels.to_row()
     yield "object-report", "two-objects", encode_object_report(report())
     for name, image in frames():
         yield "keyframe", name, image.SerializeToString()

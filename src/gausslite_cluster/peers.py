@@ -12,7 +12,7 @@ from typing import Any
 
 import grpc
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import UnavailableError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import SessionRecord
@@ -97,7 +97,7 @@ class Peers:
         require_all(slots for slots, _ in results)
         return {name: answer for name, (_, answer) in zip(names, results, strict=True)}
 
-    async def send_part(self, server: str, session_id: str, part: StoredSubset) -> StoredCount:
+    async def send_part(self, server: str, session_id: str, part: EncodedSubset) -> StoredCount:
         """Send a part of a message to its owner; returns when it is durable. Raises what the owner raised."""
         request = region_pb.StorePartRequest(
             session_id=session_id,
@@ -168,12 +168,12 @@ class PartSender:
         """Wait until the thread has ended."""
         self._decoder.shutdown(wait=True)
 
-    async def _decode(self, session: SessionRecord, message: bytes) -> StoredSubset:
+    async def _decode(self, session: SessionRecord, message: bytes) -> EncodedSubset:
         update = PendingUpdate(session.session_id, session.agent_id, message)
         self._queue.add(update)
         # one turn for each message, for the one that is next then
         self._decoder.submit(self._decode_next)
-        subset: StoredSubset = await asyncio.wrap_future(update.future)
+        subset: EncodedSubset = await asyncio.wrap_future(update.future)
         return subset
 
     def _decode_next(self) -> None:
@@ -184,7 +184,7 @@ class PartSender:
         self._queue.put_back(update)
 
     @contextmanager
-    def _room_for(self, subset: StoredSubset) -> Iterator[None]:
+    def _room_for(self, subset: EncodedSubset) -> Iterator[None]:
         """Count what waits for its owners. Raises UnavailableError if one of them has too much to store already."""
         parts = self._host.owners.split(subset)
         sizes = {owner: part.voxels.voxels.nbytes + part.voxels.gaussians.nbytes for owner, part in parts}
@@ -199,7 +199,7 @@ class PartSender:
         finally:
             self._waiting_bytes.subtract(sizes)
 
-    async def _store(self, session_id: str, subset: StoredSubset) -> StoredCount:
+    async def _store(self, session_id: str, subset: EncodedSubset) -> StoredCount:
         """Send the parts; those whose owner changes are cut and sent again, for 10 s at most."""
         loop = asyncio.get_running_loop()
         end_s, waiting, accepted, stale = loop.time() + WAIT_S, [subset], 0, 0
@@ -228,7 +228,7 @@ class PartSender:
             with suppress(TimeoutError):
                 await asyncio.wait_for(changed.wait(), _RETRY_S if owners is self._host.owners else 0.0)
 
-    async def _store_part(self, owner: str | None, session_id: str, part: StoredSubset) -> StoredCount:
+    async def _store_part(self, owner: str | None, session_id: str, part: EncodedSubset) -> StoredCount:
         if owner is None:
             raise UnavailableError("fusion server: nobody owns some of these voxels; try again in a moment")
         if owner == self._host.server:

@@ -20,7 +20,7 @@ from psycopg.conninfo import conninfo_to_dict
 
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.fusion.store import TABLES, Execute, FusionStore
-from gausslite.fusion.update_log import SLOT_BITS, LogChange, require_intact
+from gausslite.fusion.update_log import SLOT_BITS, LogChange
 from gausslite_cluster.regions import ALL_SLOTS, OwnedSlots, slots_of
 
 _FIRST_DELAY_S, _MAX_DELAY_S = 0.1, 5.0
@@ -234,13 +234,13 @@ class PostgresStore(FusionStore):
         with db.transaction(), db.cursor("load", binary=True) as cursor:
             slots = sorted(ALL_SLOTS if self._owned is None else self._owned.slots)
             cursor.execute(f"{_SELECT_UPDATES} slot = ANY(%s::smallint[]) ORDER BY slot, number", (slots,))
-            self._log.load(require_intact(cursor, self._damaged))
+            self._log.load(self._require_intact(cursor))
         timeline = db.execute(_SELECT_TIMELINE).fetchone()
         self.incarnation_id = f"{_property(db, 'incarnation_id')}-{'' if timeline is None else timeline[0]}"
 
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         rows = itertools.chain.from_iterable(self._read(_SELECT_ROWS, part) for part in _by_slot(numbers))
-        return {row[0]: row[3] for row in require_intact(rows, self._damaged)}
+        return {row[0]: row[3] for row in self._require_intact(rows)}
 
     def _damaged(self, what: str) -> StorageError:
         return StorageError(

@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
 from gausslite.codec.body import SubsetCoding
-from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
+from gausslite.codec.encoded_voxels import EncodedSubset, EncodedVoxels
 from gausslite.codec.subset_codec import encode_subset, split_batch
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, InvalidInputError, UnavailableError
@@ -60,7 +60,7 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         """Return the servicer, ready for a server."""
         return Service("gausslite.v1.RegionService", partial(region_pb_grpc.add_RegionServiceServicer_to_server, self))
 
-    async def store_part(self, session_id: str, part: StoredSubset) -> StoredCount:
+    async def store_part(self, session_id: str, part: EncodedSubset) -> StoredCount:
         """Store a part of a message. Raises GaussLiteError."""
         try:
             if not self._host.owned.have(part.voxels.keys):
@@ -75,9 +75,9 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
 
     async def StorePart(self, request: region_pb.StorePartRequest, context: Any) -> region_pb.StorePartResponse:
         """Store a part of a message."""
-        voxels = StoredVoxels.from_row(request.voxels)
+        voxels = EncodedVoxels.from_row(request.voxels)
         _require_codes_of(self._host.settings.grid, voxels)
-        part = StoredSubset(request.agent_id, request.message_seq, request.update_seq, voxels)
+        part = EncodedSubset(request.agent_id, request.message_seq, request.update_seq, voxels)
         count = await self.store_part(request.session_id, part)
         return region_pb.StorePartResponse(accepted_voxels=count.accepted, stale_voxels=count.stale)
 
@@ -153,7 +153,7 @@ class RegionServicer(region_pb_grpc.RegionServiceServicer):
         return local
 
 
-def _require_codes_of(grid: VoxelGrid, voxels: StoredVoxels) -> None:
+def _require_codes_of(grid: VoxelGrid, voxels: EncodedVoxels) -> None:
     """Raise CodecError for a row that no server of this mission sends: once stored, it could not be read."""
     keys = voxels.keys
     if voxels.size_m not in (0.0, grid.size_m) or (keys[:1] < 0).any() or (keys[1:] <= keys[:-1]).any():

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.voxel_changes import hash_columns
 from gausslite.domain.voxels import TILE_VOXELS, tiles_of
 
@@ -72,7 +72,7 @@ class Owners:
         """Whether every slot has an owner."""
         return len(self.server_of) == SLOTS
 
-    def split(self, subset: StoredSubset) -> list[tuple[str | None, StoredSubset]]:
+    def split(self, subset: EncodedSubset) -> list[tuple[str | None, EncodedSubset]]:
         """Return each owner with its part of a message, None with the part for slots without one; at least one."""
         names = (*self.servers, None)
         places = self._places[slots_of(subset.voxels.keys)]

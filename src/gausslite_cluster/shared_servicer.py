@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from google.protobuf.message_factory import GetMessageClass
 
-from gausslite.codec.ply import ply_bytes
 from gausslite.codec.subset_codec import CodecLimits, decode_subset
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, MismatchError, UnavailableError
 from gausslite.domain.voxel_changes import TileDigests
@@ -37,8 +36,8 @@ from gausslite_cluster.region_host import RegionHost
 from gausslite_cluster.region_servicer import AT_HOME, RegionServicer
 from gausslite_cluster.regions import Owners
 from gausslite_cluster.shared_watch import SharedRevisions, SharedWatch
-from gausslite_fusion_server.contributions import Contributions
-from gausslite_fusion_server.messages import declared_frame_from_message, exported_file
+from gausslite_fusion_server.contributions import Acknowledger
+from gausslite_fusion_server.messages import ExportedFile, declared_frame_from_message
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.servicer import MAX_REPORTED_REJECTIONS, DrainGate, FusionServicer
 from gausslite_fusion_server.settings import ServerSettings
@@ -58,7 +57,7 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         self._host, self._regions, self._peers, self._sender = host, regions, peers, sender
         self._gate = DrainGate()
         self._watch = SharedWatch(host, peers, SharedRevisions(), host.settings.grid)
-        self._contributions = Contributions(self._session, sender.store, host.traffic.record, RejectionLog(_log))
+        self._rejections = RejectionLog(_log)
         self._exports = asyncio.Lock()
 
     def service(self) -> Service:
@@ -122,7 +121,16 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
     ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
         """Store voxel updates; one acknowledgement for each message, after all owners have their parts."""
-        async for answer in self._contributions.answer(self._gate.admit(request_iterator), Caller.of(context)):
+        caller, session = Caller.of(context), None
+        stream = Acknowledger(caller, self._host.traffic, self._rejections)
+        async for request in self._gate.admit(request_iterator):
+            if session is None or session.session_id != request.session_id:
+                session = await self._session(request.session_id, caller)
+            try:
+                stored = await self._sender.store(session, request.subset)
+                answer = stream.accept(request, session.agent_id, stored)
+            except GaussLiteError as error:
+                answer = stream.refuse(request, session.agent_id, error)
             yield answer
 
     async def ContributeKeyframes(
@@ -166,12 +174,13 @@ class SharedServicer(pb_grpc.FusionServiceServicer):
         """Send a map, put together from all owners, as the bytes of a PLY file."""
         await self._require_mission(request.mission_id)
 
-        async def read() -> bytes:
+        async with self._exports:
             batch = await self._read_map(request)
             world_frame = (await self._host.ready()).engine.members.mission_config.given_world_frame
-            return await asyncio.to_thread(ply_bytes, batch.gaussians, world_frame)
-
-        async for chunk in exported_file(self._exports, read, self._gate.require_open):
+            exported = await asyncio.to_thread(ExportedFile, batch, world_frame)
+            del batch
+        async for chunk in exported.chunks():
+            self._gate.require_open()
             yield chunk
 
     async def RenderView(self, request: pb.RenderFusedViewRequest, context: Any) -> pb.RenderFusedViewResponse:

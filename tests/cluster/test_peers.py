@@ -10,7 +10,7 @@ import grpc
 import pytest
 from fusion_running import make_subset
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import UnavailableError
 from gausslite.v1 import region_service_pb2_grpc as region_pb_grpc
 
@@ -31,7 +31,7 @@ def test_a_server_that_never_answers_does_not_hold_a_part(tmp_path: Path, monkey
         region_pb_grpc.add_RegionServiceServicer_to_server(SilentServer(), server)
         server.add_insecure_port(address)
         await server.start()
-        part = StoredSubset.exact(make_subset("ant", 1, {11: [1]}))
+        part = EncodedSubset.exact(make_subset("ant", 1, {11: [1]}))
         try:
             with pytest.raises(UnavailableError):
                 await asyncio.wait_for(peers.send_part(address, "session", part), 20)

@@ -11,7 +11,7 @@ import pytest
 from support.postgres_running import PASSWORD, PostgresServer, postgres_server
 from support.sample_batches import random_subset
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import InvalidInputError, StorageError, UnavailableError
 from gausslite_cluster.regions import slots_of
 
@@ -177,7 +177,7 @@ def test_a_refused_message_changes_nothing_and_later_ones_are_stored(postgres: P
     store = PostgresStore(url)
     store.put(random_subset("ant", 1, {11: 3}))
     execute(url, "ALTER TABLE gausslite.voxel_updates ADD CONSTRAINT few CHECK (octet_length(voxels) < 4000)")
-    group = [StoredSubset.exact(random_subset(*own)) for own in (("bee", 2, {11: 5}), ("ant", 2, {11: 1, 22: 100}))]
+    group = [EncodedSubset.exact(random_subset(*own)) for own in (("bee", 2, {11: 5}), ("ant", 2, {11: 1, 22: 100}))]
     assert 'violates check constraint "few"' in one_line(lambda: store.put_all(group))
     assert {name: batch.counts.tolist() for name, batch in store.batches().items()} == {"ant": [3]}
     store.put(random_subset("ant", 3, {11: 2}))

@@ -22,7 +22,7 @@ from support.postgres_running import PostgresServer
 from waiting import wait_until
 
 from gausslite.codec.ply import gaussians_from_ply, ply_bytes
-from gausslite.codec.subset_codec import decode_stored, encode_subset
+from gausslite.codec.subset_codec import encode_subset, unpack_subset
 from gausslite.domain.errors import (
     CodecError,
     GaussLiteError,
@@ -91,7 +91,7 @@ def latest_of(subsets: list[RoiSubset]) -> VoxelBatch:
     """One agent's latest update of each voxel, as a store has it after these messages."""
     store = SqliteStore()
     for subset in subsets:
-        stored = decode_stored(encode_subset(subset, GRID))[0]
+        stored = unpack_subset(encode_subset(subset, GRID))[0]
         store.put_all([replace(stored, voxels=stored.voxels.with_computed_sums())])
     return store.batch(subsets[0].agent_id)
 
@@ -406,7 +406,7 @@ def test_a_part_that_cannot_be_stored_is_refused_without_effect(
         sessions = {name: server.client.join(name, GRID).session_id for name in AGENTS[:2]}
         first, second = scattered("ant", 1, 1), scattered("ant", 2, 2)
         list(server.client.contribute([request(sessions["ant"], first)], 20.0))
-        voxels = decode_stored(encode_subset(second, GRID))[0].voxels
+        voxels = unpack_subset(encode_subset(second, GRID))[0].voxels
         good, reversed_keys = voxels.to_row(), voxels.take(np.arange(len(voxels))[::-1]).to_row()
         parts = [
             StorePartRequest(session_id=sessions[name], agent_id="ant", update_seq=seq, voxels=row)

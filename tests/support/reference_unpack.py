@@ -16,7 +16,7 @@ from gausslite.codec.columns import (
     _unshuffle,
     quat_steps,
 )
-from gausslite.codec.stored_voxels import CODES, MAX_TARGET, OPACITY_BITS, TARGET_BITS, voxel_table
+from gausslite.codec.encoded_voxels import CODES, MAX_TARGET, OPACITY_BITS, TARGET_BITS, voxel_table
 from gausslite.domain.errors import CodecError
 
 

@@ -1,16 +1,13 @@
-"""Answer the streams on which agents send their voxel updates, wherever these are stored; pace large keyframes."""
+"""Acknowledge the voxel updates that agents send, wherever these are stored; pace large keyframes."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from gausslite.domain.errors import GaussLiteError, MismatchError, SessionUnknownError, StorageError, UnavailableError
-from gausslite.fusion.limits import SessionRecord
-from gausslite.fusion.traffic import TrafficCounters
+from gausslite.fusion.traffic import TrafficCounters, TrafficLog
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.status import code_and_reason
@@ -28,55 +25,45 @@ class StoredCount(NamedTuple):
     owner: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Contributions:
-    """Answers one message after the other of each stream.
+class Acknowledger:
+    """Says what became of each message of one stream, and counts it."""
 
-    find_session: raises SessionUnknownError, NotPermittedError. store: returns when the message is durable, or raises
-    what refuses it.
-    """
+    def __init__(self, caller: Caller, traffic: TrafficLog, rejections: RejectionLog) -> None:
+        self._caller, self._traffic, self._rejections = caller, traffic, rejections
+        self._acknowledged = 0
 
-    find_session: Callable[[str, Caller], Awaitable[SessionRecord]]
-    store: Callable[[SessionRecord, bytes], Awaitable[StoredCount]]
-    record_traffic: Callable[[str, TrafficCounters], None]
-    rejections: RejectionLog
-
-    async def answer(
-        self, requests: AsyncIterator[pb.ContributeSubsetsRequest], caller: Caller
-    ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
-        """Yield one acknowledgement for each message; errors of the whole stream are raised."""
-        acknowledged, session = 0, None
-        async for request in requests:
-            if session is None or session.session_id != request.session_id:
-                session = await self.find_session(request.session_id, caller)
-            outcome = await self._outcome(request, session, caller)
-            acknowledged = max(acknowledged, request.sequence)
-            yield pb.ContributeSubsetsResponse(acknowledged=acknowledged, outcomes=[outcome])
-
-    async def _outcome(
-        self, request: pb.ContributeSubsetsRequest, session: SessionRecord, caller: Caller
-    ) -> pb.SubsetOutcome:
-        outcome, size = pb.SubsetOutcome(sequence=request.sequence), len(request.subset)
-        is_handover = request.purpose == pb.PURPOSE_HANDOVER
-        traffic = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
-        try:
-            stored = await self.store(session, request.subset)
-        except STREAM_ERRORS as error:
-            if isinstance(error, UnavailableError):
-                self.rejections.record(caller.key, "UNAVAILABLE", str(error))
-            raise
-        except GaussLiteError as error:
-            reason = code_and_reason(error)[1]
-            outcome.status, outcome.reason, outcome.message = pb.SUBSET_STATUS_REJECTED, reason, str(error)
-            self.rejections.record(caller.key, reason, str(error))
-            self.record_traffic(session.agent_id, traffic.plus(TrafficCounters(subsets_rejected=1)))
-            return outcome
+    def accept(
+        self, request: pb.ContributeSubsetsRequest, agent_id: str, stored: StoredCount
+    ) -> pb.ContributeSubsetsResponse:
+        """Return the acknowledgement of a message that is durable."""
         is_accepted = stored.accepted > 0 or stored.stale == 0
-        outcome.status = pb.SUBSET_STATUS_ACCEPTED if is_accepted else pb.SUBSET_STATUS_STALE
+        outcome = pb.SubsetOutcome(status=pb.SUBSET_STATUS_ACCEPTED if is_accepted else pb.SUBSET_STATUS_STALE)
         outcome.accepted_voxels, outcome.stale_voxels, outcome.owner = stored
         counted = TrafficCounters(subsets_accepted=int(is_accepted), subsets_stale=int(not is_accepted))
-        self.record_traffic(session.agent_id, traffic.plus(counted))
-        return outcome
+        return self._answer(request, agent_id, outcome, counted)
+
+    def refuse(
+        self, request: pb.ContributeSubsetsRequest, agent_id: str, error: GaussLiteError
+    ) -> pb.ContributeSubsetsResponse:
+        """Return the acknowledgement of a refused message. Raises an error that every later message would meet too."""
+        reason = "UNAVAILABLE" if isinstance(error, UnavailableError) else code_and_reason(error)[1]
+        if isinstance(error, UnavailableError) or not isinstance(error, STREAM_ERRORS):
+            self._rejections.record(self._caller.key, reason, str(error))
+        if isinstance(error, STREAM_ERRORS):
+            raise error
+        outcome = pb.SubsetOutcome(status=pb.SUBSET_STATUS_REJECTED, reason=reason, message=str(error))
+        return self._answer(request, agent_id, outcome, TrafficCounters(subsets_rejected=1))
+
+    def _answer(
+        self, request: pb.ContributeSubsetsRequest, agent_id: str, outcome: pb.SubsetOutcome, counted: TrafficCounters
+    ) -> pb.ContributeSubsetsResponse:
+        size = len(request.subset)
+        is_handover = request.purpose == pb.PURPOSE_HANDOVER
+        received = TrafficCounters(handover_bytes=size) if is_handover else TrafficCounters(roi_bytes=size)
+        self._traffic.record(agent_id, received.plus(counted))
+        self._acknowledged = max(self._acknowledged, request.sequence)
+        outcome.sequence = request.sequence
+        return pb.ContributeSubsetsResponse(acknowledged=self._acknowledged, outcomes=[outcome])
 
 
 class PacedLock:

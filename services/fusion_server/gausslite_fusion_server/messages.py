@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from dataclasses import asdict
 
 import google_crc32c
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from gausslite.codec.ply import ply_bytes
 from gausslite.domain.errors import InvalidInputError
 from gausslite.domain.frame import MAX_COORDINATE_M
 from gausslite.domain.voxels import VoxelBatch
@@ -82,23 +83,27 @@ def select_map(engine: FusionEngine, request: pb.ExportFusedMapRequest) -> Voxel
 _CHUNK_BYTES = 1 << 20
 
 
-async def exported_file(
-    lock: asyncio.Lock, read: Callable[[], Awaitable[bytes]], require_open: Callable[[], None]
-) -> AsyncIterator[pb.ExportFusedMapResponse]:
-    """Yield a file in messages, from a copy on the disk. read: returns its bytes; lock: held until the copy is made."""
-    with tempfile.TemporaryFile() as file:
-        async with lock:
-            data = await read()
-            size_bytes, crc32c = len(data), google_crc32c.value(data)
-            await asyncio.to_thread(file.write, data)
-            del data
-        file.seek(0)
+class ExportedFile:
+    """A file that is sent, as a copy on the disk: a slow reader must not hold it in memory."""
+
+    def __init__(self, batch: VoxelBatch, world_frame: str) -> None:
+        """Encode a map as PLY; world_frame: see MissionConfig.given_world_frame."""
+        data = ply_bytes(batch.gaussians, world_frame)
+        self._size_bytes, self._crc32c = len(data), google_crc32c.value(data)
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `chunks`
+        self._file.write(data)
+        self._file.seek(0)
+
+    async def chunks(self) -> AsyncIterator[pb.ExportFusedMapResponse]:
+        """Yield the file in messages, once."""
         offset = 0
-        while data := await asyncio.to_thread(file.read, _CHUNK_BYTES):
-            require_open()
-            with read_deadline():
-                yield pb.ExportFusedMapResponse(offset=offset, total_bytes=size_bytes, data=data, crc32c=crc32c)
-            offset += len(data)
+        with self._file:
+            while data := await asyncio.to_thread(self._file.read, _CHUNK_BYTES):
+                with read_deadline():
+                    yield pb.ExportFusedMapResponse(
+                        offset=offset, total_bytes=self._size_bytes, data=data, crc32c=self._crc32c
+                    )
+                offset += len(data)
 
 
 def read_keyframe(engine: FusionEngine, request: pb.GetKeyframeRequest) -> pb.GetKeyframeResponse:

@@ -10,10 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Any, TypeVar
 
-from gausslite.codec.ply import ply_bytes
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.codec.subset_codec import MAX_SUBSET_BYTES
-from gausslite.domain.errors import InvalidInputError, QuotaError, UnavailableError
+from gausslite.domain.errors import GaussLiteError, InvalidInputError, QuotaError, UnavailableError
 from gausslite.domain.objects import ObjectReport
 from gausslite.fusion.engine import AlignmentRun, FusionEngine
 from gausslite.fusion.limits import MissionConfig, SessionRecord
@@ -27,7 +26,7 @@ from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
 from gausslite.wire.views import ChangeNotifier
 from gausslite_fusion_server import messages
-from gausslite_fusion_server.contributions import Contributions, PacedLock, StoredCount
+from gausslite_fusion_server.contributions import Acknowledger, PacedLock, StoredCount
 from gausslite_fusion_server.refinement_worker import RefinementWorker
 from gausslite_fusion_server.watch import FusedMapReader, watched_part
 
@@ -110,12 +109,10 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._background = ThreadPoolExecutor(1, "background")
         self._aligning: asyncio.Task[None] | None = None
         self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
-        self._renderer = MapRenderer(engine, refinement_worker.create_rasterizer)
+        self._renderer = MapRenderer(engine.maps, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
         self._gate = DrainGate()
-        self._contributions = Contributions(
-            self._session, self.store_message, engine.traffic.record, RejectionLog(_log)
-        )
+        self._rejections = RejectionLog(_log)
         # one at a time: they hold megabytes, the interpreter's lock, or the engine's lock during several transactions
         self._exports, self._queries, self._joins, self._keyframes = *(asyncio.Lock() for _ in range(3)), PacedLock()
 
@@ -135,7 +132,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             self._aligning.cancel()
         self._map_changes.notify()
 
-    async def store_message(self, session: SessionRecord, message: bytes | StoredSubset) -> StoredCount:
+    async def store_message(self, session: SessionRecord, message: bytes | EncodedSubset) -> StoredCount:
         """Store a message, or a decoded part of one. Raises UnavailableError, and as FusionEngine.contribute."""
         self._gate.require_open()
         put = self.engine.enqueue_update(session, message)
@@ -213,7 +210,16 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self, request_iterator: AsyncIterator[pb.ContributeSubsetsRequest], context: Any
     ) -> AsyncIterator[pb.ContributeSubsetsResponse]:
         """Store voxel updates; one acknowledgement for each message."""
-        async for answer in self._contributions.answer(self._gate.admit(request_iterator), Caller.of(context)):
+        caller, session = Caller.of(context), None
+        stream = Acknowledger(caller, self.engine.traffic, self._rejections)
+        async for request in self._gate.admit(request_iterator):
+            if session is None or session.session_id != request.session_id:
+                session = await self._session(request.session_id, caller)
+            try:
+                stored = await self.store_message(session, request.subset)
+                answer = stream.accept(request, session.agent_id, stored)
+            except GaussLiteError as error:
+                answer = stream.refuse(request, session.agent_id, error)
             yield answer
 
     async def ContributeKeyframes(
@@ -277,11 +283,13 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         """Send a map as the bytes of a PLY file."""
         self.engine.members.require_mission(request.mission_id)
 
-        async def read() -> bytes:
+        async with self._exports:
             batch = await self._work(messages.select_map, self.engine, request)
-            return await self._work(ply_bytes, batch.gaussians, self.engine.members.mission_config.given_world_frame)
-
-        async for chunk in messages.exported_file(self._exports, read, self._gate.require_open):
+            world_frame = self.engine.members.mission_config.given_world_frame
+            exported = await self._work(messages.ExportedFile, batch, world_frame)
+            del batch
+        async for chunk in exported.chunks():
+            self._gate.require_open()
             yield chunk
 
     async def ReportObjects(self, request: pb.ReportObjectsRequest, context: Any) -> pb.ReportObjectsResponse:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gausslite.codec import _unpack, columns
 from gausslite.codec.columns import Column, PositionPrecision, compress_columns, decompress, decompress_columns
-from gausslite.codec.stored_voxels import CODES, VOXELS, StoredVoxels
+from gausslite.codec.encoded_voxels import CODES, VOXELS, EncodedVoxels
 from gausslite.domain.arrays import require_finite
 from gausslite.domain.errors import CodecError, InvalidInputError
 from gausslite.domain.gaussians import Gaussians
@@ -183,7 +183,7 @@ def encode_quantised(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> 
 
 def _decode_quantised(
     body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int, stated_sums: bool
-) -> StoredVoxels:
+) -> EncodedVoxels:
     """Return the voxels of a body, with its codes; Σkappa as stated, or as computed from the Gaussians.
 
     Raises CodecError, InvalidInputError.
@@ -194,11 +194,11 @@ def _decode_quantised(
         table, codes, targets = _unpack.unpack(raw, packed, layout.widths, columns.QUAT_STEPS, update_seq, stated_sums)
     except ValueError as error:
         raise CodecError(f"subset: {error}") from error
-    voxels = StoredVoxels(np.frombuffer(table, VOXELS), np.frombuffer(codes, CODES), grid.size_m)
+    voxels = EncodedVoxels(np.frombuffer(table, VOXELS), np.frombuffer(codes, CODES), grid.size_m)
     if targets:
         batch = voxels.batch()
         gaussians = replace(batch.gaussians, target=np.frombuffer(targets, "<i2").astype(np.int16))
-        return StoredVoxels.exact(replace(batch, gaussians=gaussians), update_seq)
+        return EncodedVoxels.exact(replace(batch, gaussians=gaussians), update_seq)
     return voxels
 
 
@@ -233,7 +233,7 @@ def _encode_lossless(batch: VoxelBatch, grid: VoxelGrid, layout: BodyLayout) -> 
 
 def _decode_lossless(
     body: bytes, grid: VoxelGrid, layout: BodyLayout, update_seq: int, stated_sums: bool
-) -> StoredVoxels:
+) -> EncodedVoxels:
     """Return the voxels of a body; Σkappa as stated, or computed. Raises CodecError, InvalidInputError."""
     raw = decompress_columns(body, _lossless_columns(layout))
     keys, offsets = decode_voxels(raw[:3], layout)
@@ -244,7 +244,7 @@ def _decode_lossless(
     batch = VoxelBatch(keys, decode_kappa_sums(raw[:3], kappa, offsets), raw[2].astype(np.uint32), gaussians)
     if not _are_inside(batch, grid):
         raise CodecError("subset means_m: expected every mean inside its voxel, got one outside")
-    voxels = StoredVoxels.exact(batch, update_seq)
+    voxels = EncodedVoxels.exact(batch, update_seq)
     return voxels if stated_sums else voxels.with_computed_sums()
 
 
@@ -270,7 +270,7 @@ class BodyCoder(NamedTuple):
 
     gaussian_bytes: int
     encode: Callable[[VoxelBatch, VoxelGrid, BodyLayout], bytes]
-    decode: Callable[[bytes, VoxelGrid, BodyLayout, int, bool], StoredVoxels]
+    decode: Callable[[bytes, VoxelGrid, BodyLayout, int, bool], EncodedVoxels]
 
 
 CODERS: dict[int, BodyCoder] = {

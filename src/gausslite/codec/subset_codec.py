@@ -24,7 +24,7 @@ import numpy as np
 
 from gausslite.codec.body import CODERS, VOXEL_BYTES, BodyLayout, SubsetCoding, require_encodable
 from gausslite.codec.columns import MAX_COARSE_BITS, PositionPrecision
-from gausslite.codec.stored_voxels import CODES, VOXELS, StoredSubset
+from gausslite.codec.encoded_voxels import CODES, VOXELS, EncodedSubset
 from gausslite.domain.errors import ChecksumError, CodecError, GaussLiteError, InvalidInputError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 
@@ -87,7 +87,7 @@ def decode_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[Ro
         return RoiSubset(stored.agent_id, session_id, stored.message_seq, stored.update_seq, batch), grid
 
 
-def decode_stored(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[StoredSubset, VoxelGrid]:
+def unpack_subset(data: bytes, limits: CodecLimits = DEFAULT_LIMITS) -> tuple[EncodedSubset, VoxelGrid]:
     """Check a message and return it as a store keeps it, without decoding its Gaussians. Raises as decode_subset.
 
     Σkappa is computed from the Gaussians (Sec. III-E), whatever the message states.
@@ -105,7 +105,7 @@ def declared_bytes(data: bytes) -> int:
     return int(voxels * VOXELS.itemsize + gaussians * CODES.itemsize)
 
 
-def _decode(data: bytes, limits: CodecLimits, stated_sums: bool) -> tuple[StoredSubset, str, VoxelGrid]:
+def _decode(data: bytes, limits: CodecLimits, stated_sums: bool) -> tuple[EncodedSubset, str, VoxelGrid]:
     header = _checked_header(data, limits)
     names_start, body_start = _HEADER.size, _HEADER.size + header.agent_bytes + header.session_bytes
     precision = PositionPrecision(header.coarse_bits, header.scale_code)
@@ -116,7 +116,7 @@ def _decode(data: bytes, limits: CodecLimits, stated_sums: bool) -> tuple[Stored
         voxels = CODERS[header.coding].decode(body, grid, layout, header.update_seq, stated_sums)
         names = data[names_start:body_start]
         agent_id, session_id = names[: header.agent_bytes].decode(), names[header.agent_bytes :].decode()
-        return StoredSubset(agent_id, header.message_seq, header.update_seq, voxels), session_id, grid
+        return EncodedSubset(agent_id, header.message_seq, header.update_seq, voxels), session_id, grid
 
 
 @contextmanager

@@ -185,34 +185,6 @@ class AxisAlignedBox:
         return inside
 
 
-@dataclass(frozen=True, slots=True)
-class VoxelScore:
-    """One agent's kappa sum and number of Gaussians in one voxel."""
-
-    agent_id: str
-    kappa_sum: int
-    count: int
-
-
-@dataclass(frozen=True, slots=True)
-class VoxelVotes:
-    """The vote of one voxel: scores sorted best first."""
-
-    key: int
-    scores: tuple[VoxelScore, ...]
-
-    @property
-    def winner(self) -> str:
-        """The agent whose Gaussians the fused map contains in this voxel."""
-        return self.scores[0].agent_id
-
-    @property
-    def margin(self) -> int:
-        """The winner's lead in kappa_sum over the second; its own kappa_sum without a second agent."""
-        second = self.scores[1].kappa_sum if len(self.scores) > 1 else 0
-        return self.scores[0].kappa_sum - second
-
-
 def empty_batch() -> VoxelBatch:
     """Return a batch without voxels."""
     return VoxelBatch(np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint32), Gaussians.empty())

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import GaussLiteError, MismatchError, StorageError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectReport, TeamObject
@@ -143,13 +143,13 @@ class FusionEngine:
         """
         session = self.members.sessions.get(session_id)
         require_own(session.agent_id, subset.agent_id, grid, self.grid)
-        stored = StoredSubset.exact(subset)
+        stored = EncodedSubset.exact(subset)
         future = self.enqueue_update(session, replace(stored, voxels=stored.voxels.with_computed_sums()))
         self.commit_updates()
         # another thread may be committing it
         return future.result()
 
-    def enqueue_update(self, session: SessionRecord, message: bytes | StoredSubset) -> Future[PutOutcome]:
+    def enqueue_update(self, session: SessionRecord, message: bytes | EncodedSubset) -> Future[PutOutcome]:
         """Queue a message of a session; the future has what `contribute` returns or raises, after a commit.
 
         An encoded message is decoded when it is its agent's turn; a decoded one may be the part that is this server's.

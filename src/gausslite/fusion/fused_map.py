@@ -15,7 +15,7 @@ from numpy import ndarray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from gausslite.codec.stored_voxels import from_records, to_records
+from gausslite.codec.encoded_voxels import from_records, to_records
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import CodecError, GaussLiteError, InvalidInputError, MismatchError
 from gausslite.domain.gaussians import Gaussians

@@ -21,7 +21,6 @@ from gausslite.domain.frame import Frame, without_depth_edges
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.pose import inverse
 from gausslite.domain.relevance import NO_TARGET
-from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.fused_map import FusedMapLayers, MapLayer
 from gausslite.fusion.keyframe_pool import AgentKeyframe
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
@@ -247,8 +246,8 @@ class _LayerCopy:
 class MapRenderer:
     """Renders on one thread, from an own copy of each layer; the rasterizer is created with the first view."""
 
-    def __init__(self, engine: FusionEngine, create_rasterizer: Callable[[], Rasterizer]) -> None:
-        self._engine, self._create_rasterizer = engine, create_rasterizer
+    def __init__(self, maps: FusedMapLayers, create_rasterizer: CreateRasterizer) -> None:
+        self._maps, self._create_rasterizer = maps, create_rasterizer
         self._rasterizer: Rasterizer | None = None
         self._copies: dict[MapLayer, _LayerCopy] = {}
 
@@ -258,7 +257,7 @@ class MapRenderer:
         if pixels > _MAX_VIEW_PX:
             raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
         copy = self._copies.setdefault(layer, _LayerCopy())
-        revision = copy.update(self._engine.maps, layer)
+        revision = copy.update(self._maps, layer)
         size = camera.height_px, camera.width_px
         rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
         if len(copy.rows):

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int32, Int64, UInt64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.codec.stored_voxels import RECORD, StoredSubset, StoredVoxels, join_elements, to_records
+from gausslite.codec.encoded_voxels import RECORD, EncodedSubset, EncodedVoxels, join_elements, to_records
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch
 
@@ -80,7 +80,7 @@ def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
 _FIRST_CAPACITY = 64
 _MISSING = np.zeros((), SCORES)
 _MISSING["update_seqs"] = _MISSING["rows"] = -1
-ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[StoredVoxels]]
+ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[EncodedVoxels]]
 """Returns an agent's stored updates of some voxels in parts, each with ascending keys."""
 
 
@@ -152,7 +152,7 @@ class ScoreIndex:
         return keys
 
 
-def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadVoxels) -> Bool[ndarray, " v"]:
+def newer_voxels(index: ScoreIndex, update: EncodedSubset, read: ReadVoxels) -> Bool[ndarray, " v"]:
     """Return a mask of the message's voxels that replace the stored ones.
 
     The higher sequence number wins; between equal ones the larger (Σkappa, count, records) does, so that the outcome
@@ -173,7 +173,7 @@ def newer_voxels(index: ScoreIndex, update: StoredSubset, read: ReadVoxels) -> B
     return newer
 
 
-def _are_larger(received: StoredVoxels, stored: StoredVoxels) -> list[bool]:
+def _are_larger(received: EncodedVoxels, stored: EncodedVoxels) -> list[bool]:
     """Return which of the received voxels have larger records than the same voxels in the store."""
     if received.size_m == stored.size_m and received.content() == stored.content():
         # a duplicate, without decoding any Gaussian

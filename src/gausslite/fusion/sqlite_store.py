@@ -15,7 +15,7 @@ from typing import Any
 
 from gausslite.domain.errors import StorageError
 from gausslite.fusion.store import TABLES, Execute, FusionStore
-from gausslite.fusion.update_log import LogChange, require_intact
+from gausslite.fusion.update_log import LogChange
 
 IN_MEMORY = Path(":memory:")
 """The name of a database that ends with its connection."""
@@ -224,11 +224,11 @@ class SqliteStore(FusionStore):
             if check != "ok":
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
             rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
-            self._log.load(require_intact(rows, self._damaged))
+            self._log.load(self._require_intact(rows))
 
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         rows = self._read(_SELECT_ROWS, (json.dumps(numbers),))
-        return {row[0]: row[3] for row in require_intact(rows, self._damaged)}
+        return {row[0]: row[3] for row in self._require_intact(rows)}
 
     def _damaged(self, what: str) -> StorageError:
         return StorageError(f"store {self._path}: {what} is damaged (its checksum does not match); {RESTORE_ADVICE}")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import astuple
 from functools import partial
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import GaussLiteError, SessionUnknownError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import RoiSubset, VoxelBatch
@@ -33,8 +33,10 @@ from gausslite.fusion.update_log import (
     PutOutcome,
     SlotsOf,
     UpdateLog,
+    UpdateRow,
     batch_of,
     data_checksum,
+    is_intact,
     require_storable,
 )
 
@@ -101,9 +103,9 @@ class FusionStore(ABC):
 
     def put(self, subset: RoiSubset) -> PutOutcome:
         """Store one message in one transaction. Raises InvalidInputError, StorageError."""
-        return self.put_all([StoredSubset.exact(subset)])[0]
+        return self.put_all([EncodedSubset.exact(subset)])[0]
 
-    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
+    def put_all(self, updates: Sequence[EncodedSubset]) -> list[PutOutcome]:
         """Store messages of different agents in one transaction. Raises InvalidInputError, StorageError."""
         for update in updates:
             require_storable(update)
@@ -331,6 +333,13 @@ class FusionStore(ABC):
     @abstractmethod
     def _read_rows(self, numbers: Sequence[int]) -> dict[int, bytes]:
         """Return the voxels of those of these rows that exist. Raises StorageError, also for damaged ones."""
+
+    def _require_intact(self, rows: Iterable[UpdateRow]) -> Iterator[UpdateRow]:
+        """Yield the rows. Raises StorageError for a damaged one."""
+        for row in rows:
+            if not is_intact(row):
+                raise self._damaged(f"row {row[0]} of agent {row[1]!r}")
+            yield row
 
     @abstractmethod
     def _write_change(self, change: LogChange, execute: Execute) -> None:

@@ -20,7 +20,7 @@ from jaxtyping import Int64
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from gausslite.codec.stored_voxels import VOXELS, StoredSubset, StoredVoxels, join_elements
+from gausslite.codec.encoded_voxels import VOXELS, EncodedSubset, EncodedVoxels, join_elements
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
 from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of, tiles_of
 from gausslite.fusion.score_index import SCORES, ScoreIndex, Scores, newer_voxels
@@ -93,7 +93,7 @@ class UpdateLog:
         """Read all rows of a store; they are intact."""
         tables: dict[str, list[tuple[int, NDArray[Any]]]] = {}
         for number, agent_id, _, data in rows:
-            voxels = StoredVoxels.from_row(data)
+            voxels = EncodedVoxels.from_row(data)
             self._add_row((agent_id, tile_of(int(voxels.keys[0]))), number, _size(voxels))
             self._last = max(self._last, number & ((1 << SLOT_BITS) - 1))
             tables.setdefault(agent_id, []).append((number, voxels.voxels.copy()))
@@ -105,7 +105,7 @@ class UpdateLog:
             latest = order[np.append(keys[1:] != keys[:-1], True)[: len(keys)]]
             self._put(agent_id, _scores(table[latest], numbers[latest]))
 
-    def plan(self, updates: Sequence[StoredSubset], read: ReadRows) -> LogChange:
+    def plan(self, updates: Sequence[EncodedSubset], read: ReadRows) -> LogChange:
         """Return how to store messages of different agents, each completely. Raises StorageError."""
         change = LogChange(deleted=list(self._outdated))
         for update in updates:
@@ -150,20 +150,20 @@ class UpdateLog:
         scores = self.index.sorted_scores(agent_id, None if keys is None else np.unique(keys))
         return np.ascontiguousarray(scores["keys"]), np.ascontiguousarray(scores["rows"])
 
-    def _stored(self, agent_id: str, keys: Int64[ndarray, " k"], read: ReadRows) -> list[StoredVoxels]:
+    def _stored(self, agent_id: str, keys: Int64[ndarray, " k"], read: ReadRows) -> list[EncodedVoxels]:
         keys, rows = self.places(agent_id, keys)
         return _voxels_of(keys, rows, read(np.unique(rows).tolist()))
 
     def _add(
-        self, change: LogChange, agent_id: str, part: StoredVoxels, read: ReadRows
-    ) -> Iterator[tuple[int, StoredVoxels]]:
+        self, change: LogChange, agent_id: str, part: EncodedVoxels, read: ReadRows
+    ) -> Iterator[tuple[int, EncodedVoxels]]:
         """Add a row with these voxels of a tile, and all others of the agent's tile if that is outdated; yields it."""
         name = agent_id, tile_of(int(part.keys[0]))
         own = self._tiles.get(name)
         parts = {part.size_m: [part]}
         if own is not None and own.is_outdated:
             for number, data in read(sorted(own.sizes)).items():
-                voxels = StoredVoxels.from_row(data)
+                voxels = EncodedVoxels.from_row(data)
                 is_used = self.index.scores_of(agent_id, voxels.keys)["rows"] == number
                 is_used &= ~np.isin(voxels.keys, part.keys)
                 if is_used.any():
@@ -172,7 +172,7 @@ class UpdateLog:
         slot = int(self._slots_of(part.keys[:1])[0]) << SLOT_BITS
         for same_size in parts.values():
             self._last += 1
-            number, voxels = slot + self._last, _in_order(StoredVoxels.concatenate(same_size))
+            number, voxels = slot + self._last, _in_order(EncodedVoxels.concatenate(same_size))
             data = voxels.to_row()
             change.rows.append((number, agent_id, data_checksum(agent_id, number, data), data))
             change.added.append((name, number, _size(voxels)))
@@ -191,7 +191,7 @@ class UpdateLog:
             self._tiles[agent_id, tile].used += int(size)
 
 
-def require_storable(update: StoredSubset) -> None:
+def require_storable(update: EncodedSubset) -> None:
     """Raise InvalidInputError if a number of the message does not fit the store's signed 64-bit columns."""
     largest_sum = int(update.voxels.voxels["kappa_sums"].max(initial=0))
     limit = int(np.iinfo(np.int64).max)
@@ -199,14 +199,6 @@ def require_storable(update: StoredSubset) -> None:
     for name, value in numbers:
         if value > limit:
             raise InvalidInputError(f"subset {name}: expected at most {limit}, got {value}")
-
-
-def require_intact(rows: Iterable[UpdateRow], damaged: Callable[[str], StorageError]) -> Iterator[UpdateRow]:
-    """Yield the rows. Raises the StorageError that `damaged` makes of the name of a damaged one."""
-    for row in rows:
-        if not is_intact(row):
-            raise damaged(f"row {row[0]} of agent {row[1]!r}")
-        yield row
 
 
 def is_intact(row: UpdateRow) -> bool:
@@ -229,24 +221,26 @@ def batch_of(keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mappi
     return merge_batches(*batches) if len(batches) > 1 else batches[0] if batches else empty_batch()
 
 
-def _voxels_of(keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mapping[int, bytes]) -> list[StoredVoxels]:
+def _voxels_of(
+    keys: Int64[ndarray, " k"], rows: Int64[ndarray, " k"], data: Mapping[int, bytes]
+) -> list[EncodedVoxels]:
     """Return the voxels with these keys, each from its row: a part for each size_m, with ascending keys."""
-    parts: dict[float, list[StoredVoxels]] = {}
+    parts: dict[float, list[EncodedVoxels]] = {}
     order = np.argsort(rows, kind="stable")
     starts = np.flatnonzero(np.diff(rows[order], prepend=-1))
     for start, stop in itertools.pairwise([*starts.tolist(), len(rows)]):
-        voxels = StoredVoxels.from_row(data[int(rows[order[start]])])
+        voxels = EncodedVoxels.from_row(data[int(rows[order[start]])])
         places = np.searchsorted(voxels.keys, keys[order[start:stop]])
         parts.setdefault(voxels.size_m, []).append(voxels if len(places) == len(voxels) else voxels.take(places))
-    return [_in_order(StoredVoxels.concatenate(own)) for own in parts.values()]
+    return [_in_order(EncodedVoxels.concatenate(own)) for own in parts.values()]
 
 
-def _in_order(voxels: StoredVoxels) -> StoredVoxels:
+def _in_order(voxels: EncodedVoxels) -> EncodedVoxels:
     keys = voxels.keys
     return voxels if (keys[1:] > keys[:-1]).all() else voxels.take(np.argsort(keys))
 
 
-def _size(voxels: StoredVoxels) -> int:
+def _size(voxels: EncodedVoxels) -> int:
     return len(voxels.gaussians) + _VOXEL_UNITS * len(voxels)
 
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from gausslite.codec.stored_voxels import StoredSubset
-from gausslite.codec.subset_codec import declared_bytes, decode_stored
+from gausslite.codec.encoded_voxels import EncodedSubset
+from gausslite.codec.subset_codec import declared_bytes, unpack_subset
 from gausslite.domain import errors
 from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError
@@ -95,7 +95,7 @@ class UpdateChecks:
             self._store.save_record(agent_id, RECORD, _SECONDS.pack(now_s))
             self._first_joined_s[agent_id] = now_s
 
-    def require_permitted(self, subset: StoredSubset) -> None:
+    def require_permitted(self, subset: EncodedSubset) -> None:
         """Raise InvalidInputError for a number that a store cannot keep, or a sequence number far above those before.
 
         Raises QuotaError for a kappa that no robot can have reached, as the bound grows with the time since its first
@@ -115,7 +115,7 @@ class UpdateChecks:
 
         self._require_within_quotas(subset)
 
-    def _require_within_quotas(self, subset: StoredSubset) -> None:
+    def _require_within_quotas(self, subset: EncodedSubset) -> None:
         """Raise QuotaError if the agent would have too many voxels (with tombstones) or Gaussians."""
         stored = self._store.scores_of(subset.agent_id, subset.voxels.keys)
         totals = self._store.totals(subset.agent_id)
@@ -167,7 +167,7 @@ class PendingUpdate:
 
     session_id: str
     agent_id: str
-    message: bytes | StoredSubset
+    message: bytes | EncodedSubset
     future: Future[Any] = field(default_factory=Future)
     next_voxel: int = 0
     outcomes: list[PutOutcome] = field(default_factory=list)
@@ -178,9 +178,9 @@ class PendingUpdate:
         self.future.set_running_or_notify_cancel()
 
     @property
-    def subset(self) -> StoredSubset:
+    def subset(self) -> EncodedSubset:
         """The decoded message."""
-        assert isinstance(self.message, StoredSubset)
+        assert isinstance(self.message, EncodedSubset)
         return self.message
 
     @property
@@ -199,17 +199,17 @@ class PendingUpdate:
 
     def decode(self, grid: VoxelGrid) -> None:
         """Decode the message, as a store keeps it; the future of one that cannot be decoded has the error."""
-        if isinstance(self.message, StoredSubset):
+        if isinstance(self.message, EncodedSubset):
             return
         try:
-            subset, own_grid = decode_stored(self.message)
+            subset, own_grid = unpack_subset(self.message)
             require_own(self.agent_id, subset.agent_id, own_grid, grid)
             self.message = subset
         except Exception as error:
             # the thread decodes the messages of several agents
             self.fail(error)
 
-    def next_slice(self) -> StoredSubset:
+    def next_slice(self) -> EncodedSubset:
         """Return the part of the message to store next."""
         subset, start = self.subset, self.next_voxel
         if len(subset.voxels) <= SLICE_VOXELS:
@@ -277,11 +277,6 @@ class UpdateQueue:
             self._pending.setdefault(agent_id, deque()).append(update)
             if not own:
                 self._wait(agent_id)
-
-    @property
-    def has_waiting(self) -> bool:
-        """Whether `take` would return a message."""
-        return bool(self._waiting)
 
     def take(self, max_bytes: int = _GROUP_BYTES) -> list[PendingUpdate]:
         """Return the first message of the agents whose turn it is, at least one if any wait; they stay in the queue.

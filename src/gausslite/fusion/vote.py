@@ -6,16 +6,15 @@ and voxels can be fused in shards whose union is the whole map.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int32, Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gausslite.domain.gaussians import Gaussians
-from gausslite.domain.voxels import VoxelBatch, VoxelGrid, VoxelScore, VoxelVotes, gather_rows, group_by_voxel
+from gausslite.domain.voxels import VoxelBatch, VoxelGrid, gather_rows, group_by_voxel
 from gausslite.fusion.score_index import SCORES, VoxelScoreTable
 
 
@@ -42,17 +41,6 @@ class VoteResult:
         """The voxels, ascending."""
         return np.ascontiguousarray(self.winners.scores["keys"])
 
-    def votes(self) -> Iterator[VoxelVotes]:
-        """Yield the result on each voxel as an object, in key order."""
-        table = self.ranked
-        columns = table.agent_index, table.scores["kappa_sums"], table.scores["counts"]
-        scores = [
-            VoxelScore(table.agents[agent], kappa_sum, count)
-            for agent, kappa_sum, count in zip(*(column.tolist() for column in columns), strict=True)
-        ]
-        for key, (start, end) in zip(self.keys.tolist(), itertools.pairwise(self.offsets.tolist()), strict=True):
-            yield VoxelVotes(key, tuple(scores[start:end]))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedMap:
@@ -65,11 +53,6 @@ class FusedMap:
     def gaussians(self) -> Gaussians:
         """The fused map, sorted by voxel."""
         return self.batch.gaussians
-
-    @property
-    def provenance(self) -> Int32[ndarray, " n"]:
-        """For each Gaussian the index into vote.ranked.agents of its agent."""
-        return np.repeat(self.vote.winners.agent_index, self.batch.counts)
 
     def won_by(self, agent_id: str) -> Bool[ndarray, " v"]:
         """True for the voxels this agent wins."""

@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from gausslite.codec.stored_voxels import from_records, to_records
+from gausslite.codec.encoded_voxels import from_records, to_records
 from gausslite.domain.errors import MismatchError, StorageError
 from gausslite.domain.voxel_changes import TileDigests
 from gausslite.domain.voxels import VoxelBatch, VoxelGrid, tiles_of

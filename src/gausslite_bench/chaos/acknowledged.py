@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gausslite.codec.stored_voxels import from_records
+from gausslite.codec.encoded_voxels import from_records
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.voxels import VoxelBatch
 from gausslite.fusion.score_index import voxel_records

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gausslite.codec.encoded_voxels import EncodedVoxels, from_records
 from gausslite.codec.json import decode_object_report
 from gausslite.codec.ply import gaussians_from_ply, world_frame_from_ply
-from gausslite.codec.stored_voxels import StoredVoxels, from_records
 from gausslite.codec.subset_codec import decode_subset
 from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.wire.convert import decode_frame
@@ -29,7 +29,7 @@ DECODERS: Mapping[str, Callable[[bytes], object]] = {
     "keyframe": decode_frame,
     "object-report": decode_object_report,
     "records": from_records,
-    "stored-row": lambda data: StoredVoxels.from_row(data).batch(),
+    "stored-row": lambda data: EncodedVoxels.from_row(data).batch(),
     "ply": lambda data: (world_frame_from_ply(data), gaussians_from_ply(data)),
 }
 _SHARES = {"subset": 0.6, "keyframe": 0.1, "object-report": 0.1, "records": 0.05, "stored-row": 0.05, "ply": 0.1}

@@ -8,7 +8,7 @@ from few_examples import few_examples
 from hypothesis import given
 from hypothesis import strategies as st
 from sample_gaussians import plain_gaussians
-from test_fusion_properties import assert_same_batch
+from test_fusion_properties import assert_same_batch, votes_of
 
 from gausslite.domain.errors import RevisionGoneError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, empty_batch, merge_batches, select_voxels
@@ -62,7 +62,7 @@ def test_a_watcher_that_applies_the_changes_has_the_fused_map(steps) -> None:
             known = changes.revision
             fused = fuse(store.batches())
             assert_same_batch(watched, fused.batch)
-            assert winners == {vote.key: vote.winner for vote in fused.vote.votes()}
+            assert winners == {key: best[0] for key, (best, *_) in votes_of(fused.vote).items()}
             assert_status_is_counted_from_the_map(engine, fused)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sample_gaussians import plain_gaussians
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import (
     GaussLiteError,
     InvalidInputError,
@@ -172,7 +172,7 @@ class FailingStore(SqliteStore):
         return super().batch(agent_id, keys)
 
 
-def test_stored_voxels_that_could_not_be_voted_on_are_in_the_map_after_the_next_commit() -> None:
+def test_encoded_voxels_that_could_not_be_voted_on_are_in_the_map_after_the_next_commit() -> None:
     store = FailingStore()
     engine = FusionEngine(store, FusionSettings(grid=GRID))
     sessions = {name: engine.join(name, ANYTHING).session for name in ("ant", "bee")}
@@ -180,7 +180,7 @@ def test_stored_voxels_that_could_not_be_voted_on_are_in_the_map_after_the_next_
     engine.declare_frame("ant", transform_of(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])))
     engine.contribute(sessions["ant"].session_id, make_subset("ant", 1, [(0, 5)]), GRID)
     store.is_failing = True
-    message = {name: StoredSubset.exact(make_subset(name, 2, [(5, 5)])) for name in sessions}
+    message = {name: EncodedSubset.exact(make_subset(name, 2, [(5, 5)])) for name in sessions}
     futures = {name: engine.enqueue_update(sessions[name], message[name]) for name in sessions}
     engine.commit_updates()
     assert isinstance(futures["ant"].exception(), StorageError)

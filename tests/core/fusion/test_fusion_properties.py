@@ -25,7 +25,7 @@ from gausslite.domain.voxels import (
 )
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
-from gausslite.fusion.vote import FusedMap, fuse, fuse_maps, rank_voxels, union_maps
+from gausslite.fusion.vote import FusedMap, VoteResult, fuse, fuse_maps, rank_voxels, union_maps
 
 GRID = VoxelGrid(0.10)
 AGENTS = ("ant", "bee", "cat", "dog")
@@ -98,10 +98,20 @@ def assert_same_batch(a: VoxelBatch, b: VoxelBatch) -> None:
         assert getattr(a.gaussians, field.name).tobytes() == getattr(b.gaussians, field.name).tobytes(), field.name
 
 
+def votes_of(vote: VoteResult) -> dict[int, list[tuple[str, int, int]]]:
+    """Return the agents on each voxel, with Σkappa and number of Gaussians, best first."""
+    columns = vote.ranked.agent_index, vote.ranked.scores["kappa_sums"], vote.ranked.scores["counts"]
+    ranked = [
+        (vote.ranked.agents[agent], kappa_sum, count)
+        for agent, kappa_sum, count in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+    return {key: ranked[a:b] for key, a, b in zip(vote.keys.tolist(), vote.offsets, vote.offsets[1:], strict=True)}
+
+
 def assert_same_map(a: FusedMap, b: FusedMap) -> None:
     """Assert bit-identical Gaussians and equal votes."""
     assert_same_batch(a.batch, b.batch)
-    assert list(a.vote.votes()) == list(b.vote.votes())
+    assert votes_of(a.vote) == votes_of(b.vote)
 
 
 @few_examples
@@ -151,8 +161,7 @@ def test_the_union_of_shards_is_the_whole_map(specs: dict[str, Spec], shards: in
         merged = merge_batches(merged, part.batch)
     whole = fuse(table)
     assert_same_batch(merged, whole.batch)
-    votes = sorted((vote for part in parts for vote in part.vote.votes()), key=lambda vote: vote.key)
-    assert votes == list(whole.vote.votes())
+    assert {key: ranked for part in parts for key, ranked in votes_of(part.vote).items()} == votes_of(whole.vote)
 
 
 @few_examples
@@ -168,7 +177,7 @@ def test_the_winner_has_the_highest_kappa_sum_then_more_gaussians_then_the_lower
             rank = (-kappa_sum, -count, agent_id)
             if count > 0 and (key not in expected or rank < expected[key]):
                 expected[key] = rank
-    assert {vote.key: vote.winner for vote in fused.vote.votes()} == {k: rank[2] for k, rank in expected.items()}
+    assert {key: best[0] for key, (best, *_) in votes_of(fused.vote).items()} == {k: r[2] for k, r in expected.items()}
     for key, (_, _, agent_id) in expected.items():
         keys = np.array([key], np.int64)
         assert_same_batch(select_keys(fused.batch, keys), select_keys(table[agent_id], keys))
@@ -176,14 +185,15 @@ def test_the_winner_has_the_highest_kappa_sum_then_more_gaussians_then_the_lower
 
 @few_examples
 @given(TABLES)
-def test_provenance_and_margin_agree_with_the_votes(specs: dict[str, Spec]) -> None:
+def test_the_scores_of_a_voxel_descend_and_its_winner_has_gaussians(specs: dict[str, Spec]) -> None:
     table = table_from(specs)
     fused = fuse(table)
-    votes = list(fused.vote.votes())
-    assert len(fused.provenance) == len(fused.gaussians) == int(fused.batch.counts.sum())
-    owners = [vote.winner for vote, count in zip(votes, fused.batch.counts.tolist(), strict=True) for _ in range(count)]
-    assert [fused.vote.ranked.agents[index] for index in fused.provenance] == owners
-    assert all(vote.margin >= 0 and vote.scores[0].count > 0 for vote in votes)
+    votes = votes_of(fused.vote)
+    assert len(fused.gaussians) == int(fused.batch.counts.sum())
+    assert [ranked[0][2] for ranked in votes.values()] == fused.batch.counts.tolist()
+    for ranked in votes.values():
+        assert [score[1] for score in ranked] == sorted((score[1] for score in ranked), reverse=True)
+        assert all(count > 0 for _, _, count in ranked)
     assert sum(int(fused.won_by(agent_id).sum()) for agent_id in table) == len(votes)
 
 
@@ -202,7 +212,7 @@ def test_the_union_map_contains_all_gaussians(specs: dict[str, Spec]) -> None:
 def test_the_vote_on_scores_equals_the_vote_on_batches(history: dict[str, list[Spec]]) -> None:
     subsets = subsets_from(history)
     store = stored(subsets)
-    assert list(rank_voxels(store.scores()).votes()) == list(fuse(store.batches()).vote.votes())
+    assert votes_of(rank_voxels(store.scores())) == votes_of(fuse(store.batches()).vote)
 
 
 @few_examples
@@ -230,7 +240,7 @@ def test_ties_go_to_more_gaussians_and_then_to_the_lower_id(
 ) -> None:
     a, b = (gaussians_in([(0, kappa) for kappa in kappas], 1) for kappas in (kappas_a, kappas_b))
     for maps in ({"ant": a, "bee": b}, {"bee": b, "ant": a}):
-        assert [vote.winner for vote in fuse_maps(maps, GRID).vote.votes()] == [winner]
+        assert [best[0] for best, *_ in votes_of(fuse_maps(maps, GRID).vote).values()] == [winner]
 
 
 def test_no_updates_fuse_to_an_empty_map() -> None:

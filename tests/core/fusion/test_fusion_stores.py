@@ -19,7 +19,7 @@ import pytest
 from opened_stores import OpenStore, opener
 from support.sample_batches import make_batch, random_subset
 
-from gausslite.codec.stored_voxels import StoredSubset, to_records
+from gausslite.codec.encoded_voxels import EncodedSubset, to_records
 from gausslite.codec.subset_codec import decode_subset, encode_subset
 from gausslite.domain.errors import InvalidInputError, StorageError
 from gausslite.domain.voxels import RoiSubset, VoxelGrid, gather_rows, select_keys
@@ -93,12 +93,13 @@ def test_of_equal_update_seqs_the_larger_content_wins_in_every_order(
 
 
 def test_messages_of_several_agents_are_stored_together(store: FusionStore) -> None:
-    messages = [random_subset(name, 1, {11: 2, 22: index}) for index, name in enumerate(("ant", "bee"))]
-    assert [each.accepted.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
-    assert [each.stale.tolist() for each in store.put_all(list(map(StoredSubset.exact, messages)))] == [[11, 22]] * 2
+    subsets = [random_subset(name, 1, {11: 2, 22: index}) for index, name in enumerate(("ant", "bee"))]
+    messages = list(map(EncodedSubset.exact, subsets))
+    assert [each.accepted.tolist() for each in store.put_all(messages)] == [[11, 22]] * 2
+    assert [each.stale.tolist() for each in store.put_all(messages)] == [[11, 22]] * 2
     assert store.scores().scores["counts"].tolist() == [2, 0, 2, 1]
     with pytest.raises(InvalidInputError):
-        store.put_all([StoredSubset.exact(random_subset(*own, {33: 1})) for own in (("ant", 2), ("bee", 2**63))])
+        store.put_all([EncodedSubset.exact(random_subset(*own, {33: 1})) for own in (("ant", 2), ("bee", 2**63))])
     assert 33 not in store.scores().scores["keys"]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fusion_running import GRID, make_subset
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.errors import (
     InvalidInputError,
@@ -79,8 +79,8 @@ def test_a_declared_kappa_sum_wins_no_voxel(declared: int, encoded: bool) -> Non
     assert won == {"good": (1000, 7000), "liar": (0, 0)}
 
 
-def received(cells: dict[int, list[int]]) -> StoredSubset:
-    return StoredSubset.exact(make_subset("ant", 1, cells))
+def received(cells: dict[int, list[int]]) -> EncodedSubset:
+    return EncodedSubset.exact(make_subset("ant", 1, cells))
 
 
 def test_the_kappa_of_a_gaussian_is_bounded_by_the_time_since_the_first_join() -> None:

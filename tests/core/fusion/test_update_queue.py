@@ -13,7 +13,7 @@ from sample_gaussians import plain_gaussians
 from support.sample_batches import random_subset
 from test_fusion_properties import assert_same_batch
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.codec.subset_codec import encode_subset
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.gaussians import Gaussians
@@ -28,11 +28,11 @@ from gausslite.fusion.vote import fuse
 ANY = MissionConfig("", "", 0.10)
 
 
-def many_tombstones(agent_id: str, voxels: int) -> StoredSubset:
-    return StoredSubset.exact(RoiSubset(agent_id, "", 1, 1, tombstones(np.arange(voxels, dtype=np.int64))))
+def many_tombstones(agent_id: str, voxels: int) -> EncodedSubset:
+    return EncodedSubset.exact(RoiSubset(agent_id, "", 1, 1, tombstones(np.arange(voxels, dtype=np.int64))))
 
 
-def pending(agent_id: str, message: bytes | StoredSubset) -> PendingUpdate:
+def pending(agent_id: str, message: bytes | EncodedSubset) -> PendingUpdate:
     return PendingUpdate("", agent_id, message)
 
 
@@ -61,7 +61,7 @@ def test_a_large_message_does_not_delay_the_messages_of_other_agents() -> None:
     order = served(queue, 1)
     for _ in range(20):
         for agent_id in ("ant", "bee"):
-            queue.add(pending(agent_id, StoredSubset.exact(random_subset(agent_id, 1, {11: 1}))))
+            queue.add(pending(agent_id, EncodedSubset.exact(random_subset(agent_id, 1, {11: 1}))))
         order += served(queue, 1) + served(queue, 1) + served(queue, 1)
     assert order.count("ant") == order.count("bee") == 20
     # the small messages together cost less than one slice, so the hog gets the rest
@@ -76,7 +76,7 @@ def test_a_small_message_comes_before_the_equal_large_ones_of_many_agents() -> N
     for turn in range(1, 6):
         for _ in range(turn):
             served(queue, 1)
-        queue.add(pending("ant", StoredSubset.exact(random_subset("ant", turn, {11: 1}))))
+        queue.add(pending("ant", EncodedSubset.exact(random_subset("ant", turn, {11: 1}))))
         assert served(queue, 1) == ["ant"]
 
 
@@ -88,8 +88,7 @@ def test_every_message_is_served_once_and_in_its_agents_order(messages: list[tup
     for update in updates:
         queue.add(update)
     done: list[PendingUpdate] = []
-    while queue.has_waiting:
-        taken = queue.take(group)
+    while taken := queue.take(group):
         assert len({update.subset.agent_id for update in taken}) == len(taken)
         for update in taken:
             part = update.next_slice().voxels
@@ -141,8 +140,8 @@ def test_a_message_costs_what_its_header_declares() -> None:
     for _ in range(20):
         queue.add(pending("ant", encoded("ant", 1, {0: 40})))
     order = []
-    while queue.has_waiting:
-        [update] = queue.take(1)
+    while taken := queue.take(1):
+        [update] = taken
         order.append(update.agent_id)
         update.future.set_result(None)
         queue.put_back(update)
@@ -170,7 +169,7 @@ class CountingStore(SqliteStore):
         self.groups: list[int] = []
         self._refused = refused
 
-    def put_all(self, subsets: list[StoredSubset]) -> list[PutOutcome]:
+    def put_all(self, subsets: list[EncodedSubset]) -> list[PutOutcome]:
         self.groups.append(len(subsets))
         if any(subset.agent_id == self._refused for subset in subsets):
             raise StorageError("full")

@@ -81,7 +81,7 @@ def test_a_voxel_that_lost_its_gaussians_gets_one_tombstone() -> None:
     assert len(tracker.collect_changes(left)) == 0
 
 
-def test_stored_voxels_get_tombstones_unless_they_are_in_the_batch_or_frozen() -> None:
+def test_encoded_voxels_get_tombstones_unless_they_are_in_the_batch_or_frozen() -> None:
     tracker, gaussians = SentVoxelTracker(GRID), active_gaussians()
     whole = tracker.collect_changes(gaussians)
     tracker.freeze_sent()

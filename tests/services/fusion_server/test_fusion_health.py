@@ -17,7 +17,7 @@ import pytest
 from fusion_running import COMMAND, GRID, fusion_server, make_subset, request
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from gausslite.codec.stored_voxels import StoredSubset
+from gausslite.codec.encoded_voxels import EncodedSubset
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.fusion import traffic
 from gausslite.fusion.sqlite_store import SqliteStore
@@ -128,7 +128,7 @@ class StandingStore(SqliteStore):
         self.running = threading.Event()
         self.running.set()
 
-    def put_all(self, updates: Sequence[StoredSubset]) -> list[PutOutcome]:
+    def put_all(self, updates: Sequence[EncodedSubset]) -> list[PutOutcome]:
         assert self.running.wait(WAIT_S)
         return super().put_all(updates)
 

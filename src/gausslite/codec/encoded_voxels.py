@@ -58,7 +58,7 @@ _HEAD = struct.Struct("<dI")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StoredVoxels:
+class EncodedVoxels:
     """The complete content of each listed voxel, as a row has it.
 
     voxels: a VOXELS element each. gaussians: sorted by voxel, CODES of messages with voxels of size_m metres, or
@@ -73,13 +73,13 @@ class StoredVoxels:
         return len(self.voxels)
 
     @classmethod
-    def exact(cls, batch: VoxelBatch, update_seq: int) -> StoredVoxels:
+    def exact(cls, batch: VoxelBatch, update_seq: int) -> EncodedVoxels:
         """Return updates of one message that keep every bit of their Gaussians."""
         voxels = voxel_table(batch.keys, update_seq, batch.kappa_sums, batch.counts)
         return cls(voxels, to_records(batch.gaussians), 0.0)
 
     @classmethod
-    def concatenate(cls, parts: Sequence[StoredVoxels]) -> StoredVoxels:
+    def concatenate(cls, parts: Sequence[EncodedVoxels]) -> EncodedVoxels:
         """Return the voxels of all parts, in order; they have one size_m, and there is at least one."""
         if len(parts) == 1:
             return parts[0]
@@ -96,26 +96,26 @@ class StoredVoxels:
         """The number of Gaussians of each voxel."""
         return np.ascontiguousarray(self.voxels["counts"])
 
-    def take(self, places: Int64[ndarray, " k"]) -> StoredVoxels:
+    def take(self, places: Int64[ndarray, " k"]) -> EncodedVoxels:
         """Return the voxels at these indices, in their order."""
         counts = self.voxels["counts"].astype(np.int64)
         rows = gather_rows((np.cumsum(counts) - counts)[places], counts[places])
         # `take` copies elements as they are, an index copies them field by field
-        return StoredVoxels(self.voxels.take(places), self.gaussians.take(rows), self.size_m)
+        return EncodedVoxels(self.voxels.take(places), self.gaussians.take(rows), self.size_m)
 
-    def slice(self, start: int, stop: int) -> StoredVoxels:
+    def slice(self, start: int, stop: int) -> EncodedVoxels:
         """Return the voxels with the indices start to stop - 1, or fewer at the end."""
         ends = np.cumsum(self.voxels["counts"][:stop], dtype=np.int64)
         first, last = int(ends[start - 1]) if start else 0, int(ends[-1]) if len(ends) else 0
-        return StoredVoxels(self.voxels[start:stop], self.gaussians[first:last], self.size_m)
+        return EncodedVoxels(self.voxels[start:stop], self.gaussians[first:last], self.size_m)
 
-    def with_computed_sums(self) -> StoredVoxels:
+    def with_computed_sums(self) -> EncodedVoxels:
         """Return the voxels with the Σkappa of their own Gaussians (Sec. III-E)."""
         totals = np.concatenate([np.zeros(1, np.uint64), np.cumsum(self.gaussians["kappa"], dtype=np.uint64)])
         ends = np.cumsum(self.voxels["counts"], dtype=np.int64)
         voxels = self.voxels.copy()
         voxels["kappa_sums"] = np.diff(totals[ends], prepend=np.uint64(0))
-        return StoredVoxels(voxels, self.gaussians, self.size_m)
+        return EncodedVoxels(voxels, self.gaussians, self.size_m)
 
     def content(self) -> list[bytes]:
         """Return the Gaussians of each voxel as they are stored."""
@@ -132,7 +132,7 @@ class StoredVoxels:
             gaussians = from_records(self.gaussians.tobytes())
         return VoxelBatch(keys, np.ascontiguousarray(self.voxels["kappa_sums"]), counts, gaussians)
 
-    def by_tile(self) -> list[StoredVoxels]:
+    def by_tile(self) -> list[EncodedVoxels]:
         """Return the voxels of each tile; the tiles and the keys in them ascend, as the keys of these voxels do."""
         tiles = tiles_of(self.keys)
         if len(tiles) == 0 or (tiles == tiles[0]).all():
@@ -142,7 +142,7 @@ class StoredVoxels:
         ends = [*(np.flatnonzero(np.diff(tiles)) + 1).tolist(), len(tiles)]
         last = np.cumsum(ordered.voxels["counts"], dtype=np.int64)[np.array(ends) - 1].tolist()
         return [
-            StoredVoxels(ordered.voxels[start:end], ordered.gaussians[first:stop], self.size_m)
+            EncodedVoxels(ordered.voxels[start:end], ordered.gaussians[first:stop], self.size_m)
             for start, end, first, stop in zip([0, *ends], ends, [0, *last], last, strict=False)
         ]
 
@@ -151,7 +151,7 @@ class StoredVoxels:
         return _HEAD.pack(self.size_m, len(self)) + self.voxels.tobytes() + self.gaussians.tobytes()
 
     @classmethod
-    def from_row(cls, row: bytes) -> StoredVoxels:
+    def from_row(cls, row: bytes) -> EncodedVoxels:
         """Return the voxels of a row. Raises StorageError for bytes that are none."""
         size_m, voxels = _HEAD.unpack_from(row) if len(row) >= _HEAD.size else (0.0, -1)
         dtype = CODES if size_m else RECORD
@@ -184,18 +184,18 @@ def voxel_table(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StoredSubset:
+class EncodedSubset:
     """One message of an agent, see RoiSubset, as a store keeps it."""
 
     agent_id: str
     message_seq: int
     update_seq: int
-    voxels: StoredVoxels
+    voxels: EncodedVoxels
 
     @classmethod
-    def exact(cls, subset: RoiSubset) -> StoredSubset:
+    def exact(cls, subset: RoiSubset) -> EncodedSubset:
         """Return a message that keeps every bit of its Gaussians."""
-        voxels = StoredVoxels.exact(subset.batch, subset.update_seq)
+        voxels = EncodedVoxels.exact(subset.batch, subset.update_seq)
         return cls(subset.agent_id, subset.message_seq, subset.update_seq, voxels)
 
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from support.sample_batches import make_batch
 
 from gausslite.codec.body import SubsetCoding
-from gausslite.codec.stored_voxels import CODES, RECORD, VOXELS, StoredVoxels, to_records
-from gausslite.codec.subset_codec import decode_stored, decode_subset, encode_subset
+from gausslite.codec.encoded_voxels import CODES, RECORD, VOXELS, EncodedVoxels, to_records
+from gausslite.codec.subset_codec import decode_subset, encode_subset, unpack_subset
 from gausslite.domain.errors import CodecError, StorageError
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid, tiles_of
 
@@ -23,7 +23,7 @@ CASES = st.tuples(
 )  # fmt: skip
 
 
-def require_same(voxels: StoredVoxels, expected: VoxelBatch) -> None:
+def require_same(voxels: EncodedVoxels, expected: VoxelBatch) -> None:
     batch = voxels.batch()
     assert to_records(batch.gaussians).tobytes() == to_records(expected.gaussians).tobytes()
     for name in ("keys", "kappa_sums", "counts"):
@@ -44,13 +44,13 @@ def test_every_bit_of_a_message_comes_back_from_its_rows(case: tuple[float, floa
     size_m, centre_m, seed, n = case
     grid = VoxelGrid(size_m)
     message = encode_subset(RoiSubset("ant", "s", 7, 9, make_batch(seed, n, grid, centre_m=centre_m)), grid, coding)
-    expected, stored = with_computed_sums(decode_subset(message)[0].batch), decode_stored(message)[0]
+    expected, stored = with_computed_sums(decode_subset(message)[0].batch), unpack_subset(message)[0]
     assert (stored.agent_id, stored.message_seq, stored.update_seq) == ("ant", 7, 9)
     require_same(stored.voxels, expected)
-    parts = [StoredVoxels.from_row(part.to_row()) for part in stored.voxels.by_tile()]
+    parts = [EncodedVoxels.from_row(part.to_row()) for part in stored.voxels.by_tile()]
     assert all(len(set(tiles_of(part.keys).tolist())) == 1 for part in parts)
     if parts:
-        together = StoredVoxels.concatenate(parts)
+        together = EncodedVoxels.concatenate(parts)
         assert set(together.voxels["update_seqs"].tolist()) == {9}
         require_same(together.take(np.argsort(together.keys)), expected)
 
@@ -58,10 +58,10 @@ def test_every_bit_of_a_message_comes_back_from_its_rows(case: tuple[float, floa
 @given(CASES, st.integers(1, 9))
 def test_slices_are_the_voxels_in_order(case: tuple[float, float, int, int], step: int) -> None:
     size_m, centre_m, seed, n = case
-    whole = StoredVoxels.exact(make_batch(seed, n, VoxelGrid(size_m), centre_m=centre_m), 3)
+    whole = EncodedVoxels.exact(make_batch(seed, n, VoxelGrid(size_m), centre_m=centre_m), 3)
     slices = [whole.slice(start, start + step) for start in range(0, len(whole), step)]
     if slices:
-        require_same(StoredVoxels.concatenate(slices), whole.batch())
+        require_same(EncodedVoxels.concatenate(slices), whole.batch())
 
 
 @given(CASES)
@@ -69,7 +69,7 @@ def test_received_gaussians_take_21_bytes(case: tuple[float, float, int, int]) -
     size_m, centre_m, seed, n = case
     grid = VoxelGrid(size_m)
     batch = with_few_targets(make_batch(seed, n, grid, centre_m=centre_m))
-    voxels = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))[0].voxels
+    voxels = unpack_subset(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))[0].voxels
     assert len(voxels.to_row()) == HEAD_BYTES + VOXELS.itemsize * len(batch) + 21 * n
 
 
@@ -77,9 +77,9 @@ def test_received_gaussians_take_21_bytes(case: tuple[float, float, int, int]) -
 def test_sums_are_computed_whatever_a_message_states(coding: SubsetCoding) -> None:
     grid = VoxelGrid(0.1)
     batch = make_batch(3, 60, grid)
-    voxels = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid, coding))[0].voxels
+    voxels = unpack_subset(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid, coding))[0].voxels
     assert voxels.voxels["kappa_sums"].tolist() == with_computed_sums(batch).kappa_sums.tolist()
-    assert StoredVoxels.exact(batch, 1).with_computed_sums().voxels.tolist() == voxels.voxels.tolist()
+    assert EncodedVoxels.exact(batch, 1).with_computed_sums().voxels.tolist() == voxels.voxels.tolist()
     assert voxels.voxels["kappa_sums"].tolist() != batch.kappa_sums.tolist()
 
 
@@ -92,17 +92,17 @@ def test_voxels_that_do_not_ascend_are_refused() -> None:
     object.__setattr__(batch, "keys", keys)
     moved = replace(batch.gaussians, means_m=np.repeat(grid.centres_m(keys), batch.counts, axis=0))
     object.__setattr__(batch, "gaussians", moved)
-    decode_stored(message)
+    unpack_subset(message)
     with pytest.raises(CodecError, match="ascending"):
-        decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))
+        unpack_subset(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))
 
 
 def test_a_damaged_row_is_named() -> None:
     grid = VoxelGrid(0.1)
     batch = with_few_targets(make_batch(5, 20, grid))
-    row = decode_stored(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))[0].voxels.to_row()
-    whole = StoredVoxels.exact(batch, 1).to_row()
+    row = unpack_subset(encode_subset(RoiSubset("ant", "s", 1, 1, batch), grid))[0].voxels.to_row()
+    whole = EncodedVoxels.exact(batch, 1).to_row()
     assert (len(row) - len(whole)) == len(batch.gaussians) * (CODES.itemsize - RECORD.itemsize)
     for damaged in (row[:-1], row + b"0", row[:5], b"", row[:8] + b"\xff\xff\xff\xff" + row[12:], bytes(8) + row[8:]):
         with pytest.raises(StorageError, match="damaged"):
-            StoredVoxels.from_row(damaged)
+            EncodedVoxels.from_row(damaged)

@@ -10,8 +10,8 @@ import pytest
 from opened_stores import OpenStore, opener
 from support.sample_batches import make_batch, random_subset
 
-from gausslite.codec.stored_voxels import StoredSubset, StoredVoxels
-from gausslite.codec.subset_codec import decode_stored, decode_subset, encode_subset
+from gausslite.codec.encoded_voxels import EncodedSubset, EncodedVoxels
+from gausslite.codec.subset_codec import decode_subset, encode_subset, unpack_subset
 from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion import update_log
 from gausslite.fusion.score_index import voxel_records
@@ -28,18 +28,18 @@ def open_store(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     return opener(request.param, request)
 
 
-def random_update(rng: np.random.Generator, agent_id: str) -> tuple[StoredSubset, RoiSubset]:
+def random_update(rng: np.random.Generator, agent_id: str) -> tuple[EncodedSubset, RoiSubset]:
     """A message of a few voxels in several tiles, as codes or exact, and its Gaussians as floats."""
     if rng.random() < 0.3:
         counts = {int(key): int(rng.integers(0, 4)) for key in rng.integers(0, 60, 6)}
         subset = random_subset(
             agent_id, int(rng.integers(1, 30)), counts, int(rng.integers(1, 4)), int(rng.integers(9))
         )
-        return StoredSubset.exact(subset), subset
+        return EncodedSubset.exact(subset), subset
     grid = VoxelGrid(float(rng.choice([0.5, 0.25])))
     seq = int(rng.integers(1, 30))
     message = encode_subset(RoiSubset(agent_id, "", seq, seq, make_batch(int(rng.integers(40)), 12, grid)), grid)
-    stored = decode_stored(message)[0]
+    stored = unpack_subset(message)[0]
     subset = decode_subset(message)[0]
     sums = replace(subset.batch, kappa_sums=stored.voxels.batch().kappa_sums)
     return stored, replace(subset, batch=sums)
@@ -102,10 +102,10 @@ def test_a_duplicate_is_found_without_decoding_its_gaussians(
 ) -> None:
     grid = VoxelGrid(0.5)
     message = encode_subset(RoiSubset("ant", "", 3, 3, make_batch(5, 40, grid)), grid)
-    store, stored = open_store(), decode_stored(message)[0]
+    store, stored = open_store(), unpack_subset(message)[0]
     keys = stored.voxels.keys.tolist()
     assert store.put_all([stored])[0].accepted.tolist() == keys
-    monkeypatch.setattr(StoredVoxels, "batch", Mock(side_effect=AssertionError("decoded")))
+    monkeypatch.setattr(EncodedVoxels, "batch", Mock(side_effect=AssertionError("decoded")))
     assert store.put_all([stored])[0].stale.tolist() == keys
     store.close()
 
