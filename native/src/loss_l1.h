@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The L1 terms of Eq. (1) on sixteen pixels: colour, and expected depth D / A where there is a surface and a
+// The L1 terms of Eq. (2) on sixteen pixels: colour, and expected depth D / A where there is a surface and a
 // measurement.
 #pragma once
 

@@ -141,7 +141,7 @@ class CudaView:
 def training_loss(
     channels: Float32[Tensor, "h w 4"], alpha: Float32[Tensor, "h w"], target: LossTarget, loss: LossWeights
 ) -> Float32[Tensor, ""]:
-    """Return the loss of Eq. (1), as defined in LossWeights, on a rendered window that contains all weighted pixels."""
+    """Return the loss of Eq. (2), as defined in LossWeights, on a rendered window that contains all weighted pixels."""
     if target.weight_sum == 0.0:
         return channels.sum() * 0.0
     rgb, depth_m = channels[..., :3], channels[..., 3]

@@ -162,7 +162,7 @@ class OptimizationSettings:
     """Training of the map with one frame (Sec. III-D): warm-up iterations on full images, then active ones on the ROI.
 
     active_views: views that an active iteration trains in turn, if the tiles of their regions are together no more than
-    one image; 1 is the paper's. loss: weights of Eq. (1). By default they are normalised by the image size. Adam's
+    one image; 1 is the paper's. loss: weights of Eq. (2). By default they are normalised by the image size. Adam's
     steps with the small masks of the active phase are then comparable to those with full images. adam: learning rates.
     decay_after_updates: updates of a Gaussian after which its learning rates decay, if `MapperSettings.pose_prior`
     allows an error; inf disables the decay. With constant rates, Gaussians would oscillate between views that

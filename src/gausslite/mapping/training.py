@@ -1,4 +1,4 @@
-"""Train the map on a frame: warm-up over full images, then the ROI alone (Sec. III-D.1, ROI; III-D.2, MVO; Eq. 1).
+"""Train the map on a frame: warm-up over full images, then the ROI alone (Sec. III-D.1, ROI; III-D.2, MVO; Eq. 2).
 
 Saturation: the loss of an active iteration is compared with that of the previous one on the same view, so that easy and
 hard views do not mix. The improvement per visit starts above 0.1 in a new region and falls where views contradict each

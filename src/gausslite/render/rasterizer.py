@@ -121,7 +121,7 @@ class SplatGradients:
 
 @dataclass(frozen=True, slots=True)
 class LossWeights:
-    """Weights of the training loss, Eq. (1).
+    """Weights of the training loss, Eq. (2).
 
     w is the view's weight of a pixel (1 if the step is not masked) and W the sum of w over the image. The loss is 0 if
     W is 0, else the sum of

@@ -1,4 +1,4 @@
-"""The oracle of all backends, in torch: checks, projection, compositing, the loss of Eq. (1), Adam."""
+"""The oracle of all backends, in torch: checks, projection, compositing, the loss of Eq. (2), Adam."""
 
 from __future__ import annotations
 
