@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 
+from gausslite.cli.map_command import mission_settings
 from gausslite.codec.ply import read_ply
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
@@ -21,7 +22,6 @@ from gausslite.domain.checks import require_name
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
 from gausslite.mission.build import chosen_detector
-from gausslite.mission.plan import mission_settings
 from gausslite.mission.recording import RecordingOptions
 from gausslite.mission.results import REPORT_PAGE, prepare_folder, require_writable, write_json
 from gausslite.mission.runner import CorruptFrames

@@ -10,13 +10,13 @@ import pytest
 
 import gausslite as gl
 from gausslite.cli.main import main
-from gausslite.cli.map_command import configure
+from gausslite.cli.map_command import configure, plan_of
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.program import parse_options
 from gausslite.datasets.calibration import StatedValues
 from gausslite.datasets.open import open_source
 from gausslite.domain.recording import CameraCorrection
-from gausslite.mission.plan import OpenRun, RunPlan
+from gausslite.mission.plan import OpenRun
 from gausslite.process import print_message
 from gausslite_calibration.calibrate import calibrate
 
@@ -29,7 +29,7 @@ def open_run(spec: str) -> OpenRun:
     parser = CommandParser(prog="gausslite map")
     configure(parser)
     options = parse_options(parser, [spec, "--out", "unused"], {}, warn=print_message)
-    return RunPlan.from_options(options).open()
+    return plan_of(options).open()
 
 
 def opening(note: str) -> tuple[str, str]:

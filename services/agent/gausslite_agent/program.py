@@ -140,8 +140,8 @@ async def _serve(settings: AgentSettings) -> int:
         parser = _open_parser(settings, stack)
         uplink = _open_uplink(settings, stack, has_restored_map=saved is not None)
         # a saved mission has its own
-        folder, extra = (settings.prior, {}) if saved is None else (None, saved.run.extra)
-        prior = open_prior_map(folder, extra, settings.mission)
+        folder = settings.prior if saved is None else None
+        prior = open_prior_map(folder, {} if saved is None else saved.run.extra, settings.mission)
         estimators = _estimators(settings, stream, prior)
         worker = MappingWorker(
             settings.mission,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import MISSING, asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,22 @@ from gausslite.cli.progress import MappingBar, print_above_bar
 from gausslite.codec.json import noun_as_json, object_as_json
 from gausslite.codec.state_file import write_png
 from gausslite.config.command_parser import CommandParser
-from gausslite.config.option import option
+from gausslite.config.option import build, option
 from gausslite.config.program import Program
+from gausslite.config.task_parser import DefaultParser
 from gausslite.datasets.open import default_world_frame, open_reference
 from gausslite.datasets.source import Source
 from gausslite.domain.checks import require_name
-from gausslite.domain.errors import DatasetError, MissingPluginError, PoseError
+from gausslite.domain.errors import DatasetError, InvalidInputError, MissingPluginError, PoseError
 from gausslite.domain.frame import NO_DEPTH, ONE_COLOUR
 from gausslite.domain.objects import found_text
+from gausslite.domain.recording import PoseExposurePrior
+from gausslite.domain.task import TaskGraph
 from gausslite.mapping.keyframes import Keyframe
 from gausslite.mission.evaluation import Evaluator, TrainingFit
-from gausslite.mission.plan import MappedRun, OpenRun, RunPlan, policy_of
+from gausslite.mission.plan import MappedRun, OpenRun, RunPlan
 from gausslite.mission.prior_map import compare_with_prior
-from gausslite.mission.recording import RecordingOptions, has_regions
+from gausslite.mission.recording import RecordingOptions, stated_values
 from gausslite.mission.results import (
     MAP,
     PREVIEW,
@@ -40,8 +43,15 @@ from gausslite.mission.results import (
     write_results,
 )
 from gausslite.mission.runner import MissionResult
-from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, Timeline
-from gausslite.mission.settings import MissionSettings, PerceptionSettings, PoseMode, SourceSettings, TaskSettings
+from gausslite.mission.schedule import MapRecorder, ScheduledTaskMapper, TaskSchedule, Timeline
+from gausslite.mission.settings import (
+    MissionSettings,
+    PerceptionSettings,
+    PoseMode,
+    SourceSettings,
+    TaskSettings,
+    default_policy,
+)
 from gausslite.mission.task_mapper import REPEATED, TRACKING_LOST, FrameOutcome
 from gausslite.pages import load_pages
 from gausslite.plugins import Group, load
@@ -139,12 +149,66 @@ def configure(parser: CommandParser) -> None:
     parser.set_defaults(run=run)
 
 
+def plan_of(options: argparse.Namespace) -> RunPlan:
+    """Return what the options map. Raises InvalidInputError for a contradiction, TaskError."""
+    mission = mission_settings(options)
+    tracks = mission.poses is PoseMode.TRACK
+    recorded = {"depth_registration": None, "camera_correction": None, "require_poses": not tracks}
+    chooses_nothing = options.policy is None and options.task is None and not has_regions(options)
+    stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
+    return RunPlan(
+        mission,
+        build(PerceptionSettings, options).at_rate(mission),
+        build(SourceSettings, options, **recorded),
+        TaskSchedule.parse(parse_task(options), options.task_at, DefaultParser()),
+        build(TaskSettings, options),
+        stated=replace(stated, force=options.force),
+        can_point=options.view is not None,
+        prior=options.prior,
+        resume=options.resume,
+        notes=("no --task and no region: mapping everything equally (--policy uniform)",) * chooses_nothing,
+    )
+
+
+def mission_settings(options: argparse.Namespace) -> MissionSettings:
+    """Return the mapping's settings; a pose prior that is still to be estimated counts as exact."""
+    prior = options.pose_prior if isinstance(options.pose_prior, PoseExposurePrior) else PoseExposurePrior()
+    return build(MissionSettings, options, policy=options.policy or policy_of(options), pose_prior=prior)
+
+
+def policy_of(options: argparse.Namespace) -> str:
+    """Return the policy that is used without --policy: "task" with a task or a region, else "uniform"."""
+    return default_policy(options.task is not None or has_regions(options))
+
+
+def parse_task(options: argparse.Namespace) -> TaskGraph | None:
+    """Return the task; None for regions and a uniform map. Raises InvalidInputError for a contradiction, TaskError."""
+    regions = has_regions(options)
+    if options.task is not None and regions:
+        raise InvalidInputError("--task: give either a task, or regions with --roi, --objects or target-at, not both")
+    if options.detector is not None and options.task is None:
+        raise InvalidInputError("--detector: it finds the nouns of a task; give the task with --task TEXT")
+    if options.task is not None:
+        return DefaultParser().parse(options.task)
+    if options.policy is not None and not regions and MissionSettings(policy=options.policy).follows_task:
+        raise InvalidInputError(
+            f"--policy {options.policy}: expected a task, with --task TEXT, or regions, with --roi FILE.npz or "
+            "--set target-at=X,Y,Z[,R]"
+        )
+    return None
+
+
+def has_regions(options: argparse.Namespace) -> bool:
+    """Return True if the options select regions of space."""
+    return bool(options.roi is not None or options.objects or options.target_at)
+
+
 def run(options: argparse.Namespace) -> int:
     """Map the sequence and write the results. Errors in the options are raised before the work starts."""
     require_name("world-frame", options.world_frame or "")
     if options.view is not None:
         load_pages("--view").require_usable("--view")
-    plan = RunPlan.from_options(options)
+    plan = plan_of(options)
     plan.check(options.out)
     if options.resume is None and not options.overwrite:
         require_absent(options.out / MAP)

@@ -1,19 +1,17 @@
-"""The front half of every run: `RunPlan`, from options or arguments; `open` it to an `OpenRun`; `map` that to a result.
+"""The front half of every run: `RunPlan`, of options or arguments; `open` it to an `OpenRun`; `map` that to a result.
 
 Each step returns a new value and changes none. Checks come first, estimates of half a minute and models after them.
 """
 
 from __future__ import annotations
 
-from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from gausslite.codec.json import graph_as_json
-from gausslite.config.option import build, option
-from gausslite.config.task_parser import DefaultParser
+from gausslite.config.option import option
 from gausslite.datasets.calibration import Calibration, StatedValues
 from gausslite.datasets.source import Source, frame_step
 from gausslite.domain.errors import InvalidInputError, StorageError
@@ -28,11 +26,9 @@ from gausslite.mission.checkpoint import ResumeConfig, SavedRun, save_run
 from gausslite.mission.prior_map import PriorMap, open_prior_map
 from gausslite.mission.recording import (
     calibrate_with_messages,
-    has_regions,
     open_for_mapping,
     report_region_file,
     selected_regions,
-    stated_values,
 )
 from gausslite.mission.results import peak_rss_mib, prepare_folder
 from gausslite.mission.runner import CorruptFrames, FrameStream, MissionResult, MissionRunner
@@ -44,7 +40,6 @@ from gausslite.mission.settings import (
     SceneInfo,
     SourceSettings,
     TaskSettings,
-    default_policy,
 )
 from gausslite.mission.task_mapper import FrameOutcome, TaskMapper
 from gausslite.process import print_message
@@ -82,31 +77,6 @@ class RunPlan:
     prior: Path | None = None
     resume: Path | None = None
     notes: tuple[str, ...] = ()
-
-    @classmethod
-    def from_options(cls, options: Namespace) -> RunPlan:
-        """Return the plan of `gausslite map`. Raises InvalidInputError for a contradiction, TaskError."""
-        mission = mission_settings(options)
-        chooses_nothing = options.policy is None and options.task is None and not has_regions(options)
-        stated = stated_values(options.register_depth, options.camera_correction, options.pose_prior)
-        return cls(
-            mission,
-            build(PerceptionSettings, options).at_rate(mission),
-            build(
-                SourceSettings,
-                options,
-                depth_registration=None,
-                camera_correction=None,
-                require_poses=mission.poses is not PoseMode.TRACK,
-            ),
-            TaskSchedule.parse(parse_task(options), options.task_at, DefaultParser()),
-            build(TaskSettings, options),
-            stated=replace(stated, force=options.force),
-            can_point=options.view is not None,
-            prior=options.prior,
-            resume=options.resume,
-            notes=("no --task and no region: mapping everything equally (--policy uniform)",) * chooses_nothing,
-        )
 
     def check(self, out: Path | None) -> None:
         """Raise for what would fail later, before anything is opened. out: the folder of the results.
@@ -370,31 +340,3 @@ class MappedRun:
         targets = {noun_of(target) for graph in graphs for target in graph.targets}
         is_in_map = any(landmark.noun in targets for landmark in self.mapper.objects)
         return not graphs or self.result.processed == 0 or self.result.totals.region_seen or is_in_map
-
-
-def mission_settings(options: Namespace) -> MissionSettings:
-    """Return the mapping's settings; a pose prior that is still to be estimated counts as exact."""
-    prior = options.pose_prior if isinstance(options.pose_prior, PoseExposurePrior) else PoseExposurePrior()
-    return build(MissionSettings, options, policy=options.policy or policy_of(options), pose_prior=prior)
-
-
-def policy_of(options: Namespace) -> str:
-    """Return the policy that is used without --policy: "task" with a task or a region, else "uniform"."""
-    return default_policy(options.task is not None or has_regions(options))
-
-
-def parse_task(options: Namespace) -> TaskGraph | None:
-    """Return the task; None for regions and a uniform map. Raises InvalidInputError for a contradiction, TaskError."""
-    regions = has_regions(options)
-    if options.task is not None and regions:
-        raise InvalidInputError("--task: give either a task, or regions with --roi, --objects or target-at, not both")
-    if options.detector is not None and options.task is None:
-        raise InvalidInputError("--detector: it finds the nouns of a task; give the task with --task TEXT")
-    if options.task is not None:
-        return DefaultParser().parse(options.task)
-    if options.policy is not None and not regions and MissionSettings(policy=options.policy).follows_task:
-        raise InvalidInputError(
-            f"--policy {options.policy}: expected a task, with --task TEXT, or regions, with --roi FILE.npz or "
-            "--set target-at=X,Y,Z[,R]"
-        )
-    return None

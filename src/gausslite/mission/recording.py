@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import textwrap
 from collections.abc import Sequence
 from contextlib import suppress
@@ -148,11 +147,6 @@ def _report_estimate(evidence: Evidence) -> None:
         value = f" {evidence.value}" if len(evidence.value) <= _VALUE_WIDTH else ""
         line = f"{evidence.option}{value}: {'; '.join(evidence.reasons)}"
         print_message(textwrap.shorten(line, _MESSAGE_WIDTH, placeholder=" …"))
-
-
-def has_regions(options: argparse.Namespace) -> bool:
-    """Return True if the options select regions of space."""
-    return bool(options.roi is not None or options.objects or options.target_at)
 
 
 def selected_regions(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from gausslite.cli.map_command import mission_settings, parse_task
 from gausslite.cli.progress import MappingBar
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.option import build
@@ -15,7 +16,6 @@ from gausslite.mapping.policies import TASK
 from gausslite.mapping.voxel_exchange import SentVoxelTracker
 from gausslite.mission.build import EstimatorFactory, build_mapper, region_estimator
 from gausslite.mission.frame_scheduler import FrameScheduler
-from gausslite.mission.plan import mission_settings, parse_task
 from gausslite.mission.recording import (
     RecordingOptions,
     calibrate_with_messages,
