@@ -11,7 +11,7 @@ from threading import Event
 from gausslite.domain.errors import QuotaError
 from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.limits import MAX_REFINE_ITERATIONS
-from gausslite.fusion.refinement import CreateRasterizer, RefineProgress, RefineSettings, refine
+from gausslite.fusion.refinement import CreateRasterizer, Refinement, RefineProgress, RefineSettings
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.views import ChangeNotifier
 
@@ -29,7 +29,7 @@ class RefinementWorker:
         """Refine the engine's map, yield the latest progress, and store the result. Closing the iterator cancels.
 
         A slow reader misses some progress, but never the last one. Raises QuotaError if another refinement runs, and
-        the errors of `refine`.
+        those of Refinement.
         """
         settings = self._settings_for(request)
         if self._busy:
@@ -42,15 +42,14 @@ class RefinementWorker:
             latest[:] = [progress]
             progress_notifier.notify()
 
-        def report_progress(progress: RefineProgress) -> bool:
-            loop.call_soon_threadsafe(publish, progress)
-            return not cancelled.is_set()
-
         def work() -> None:
             gaussians, keyframes, revision = engine.refinement_input()
-            refined = refine(gaussians, keyframes, self.create_rasterizer(), settings, report_progress)
-            if not cancelled.is_set():
-                engine.store_refined(refined, revision)
+            refinement = Refinement(gaussians, keyframes, self.create_rasterizer(), settings)
+            for progress in refinement.steps():
+                loop.call_soon_threadsafe(publish, progress)
+                if cancelled.is_set():
+                    return
+            engine.store_refined(refinement.result(), revision)
 
         future = loop.run_in_executor(self._worker, work)
         future.add_done_callback(lambda _: self._finish(progress_notifier))

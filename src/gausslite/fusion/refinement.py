@@ -6,7 +6,7 @@ inside the footprint of the fused map, and not where the measured surface occlud
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
@@ -92,48 +92,48 @@ CreateRasterizer = Callable[[], Rasterizer]
 """Creates the rasterizer of a refinement when it starts: a server without refinements needs no kernels."""
 
 
-ProgressCallback = Callable[[RefineProgress], bool]
-"""Called every report_every iterations and at the end; the refinement stops if it returns False."""
+class Refinement:
+    """A joint optimisation of every Gaussian of a map.
 
-
-def refine(
-    gaussians: Gaussians,
-    keyframes: Sequence[AgentKeyframe],
-    rasterizer: Rasterizer,
-    settings: RefineSettings,
-    report_progress: ProgressCallback,
-) -> Gaussians:
-    """Return the map after joint optimisation of every Gaussian; the partial result if stopped.
-
-    The Gaussians of the tasks' regions are active in the result: those that show a target.
     Raises InvalidInputError if no keyframe shows the map, QuotaError if the map exceeds max_gaussians.
     """
-    table = _fill_table(gaussians, settings)
-    views = _ViewPool(_footprints(table, keyframes, rasterizer), rasterizer, settings)
-    extent_m = _extent_m(gaussians)
-    rng = np.random.default_rng(settings.seed)
-    with ExitStack() as binding:
-        binding.enter_context(rasterizer.bind_tables(*_tables(table)))
-        for iteration in range(1, settings.iterations + 1):
-            view, T_camera_world = views.draw(rng)
-            report = rasterizer.step(
-                *_tables(table),
-                view=view,
-                T_camera_world=T_camera_world,
-                loss=settings.loss,
-                adam=settings.adam,
-                masked=True,
-                update_counter=UpdateCounter(table.kappa),
-            )
-            if iteration % settings.density.densify_every == 0 or iteration % settings.density.prune_every == 0:
-                binding.close()
-                _control_density(table, iteration, settings, extent_m)
-                binding.enter_context(rasterizer.bind_tables(*_tables(table)))
-            due = iteration % settings.report_every == 0 or iteration == settings.iterations
-            if due and not report_progress(RefineProgress(iteration, settings.iterations, report.loss, table.count)):
-                break
-    refined = table.to_gaussians()
-    return replace(refined, active=refined.target != NO_TARGET)
+
+    def __init__(
+        self, gaussians: Gaussians, keyframes: Sequence[AgentKeyframe], rasterizer: Rasterizer, settings: RefineSettings
+    ) -> None:
+        self._rasterizer, self._settings = rasterizer, settings
+        self._table = _fill_table(gaussians, settings)
+        self._views = _ViewPool(_footprints(self._table, keyframes, rasterizer), rasterizer, settings)
+        self._extent_m = _extent_m(gaussians)
+
+    def steps(self) -> Iterator[RefineProgress]:
+        """Optimise, once; yields every report_every iterations and at the end. It stops where its reader does."""
+        table, rasterizer, settings = self._table, self._rasterizer, self._settings
+        rng = np.random.default_rng(settings.seed)
+        with ExitStack() as binding:
+            binding.enter_context(rasterizer.bind_tables(*_tables(table)))
+            for iteration in range(1, settings.iterations + 1):
+                view, T_camera_world = self._views.draw(rng)
+                report = rasterizer.step(
+                    *_tables(table),
+                    view=view,
+                    T_camera_world=T_camera_world,
+                    loss=settings.loss,
+                    adam=settings.adam,
+                    masked=True,
+                    update_counter=UpdateCounter(table.kappa),
+                )
+                if iteration % settings.density.densify_every == 0 or iteration % settings.density.prune_every == 0:
+                    binding.close()
+                    _control_density(table, iteration, settings, self._extent_m)
+                    binding.enter_context(rasterizer.bind_tables(*_tables(table)))
+                if iteration % settings.report_every == 0 or iteration == settings.iterations:
+                    yield RefineProgress(iteration, settings.iterations, report.loss, table.count)
+
+    def result(self) -> Gaussians:
+        """Return the map after the steps. The Gaussians of the tasks' regions are active: those that show a target."""
+        refined = self._table.to_gaussians()
+        return replace(refined, active=refined.target != NO_TARGET)
 
 
 def _tables(table: SplatTable) -> tuple[_Rows, _Rows, _Rows]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from dataclasses import fields
 from pathlib import Path
@@ -105,7 +106,8 @@ def votes_of(vote: VoteResult) -> dict[int, list[tuple[str, int, int]]]:
         (vote.ranked.agents[agent], kappa_sum, count)
         for agent, kappa_sum, count in zip(*(column.tolist() for column in columns), strict=True)
     ]
-    return {key: ranked[a:b] for key, a, b in zip(vote.keys.tolist(), vote.offsets, vote.offsets[1:], strict=True)}
+    places = itertools.pairwise(vote.offsets.tolist())
+    return {key: ranked[start:end] for key, (start, end) in zip(vote.keys.tolist(), places, strict=True)}
 
 
 def assert_same_map(a: FusedMap, b: FusedMap) -> None:

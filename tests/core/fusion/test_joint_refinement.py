@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,11 @@ from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.relevance import NO_TARGET
 from gausslite.fusion.keyframe_pool import ORDER_RECORD, AgentKeyframe, EncodedKeyframe, KeyframePool
 from gausslite.fusion.limits import Quotas
-from gausslite.fusion.refinement import RefineProgress, RefineSettings, refine
+from gausslite.fusion.refinement import Refinement, RefineProgress, RefineSettings
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.mapping.settings import ONLINE_RATES, DensitySettings
 from gausslite.render.cpu import CpuRasterizer
-from gausslite.render.rasterizer import AdamSettings
+from gausslite.render.rasterizer import AdamSettings, Rasterizer
 from gausslite.wire.convert import decode_frame
 
 CAMERA = Camera(30.0, 30.0, 12.0, 9.0, 24, 18)
@@ -42,19 +43,18 @@ def view(index: int, grey: int, depth_m: float = 1.0) -> AgentKeyframe:
     return AgentKeyframe("ant", Frame(index, index, rgb, depth, CAMERA, np.eye(4)))
 
 
-def always(_: RefineProgress) -> bool:
-    return True
+def refine(
+    gaussians: Gaussians, views: Sequence[AgentKeyframe], rasterizer: Rasterizer, settings: RefineSettings
+) -> tuple[Gaussians, list[RefineProgress]]:
+    """Return the refined map and the progress."""
+    refinement = Refinement(gaussians, views, rasterizer, settings)
+    progress = list(refinement.steps())
+    return refinement.result(), progress
 
 
 def test_refinement_moves_the_map_towards_the_keyframes() -> None:
     before = patch(0.2)
-    reports: list[RefineProgress] = []
-
-    def listen(progress: RefineProgress) -> bool:
-        reports.append(progress)
-        return True
-
-    after = refine(before, [view(1, 200), view(2, 200)], ReferenceRasterizer(), QUICK, listen)
+    after, reports = refine(before, [view(1, 200), view(2, 200)], ReferenceRasterizer(), QUICK)
     assert after.rgb.mean() > before.rgb.mean() + 0.005
     assert after.active.all()
     assert (after.kappa > 0).any()
@@ -67,14 +67,14 @@ def test_refinement_moves_the_map_towards_the_keyframes() -> None:
 def test_after_the_refinement_only_the_gaussians_of_a_target_are_of_the_region() -> None:
     targets = np.where(np.arange(16) < 5, 0, NO_TARGET).astype(np.int16)
     before = dataclasses.replace(patch(0.2), target=targets)
-    after = refine(before, [view(1, 200)], ReferenceRasterizer(), QUICK, always)
+    after, _ = refine(before, [view(1, 200)], ReferenceRasterizer(), QUICK)
     assert (after.active == (targets == 0)).all()
     assert (after.rgb != before.rgb).any(axis=1).all()
 
 
 def test_the_same_seed_gives_the_same_map() -> None:
     views = [view(1, 200), view(2, 30)]
-    maps = [refine(patch(0.2), views, ReferenceRasterizer(), QUICK, always) for _ in range(2)]
+    maps = [refine(patch(0.2), views, ReferenceRasterizer(), QUICK)[0] for _ in range(2)]
     assert maps[0].rgb.tobytes() == maps[1].rgb.tobytes()
     assert maps[0].means_m.tobytes() == maps[1].means_m.tobytes()
 
@@ -90,8 +90,7 @@ def test_gaussians_converge_between_contradicting_views() -> None:
                 views,
                 CpuRasterizer(1, "portable"),
                 RefineSettings(iterations=iterations, density=undisturbed, adam=adam),
-                always,
-            )
+            )[0]
             for iterations in (204, 200)
         )
         return float(np.abs(longer.rgb - shorter.rgb).mean())
@@ -101,40 +100,37 @@ def test_gaussians_converge_between_contradicting_views() -> None:
 
 def test_pixels_that_occlude_the_map_are_not_trained() -> None:
     with pytest.raises(InvalidInputError, match="1 but none does"):
-        refine(patch(0.2), [view(1, 250, depth_m=0.5)], ReferenceRasterizer(), QUICK, always)
+        refine(patch(0.2), [view(1, 250, depth_m=0.5)], ReferenceRasterizer(), QUICK)
 
 
-def test_refinement_stops_when_the_callback_returns_false() -> None:
-    reports = []
-
-    def stop_at_once(progress: RefineProgress) -> bool:
-        reports.append(progress.iteration)
-        return False
-
-    refine(patch(0.2), [view(1, 200)], ReferenceRasterizer(), QUICK, stop_at_once)
-    assert reports == [2]
+def test_refinement_stops_where_its_reader_does() -> None:
+    before = patch(0.2)
+    refinement = Refinement(before, [view(1, 200)], ReferenceRasterizer(), QUICK)
+    assert next(refinement.steps()).iteration == 2
+    stopped = refinement.result()
+    assert (stopped.rgb != before.rgb).any()
+    assert (stopped.rgb != refine(before, [view(1, 200)], ReferenceRasterizer(), QUICK)[0].rgb).any()
 
 
 def test_growth_stays_under_the_cap_and_uncached_views_are_trained() -> None:
     eager = DensitySettings(densify_every=1, min_mean_gradient=0.0, prune_every=2, min_opacity=0.0)
     settings = RefineSettings(iterations=6, headroom=2.0, max_gaussians=20, max_prepared_views=1, density=eager)
-    after = refine(patch(0.2), [view(1, 200), view(2, 200)], ReferenceRasterizer(), settings, always)
+    after, _ = refine(patch(0.2), [view(1, 200), view(2, 200)], ReferenceRasterizer(), settings)
     assert 16 < len(after) <= 20
 
 
 def test_a_map_of_faint_gaussians_is_not_pruned_completely() -> None:
     strict = DensitySettings(densify_every=100, prune_every=1, min_opacity=1.1)
-    after = refine(
-        patch(0.2), [view(1, 200)], ReferenceRasterizer(), RefineSettings(iterations=2, density=strict), always
-    )
+    settings = RefineSettings(iterations=2, density=strict)
+    after, _ = refine(patch(0.2), [view(1, 200)], ReferenceRasterizer(), settings)
     assert len(after) == 16
 
 
 def test_an_empty_or_too_large_map_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="got an empty one"):
-        refine(Gaussians.empty(), [view(1, 200)], ReferenceRasterizer(), QUICK, always)
+        refine(Gaussians.empty(), [view(1, 200)], ReferenceRasterizer(), QUICK)
     with pytest.raises(QuotaError, match="at most 3 Gaussians, got 16"):
-        refine(patch(0.2), [view(1, 200)], ReferenceRasterizer(), RefineSettings(max_gaussians=3), always)
+        refine(patch(0.2), [view(1, 200)], ReferenceRasterizer(), RefineSettings(max_gaussians=3))
     for wrong in ({"iterations": 0}, {"headroom": 0.5}, {"max_gaussians": 0}):
         with pytest.raises(InvalidInputError, match="refine"):
             RefineSettings(**wrong)
