@@ -1,1 +1,1 @@
-"""What those who operate a fusion server need: figures for Prometheus, and maintenance of a store's file."""
+"""What those who operate a team need: commands for its services, maintenance of a store's file, figures for Prometheus."""

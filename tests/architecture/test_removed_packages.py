@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_export": (("gausslite", "export", "a", "--to", "ply"),),
     "gausslite_recorders": (),
     "gausslite_operations": (
+        ("gausslite", "status", "127.0.0.1:1"),
         ("gausslite_fusion_server", "verify", "fusion.sqlite"),
         ("gausslite_fusion_server", "--listen", "127.0.0.1:0", "--metrics", "127.0.0.1:0"),
     ),

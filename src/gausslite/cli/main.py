@@ -20,14 +20,7 @@ from gausslite.process import Terminated, print_message, raise_interrupts
 _SUMMARIES: Final = {
     "map": "map a sequence for a task; write map.ply, report.json and preview.png",
     "fuse": "fuse map files into one by a vote in every voxel",
-    "status": "print the state of a running agent or fusion server",
-    "end": "end the mission of a running agent: send what waits, hand over, save",
-    "refine": "refine the fused map of a running team",
-    "fetch": "download the fused map of a running team",
-    "evict": "delete the data of an agent from a fusion server, and keep it out on request",
-    "unban": "let a banned agent join a fusion server again",
 }
-_TEAM = ("status", "end", "refine", "fetch", "evict", "unban")
 
 
 class _PrintVersion(argparse.Action):
@@ -45,12 +38,8 @@ class _PrintVersion(argparse.Action):
 
 def commands() -> dict[str, Command]:
     """Return the sub-commands: those of the core, then those of the packages beside it."""
-    core = {name: Command(summary, f"gausslite.cli.{_module(name)}") for name, summary in _SUMMARIES.items()}
+    core = {name: Command(summary, f"gausslite.cli.{name}_command") for name, summary in _SUMMARIES.items()}
     return core | {name: _plugin(name) for name in names(Group.COMMANDS)}
-
-
-def _module(name: str) -> str:
-    return f"team:configure_{name}" if name in _TEAM else f"{name}_command:configure"
 
 
 def _plugin(name: str) -> Command:
