@@ -1,1 +1,1 @@
-"""What those who operate a team need: commands for its services, maintenance of a store's file, figures for Prometheus."""
+"""What those who operate a team need: commands for its services, maintenance of a store, figures for Prometheus."""

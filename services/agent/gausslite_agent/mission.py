@@ -214,8 +214,9 @@ class AgentMission:
         """
         if self.state is MissionState.WAITING_FOR_TASK:
             raise MismatchError("mission: expected a task first, got none yet; call AssignTask")
-        self._requested = self._requested or request
-        self._stopping.set()
+        if self._summary is None:
+            self._requested = self._requested or request
+            self._stopping.set()
         self._replay_ended.wait()
         return self._end(request, None)
 

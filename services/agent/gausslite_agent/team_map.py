@@ -119,9 +119,9 @@ class TeamMapFollower:
         for update in updates:
             if update.batch is not None:
                 self._insert_region(update, region, T_agent_fused)
-            self._revision = update.revision
             if update.last:
-                # the revision is complete; the stream ends with its iterator
+                # each block names the final revision: after an error in between, the next call reads all blocks again
+                self._revision = update.revision
                 return
 
     def _insert_region(self, update: MapUpdate, region: TeamRegion, T_agent_fused: Float64[ndarray, "4 4"]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 
 import numpy as np
@@ -10,10 +11,11 @@ import pytest
 from agent_running import SETTINGS, ball_estimator
 from fusion_running import GRID, RunningServer, fusion_server, make_subset
 
+from gausslite.domain.errors import UnavailableError
 from gausslite.domain.gaussians import Gaussians
 from gausslite.domain.objects import ObjectLandmark, ObjectReport, ObjectRole
 from gausslite.domain.task import TaskGraph
-from gausslite.domain.voxels import AxisAlignedBox
+from gausslite.domain.voxels import AxisAlignedBox, VoxelBatch
 from gausslite.wire.clients import FusionClient
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.team_map import TeamMapFollower
@@ -73,6 +75,29 @@ def test_a_late_agent_starts_with_the_teams_map_of_its_region(server: RunningSer
         follower.follow_once()
         assert sorted(local().kappa.tolist()) == [5, 7, 8, 11]
         assert worker.status().team_gaussians == 5
+
+
+def test_blocks_after_an_error_are_read_again(server: RunningServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gausslite.wire.map_changes.BLOCK_BYTES", 1100)
+    ant = server.client.join("ant", GRID, task=OTHER).session_id
+    # two tiles, so two blocks
+    server.contribute_subsets(ant, make_subset("ant", 1, {14: [5], 17: [7]}))
+    server.client.report_objects(ant, ObjectReport(OTHER, (mug_in_cells(14, 17),)))
+    with following(server, GRAPH) as (follower, local, worker):
+        insert, calls = worker.insert_team_voxels, iter((None, UnavailableError("busy")))
+
+        def insert_or_fail(batch: VoxelBatch) -> Future[None]:
+            error = next(calls, None)
+            if error is not None:
+                raise error
+            return insert(batch)
+
+        monkeypatch.setattr(worker, "insert_team_voxels", insert_or_fail)
+        with pytest.raises(UnavailableError):
+            follower.follow_once()
+        assert local().kappa.tolist() == [5]
+        follower.follow_once()
+        assert sorted(local().kappa.tolist()) == [5, 7]
 
 
 def test_an_agent_without_a_task_reads_nothing(server: RunningServer) -> None:
