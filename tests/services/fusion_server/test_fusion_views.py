@@ -130,7 +130,7 @@ def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the
     engine = FusionEngine(SqliteStore(), FusionSettings(grid=GRID))
     ant = engine.join("ant", MissionConfig("", "", GRID.size_m)).session.session_id
     engine.contribute(ant, make_subset("ant", 1, {0: [5, 6], 20: [7], 40: [1, 1]}), GRID)
-    renderer = MapRenderer(engine, ReferenceRasterizer)
+    renderer = MapRenderer(engine.maps, ReferenceRasterizer)
     with patch.object(engine.maps, "tile", wraps=engine.maps.tile) as read:
         for change, tiles in (
             (lambda: None, 3),
@@ -145,7 +145,7 @@ def test_a_view_of_a_changed_map_reads_only_the_tiles_that_changed_and_shows_the
             read.reset_mock()
             shown = renderer.render(CAMERA, np.eye(4), MapLayer.REFINED)
             assert read.call_count == tiles
-            alone = MapRenderer(engine, ReferenceRasterizer).render(CAMERA, np.eye(4), MapLayer.VOTE)
+            alone = MapRenderer(engine.maps, ReferenceRasterizer).render(CAMERA, np.eye(4), MapLayer.VOTE)
             assert np.array_equal(shown.rgb, alone.rgb)
             assert np.array_equal(shown.depth_m, alone.depth_m)
     assert not shown.rgb.any()
