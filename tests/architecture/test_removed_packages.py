@@ -14,6 +14,8 @@ from tiny_sequences import FEW_GAUSSIANS, write_tum
 
 pytest.importorskip("gausslite.render._kernels", reason="the native kernels are not built")
 
+pytestmark = pytest.mark.slow
+
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 SEQUENCE = "../fr1_cup"
 """A folder in the layout of TUM, whose camera is known by its name."""

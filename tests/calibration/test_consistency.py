@@ -118,6 +118,7 @@ def test_another_unit_of_depth_is_named(recording: Recording, factor: float, wor
         calibrate(recording, NOTHING_ESTIMATED)
 
 
+@pytest.mark.slow
 def test_another_clock_is_named(home: Source) -> None:
     recording = Recording(home, [*range(24), *range(22, -1, -1)])
     recording.poses = np.roll(recording.poses, 6, axis=0)
@@ -199,6 +200,7 @@ def test_another_principal_point_or_ratio_of_focal_lengths_is_named(home: Source
         calibrate(recording, NOTHING_ESTIMATED)
 
 
+@pytest.mark.slow
 def test_depth_along_the_ray_is_named(recording: Recording) -> None:
     camera = recording.frames[0].camera
     x, y = camera.slopes(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
@@ -208,6 +210,7 @@ def test_depth_along_the_ray_is_named(recording: Recording) -> None:
         calibrate(recording, NOTHING_ESTIMATED)
 
 
+@pytest.mark.slow
 def test_mirrored_depth_images_are_named(recording: Recording) -> None:
     recording.frames = [replace(frame, depth_m=frame.depth_m[:, ::-1].copy()) for frame in recording.frames]
     with pytest.raises(DatasetError, match="depth images mirrored left to right would agree"):
@@ -244,6 +247,7 @@ def test_depth_images_of_another_time_are_named(home: Source, late: int, words: 
         calibrate(recording, NOTHING_ESTIMATED)
 
 
+@pytest.mark.slow
 def test_depth_images_that_are_late_by_one_frame_are_noted(home: Source) -> None:
     recording = Recording(home, list(range(24)))
     depths = [recording.frames[max(i - 1, 0)].depth_m for i in range(24)]
@@ -270,6 +274,7 @@ def standstill(poses: Poses) -> Poses:
     return still
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [jump, spikes, standstill])
 def test_poses_that_do_not_fit_in_places_are_noted(home: Source, change: Callable[[Poses], Poses]) -> None:
     recording = Recording(home, list(range(0, 42, 3)))
