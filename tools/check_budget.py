@@ -13,7 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "CONTRIBUTING.md"
-ROW = re.compile(r"^\| `?([\w ]+?)`? \| ([\d ]+) (lines|words) \|", re.MULTILINE)
+ROW = re.compile(r"^\| ([\w ]+?) \| ([\d ]+) \| (?:lines|words) \|", re.MULTILINE)
 
 
 def part_of(file: str) -> str | None:
@@ -42,7 +42,7 @@ def sizes() -> Counter[str]:
 
 def main() -> int:
     """Print the table and return the exit code."""
-    limits = {name: int(limit.replace(" ", "")) for name, limit, _ in ROW.findall(TABLE.read_text(encoding="utf-8"))}
+    limits = {name: int(limit.replace(" ", "")) for name, limit in ROW.findall(TABLE.read_text(encoding="utf-8"))}
     counts = sizes()
     for name in sorted(counts.keys() | limits.keys(), key=lambda name: -counts[name]):
         limit = limits.get(name)
