@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The extension module gausslite.codec._unpack: the body of a quantised message becomes the elements that a store keeps.
-// docs/reference/wire.md defines the columns and the bit fields, codec/stored_voxels.py the elements.
+// docs/reference/wire.md defines the columns and the bit fields, codec/encoded_voxels.py the elements.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/tuple.h>
 
