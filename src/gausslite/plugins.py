@@ -1,7 +1,7 @@
 """Find plug-ins: what packages beside the core register as entry points of the groups below.
 
-The core holds the protocol of each group and no name of a plug-in. In a group of which one is used unless somebody
-chooses another, that one has the name "default".
+The core holds the protocol of each group (docs/guides/plugin.md lists them) and no name of a plug-in. The preferred
+plug-in of a group is registered under the name "default".
 """
 
 from __future__ import annotations

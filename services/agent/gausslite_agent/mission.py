@@ -36,7 +36,7 @@ from gausslite_agent.state import (
     WorkerStatus,
 )
 
-_OF_UPLINK = (
+_REPORTED_UPLINK_COUNTERS = (
     *("handover_bytes", "keyframe_bytes", "keyframes_sent", "keyframes_waiting", "gaussians_sent"),
     *("voxels_sent", "subsets_sent", "subsets_rejected", "voxels_waiting"),
 )
@@ -45,7 +45,7 @@ _OF_UPLINK = (
 def mission_report(
     agent_id: str, status: WorkerStatus, gaussians: Gaussians, uplink: UplinkCounters, seconds: float
 ) -> dict[str, object]:
-    """Return the figures of a mission. map_shared_percent: share of the map in the task's region, if it was sent."""
+    """Return the figures of a mission. map_shared_percent: of the Gaussians in the region; 0 if no update was sent."""
     graph, active = status.graph, int(gaussians.active.sum())
     is_sent = uplink.subsets_sent > 0
     return {
@@ -55,12 +55,12 @@ def mission_report(
         "task_graph": None if graph is None else graph_as_json(graph),
         "frames": status.mapped,
         **{f"frames_{outcome}": getattr(status, outcome) for outcome in ("skipped", "dropped", "rejected")},
-        "frames_short": status.under_trained,
-        "frames_without_words": status.publishing_skipped,
+        "frames_under_trained": status.under_trained,
+        "frames_not_published": status.publishing_skipped,
         "frames_without_seeding": status.seeding_skipped,
         **values_of(status, ("iterations", "idle_iterations")),
         "max_detection_lag_frames": status.max_detection_lag,
-        "keyframes_reread": status.keyframes_reevaluated,
+        "keyframes_reevaluated": status.keyframes_reevaluated,
         "hz": status.hz,
         "frame_age_p50_s": status.age_s(50),
         "frame_age_p99_s": status.age_s(99),
@@ -69,7 +69,7 @@ def mission_report(
         "active_gaussians": active,
         "roi_share": status.roi_share,
         "bytes_sent": uplink.roi_bytes,
-        **values_of(uplink, _OF_UPLINK),
+        **values_of(uplink, _REPORTED_UPLINK_COUNTERS),
         "uplink_stopped_because": uplink.stopped_because,
         "map_shared_percent": 100.0 * active / max(len(gaussians), 1) if is_sent else 0.0,
         "peak_rss_mib": peak_rss_mib(),

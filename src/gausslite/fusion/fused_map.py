@@ -349,6 +349,7 @@ class FusedMapLayers:
         """Show a refinement from before a restart; returns the voxels of the refined layer."""
         changed = stored.changed_voxels(vote)
         self._refined = RefinedMap(stored.without_removed(vote), self._voted_log.revisions.revision)
+        # a later revision than the refinement's: these voxels show the vote
         self._voted_log.record(changed.tolist())
         return np.union1d(self._refined.batch.keys, changed)
 

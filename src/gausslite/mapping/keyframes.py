@@ -310,7 +310,7 @@ class KeyframeStore:
     def add(self, view: WindowView) -> None:
         """Store a mapped frame for the long term and, if it is the next `every`th one, among the most recent ones.
 
-        It replaces an earlier one with its id: that of a recording which is played again.
+        A frame whose id is kept already, of a recording that is played again, is replaced.
         """
         self._limit_for(view.keyframe)
         is_keyframe = self.next_is_keyframe
@@ -321,13 +321,14 @@ class KeyframeStore:
             if new in frames:
                 frames.remove(new)
         self._keyframes[new], self._views[new] = view.keyframe, view
+        # any mapped frame may stay for the long term, if it shows the ROI better than those kept
         self._set_long_term([*self._long_term, new])
         if is_keyframe:
             self._recent = [*self._recent, new][-self._limits.window :]
             self._buffer.append(new)
             while len(self._buffer) > self._limits.buffer:
                 del self._buffer[_most_redundant(self.buffer)]
-        # here and not with each selection, so that a frame is known until the next one comes
+        # drop unused frames only now: `get` finds the last frame until the next one comes
         self._keyframes = {frame: self._keyframes[frame] for frame in self._ids()}
         self._views = {frame: self._views[frame] for frame in (*self._recent, *self._long_term)}
 

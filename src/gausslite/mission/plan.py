@@ -110,6 +110,7 @@ class RunPlan:
         if saved is None and isinstance(roi, TaskGraph):
             models.require_detector()
         self._report_search(recorded.source, models)
+        # models and regions again below if the earlier map moves the sequence: they were found in the recording's frame
         found = calibrate_with_messages(self.source.spec, recorded.source, stated)
         stream = self._localised(replace(recorded, source=found.source), prior)
         plan, is_moved = self._with_values(recorded, found), prior is not None and prior.motion is not None
@@ -144,7 +145,7 @@ class RunPlan:
             return StatedValues.all_of(registration, correction, pose_prior)
         correction, pose_prior = stated.correction, stated.pose_prior
         if poses is PoseMode.TRACK:
-            # readout time and offset are estimated from given poses
+            # readout time and offset need given poses: only the lens is kept
             correction = correction or CameraCorrection(source.lens)
         if poses is not PoseMode.REFINE:
             pose_prior = pose_prior or PoseExposurePrior()

@@ -191,7 +191,7 @@ class MissionResult:
             "frames_late": totals.late,
             "iterations": totals.iterations,
             "roi_share": totals.roi_share_sum / max(totals.frames, 1),
-            "keyframes_reread": totals.keyframes_reevaluated,
+            "keyframes_reevaluated": totals.keyframes_reevaluated,
             "seeded_in_keyframes": totals.seeded_in_keyframes,
             "hz": self.hz,
             "seconds": self.seconds,

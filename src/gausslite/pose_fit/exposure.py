@@ -53,14 +53,16 @@ def fit_exposure(
     pixels = comparable_pixels(rendering, frame, max_pixels)
     if not prior.has_exposure_error or len(pixels) < MIN_PIXELS:
         return IDENTITY_EXPOSURE
-    # without the blur, detail that the map lacks would pull the gain below 1
+    # without the blur, detail of the photograph that the map lacks would pull the gain below 1
     model = _blurred(rendering.rgb)[pixels].astype(np.float64)
     residual = _blurred(frame.rgb)[pixels] / 255.0 - model
     prior_std, gain, offset = np.array([prior.gain, prior.offset]), np.ones(3), np.zeros(3)
     for channel in range(3):
+        # of the residual: photograph - (gain * rendering + offset)
         jacobian = -np.stack([model[:, channel], np.ones(len(model))], axis=1)
         weights = independent_share(rendering, max_pixels) * robust_weights(residual[:, channel])
         change = NormalEquations.of(jacobian, residual[:, channel], weights).solve(np.zeros(2), prior_std)
+        # shrinkage beside the prior: a map that still grows has errors of its own, and must not drift with them
         gain[channel] += change[0] * shrinkage(prior.gain, _FIT_GAIN_STD)
         offset[channel] += change[1] * shrinkage(prior.offset, _FIT_OFFSET_STD)
     return AffineExposure(gain, offset)

@@ -42,6 +42,6 @@ def test_a_mission_with_a_task_change_resumes_bit_identically(tmp_path: Path) ->
     state = str(tmp_path / "run.state")
     uninterrupted, report = map_home("uninterrupted")
     # all six earlier frames showed the first task's region, so they are keyframes
-    assert report["keyframes_reread"] == 6
+    assert report["keyframes_reevaluated"] == 6
     map_home("first", "--frames", "0:7", "--set", f"save-state={state}")
     assert map_home("rest", "--set", f"resume={state}")[0] == uninterrupted
