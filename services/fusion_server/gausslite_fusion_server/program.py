@@ -33,7 +33,7 @@ _COLLECTION_THRESHOLDS = (
     2_000,
     10,
     100,
-)  # a full collection of a large map takes 0.1 s; Python's come ten times as often
+)  # a full collection of a large map takes 0.1 s: make it rare
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
