@@ -13,7 +13,7 @@ from enum import StrEnum
 from importlib.metadata import EntryPoint, distributions
 from typing import Any, Final
 
-from gausslite.domain.errors import MissingPluginError
+from gausslite.domain.errors import InvalidInputError, MissingPluginError
 
 DEFAULT: Final = "default"
 _BESIDE_THE_CORE: Final = "gausslite_"
@@ -63,7 +63,8 @@ def default_name(group: Group) -> str:
 
 
 def load(group: Group, name: str = DEFAULT, purpose: str = "") -> Any:
-    """Import a plug-in. Raises MissingPluginError if it is not registered, or its package is not installed.
+    """Import a plug-in. Raises MissingPluginError if it is not registered, or its package is not installed;
+    InvalidInputError if its import fails.
 
     purpose: what the error names in place of the plug-in, such as the option that needs it.
     """
@@ -112,11 +113,13 @@ def _entry_points() -> dict[str, dict[str, EntryPoint]]:
 
 
 def _import(entry: EntryPoint, purpose: str) -> Any:
+    package = entry.module.partition(".")[0]
+    name = purpose or (entry.group if entry.name == DEFAULT else entry.name)
     try:
         return entry.load()
     except ModuleNotFoundError as error:
-        package = entry.module.partition(".")[0]
         missing = (error.name or package).partition(".")[0]
         needs = f"the package {package}" if missing == package else f"the package {missing}, for {package}"
-        name = purpose or (entry.group if entry.name == DEFAULT else entry.name)
         raise MissingPluginError(f"{name}: needs {needs}, which is not installed") from error
+    except Exception as error:  # code of others may raise anything
+        raise InvalidInputError(f"{name}: the package {package} cannot be loaded: {error!r}") from error

@@ -13,7 +13,8 @@ from typing import Final, cast
 
 from gausslite.config.command_parser import CommandParser
 from gausslite.config.program import parse_options
-from gausslite.domain.errors import GaussLiteError, MissingPluginError
+from gausslite.domain.checks import require_instance
+from gausslite.domain.errors import GaussLiteError, InvalidInputError
 from gausslite.plugins import Command, Group, absent_package, load, names
 from gausslite.process import Terminated, print_message, raise_interrupts
 
@@ -39,16 +40,17 @@ class _PrintVersion(argparse.Action):
 def commands() -> dict[str, Command]:
     """Return the sub-commands: those of the core, then those of the packages beside it."""
     core = {name: Command(summary, f"gausslite.cli.{name}_command") for name, summary in _SUMMARIES.items()}
-    return core | {name: _plugin(name) for name in names(Group.COMMANDS)}
+    return core | {name: _plugin(name) for name in names(Group.COMMANDS) if name not in core}
 
 
 def _plugin(name: str) -> Command:
-    """Return a command of another package; one whose package is not installed says so when it is chosen."""
+    """Return a command of another package; one that cannot be loaded says why when it is chosen."""
     try:
-        command: Command = load(Group.COMMANDS, name)
-    except MissingPluginError as error:
+        command = load(Group.COMMANDS, name)
+        require_instance(name, command, Command, "gausslite.plugins.Command(summary, module)")
+    except InvalidInputError as error:
         return Command(str(error).partition(": ")[2], "")
-    return command
+    return cast(Command, command)
 
 
 def build_parser(configured: Collection[str] | None = None) -> CommandParser:
@@ -67,7 +69,7 @@ def build_parser(configured: Collection[str] | None = None) -> CommandParser:
 def _configure(name: str, command: Command) -> Callable[[argparse.ArgumentParser], None]:
     """Return the function that adds the options of a command; this imports its module."""
     if not command.module:
-        load(Group.COMMANDS, name)
+        raise InvalidInputError(f"{name}: {command.summary}")
     module, _, function = command.module.partition(":")
     return cast(Callable[[argparse.ArgumentParser], None], getattr(import_module(module), function or "configure"))
 
