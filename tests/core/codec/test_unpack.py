@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.reference_unpack import reference_unpack
 from support.sample_batches import make_batch
@@ -56,6 +56,7 @@ def test_every_bit_is_that_of_the_oracle(case: tuple[float, int, int], update_se
     assert native == oracle
 
 
+@settings(max_examples=3 * settings.default.max_examples)
 @given(CASES, st.data())
 def test_a_damaged_body_is_refused_as_by_the_oracle(case: tuple[float, int, int], data: st.DataObject) -> None:
     layout, frame, fields = body_of(case)
