@@ -105,7 +105,9 @@ def _unit_vector(descriptor: PlaceDescriptor) -> Float32[ndarray, "448"]:
     features, colour, depth = np.split(values, np.cumsum(list(_SIZES.values()))[:-1])
     lab = colour.reshape(-1, 3) - colour.reshape(-1, 3).mean(axis=0)
     measured = depth > 0
-    relative = np.where(measured, depth - depth[measured].mean() if measured.any() else 0.0, 0.0)
+    relative = (
+        np.where(measured, depth - depth[measured].mean(), np.float32(0)) if measured.any() else np.zeros_like(depth)
+    )
     weighted = [
         np.float32(weight) * part / max(float(np.linalg.norm(part)), _MIN_CONTRAST * len(part) ** 0.5)
         for part, weight in zip((features, lab.ravel(), relative), _WEIGHTS.values(), strict=True)
