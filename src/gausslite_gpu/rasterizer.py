@@ -105,11 +105,6 @@ class CudaRasterizer:
         """`cuda`."""
         return "cuda"
 
-    @property
-    def device_name(self) -> str:
-        """Name of the device."""
-        return str(torch.cuda.get_device_name(self._kernels.device))
-
     def forward(
         self,
         rows: Float32[ndarray, "n 16"],

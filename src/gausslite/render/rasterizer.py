@@ -221,14 +221,6 @@ class StepReport(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HostReport:
-    """The report of a backend that has loss and visible rows in host memory."""
-
-    loss: float
-    visible: UInt32[ndarray, " m"]
-
-
 @runtime_checkable
 class Rasterizer(Protocol):
     """A rendering backend. It owns scratch memory and threads, never the splat tables. Calls are not re-entrant."""

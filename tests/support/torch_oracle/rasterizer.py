@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import conv2d
@@ -25,7 +25,6 @@ from gausslite.render.rasterizer import (
     TILE_PX,
     UPDATE_COUNT,
     AdamSettings,
-    HostReport,
     LossWeights,
     Rendering,
     SplatGradients,
@@ -55,6 +54,14 @@ class Limits:
 
 
 DEFAULT_LIMITS = Limits()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HostReport:
+    """The report of a backend that has loss and visible rows in host memory."""
+
+    loss: float
+    visible: UInt32[ndarray, " m"]
 
 
 def composite(
