@@ -33,6 +33,7 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "raster", "server")
         (("quality", "--max-gaussians", "0"), "--max-gaussians: expected at least 1, got 0"),
         (("ablation", "--pair", "kitchen"), "pairs: expected names"),
         (("ablation", "--lpips-weights", "none.onnx"), "model none.onnx: expected an ONNX file, found nothing"),
+        (("compute", "--steps", "8,many"), "steps: expected numbers such as 4, got 'many'"),
         (("raster", "--sizes", "32x"), "expected WIDTHxHEIGHT"),
         (("server", "--held", "many"), "--held"),
         (("server", "--agents", "0"), "--agents"),
