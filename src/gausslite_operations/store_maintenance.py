@@ -53,7 +53,8 @@ def back_up(store: Path, target: Path) -> StoreReport:
         raise StorageError(f"backup {target}: the file exists; choose another name")
     with contextlib.closing(sqlite_store.open_existing(store)) as source:
         _copy(source, store, target)
-    return _require_intact(target)
+    with contextlib.closing(sqlite_store.open_existing(target)) as db:
+        return _require_intact(db, target)
 
 
 def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
@@ -62,13 +63,15 @@ def restore(backup: Path, store: Path) -> tuple[StoreReport, Path | None]:
     Returns the report and the new name of the file that was there before. Raises StorageError.
     """
     with sqlite_store.locked(store):
-        report = _require_intact(backup)
         copy = store.with_name(store.name + ".restoring")
         copy.unlink(missing_ok=True)
-        with contextlib.closing(sqlite_store.open_existing(backup)) as source:
+        with contextlib.closing(sqlite_store.open_existing(backup, may_be_earlier=True)) as source:
             _copy(source, backup, copy)
-        with contextlib.closing(sqlite_store.open_existing(copy)) as db, sqlite_store.storage_errors(copy):
-            sqlite_store.renew_incarnation(db)
+        with contextlib.closing(sqlite_store.open_existing(copy, may_be_earlier=True)) as db:
+            sqlite_store.bring_forward(db, copy)
+            report = _require_intact(db, backup)
+            with sqlite_store.storage_errors(copy):
+                sqlite_store.renew_incarnation(db)
         replaced = _move_away(store)
         copy.replace(store)
         _synchronise_folder(store.parent)
@@ -113,8 +116,9 @@ def _keyframes(db: sqlite3.Connection) -> list[tuple[tuple[str, int], bool]]:
     return [(key, join_parts(list(own)) is not None) for key, own in groups]
 
 
-def _require_intact(path: Path) -> StoreReport:
-    report = verify(path)
+def _require_intact(db: sqlite3.Connection, path: Path) -> StoreReport:
+    with sqlite_store.storage_errors(path):
+        report, _ = _check(db, path)
     if report.damaged_rows:
         raise StorageError(
             f"store {path}: expected intact rows, got {report.damaged_rows} damaged ones; {sqlite_store.RESTORE_ADVICE}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import logging
 import secrets
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,8 +15,11 @@ from threading import Event, Lock, Thread
 from typing import Any
 
 from gausslite.domain.errors import StorageError
+from gausslite.fusion.migrations import Query, missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import LogChange
+
+_log = logging.getLogger(__name__)
 
 IN_MEMORY = Path(":memory:")
 """The name of a database that ends with its connection."""
@@ -62,8 +66,11 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def open_existing(path: Path) -> sqlite3.Connection:
-    """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError."""
+def open_existing(path: Path, may_be_earlier: bool = False) -> sqlite3.Connection:
+    """Connect to a store and check its header and its schema version; rows are not read. Raises StorageError.
+
+    may_be_earlier: of one of the schemas that `bring_forward` knows.
+    """
     if not path.is_file():
         raise StorageError(f"store {path}: expected a GaussLite store, got no file")
     with ExitStack() as opened, storage_errors(path):
@@ -75,14 +82,37 @@ def open_existing(path: Path) -> sqlite3.Connection:
             )
         if db.execute("PRAGMA application_id").fetchone()[0] != _APPLICATION_ID:
             raise StorageError(f"store {path}: expected a GaussLite store, got another program's database")
-        version = db.execute("PRAGMA user_version").fetchone()[0]
-        if version != SCHEMA_VERSION:
-            raise StorageError(
-                f"store {path}: expected schema version {SCHEMA_VERSION}, got {version} of another release; use that "
-                "release, or another file, and the agents send their updates again"
-            )
+        if _steps(db, path) and not may_be_earlier:
+            raise StorageError(f"store {path}: of an earlier schema; a server that opens it brings it forward")
         opened.pop_all()
         return db
+
+
+def bring_forward(db: sqlite3.Connection, path: Path) -> None:
+    """Give a store of an earlier schema the tables of this one, in one transaction. Raises StorageError."""
+    with storage_errors(path):
+        db.execute("BEGIN IMMEDIATE")
+        for step in _steps(db, path):
+            step(db.execute)
+        db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        db.execute("COMMIT")
+
+
+def _steps(db: sqlite3.Connection, path: Path) -> tuple[Callable[[Query], None], ...]:
+    return missing_steps(str(path), _version(db), SCHEMA_VERSION)
+
+
+def _version(db: sqlite3.Connection) -> int:
+    return int(db.execute("PRAGMA user_version").fetchone()[0])
+
+
+def _keep_earlier(db: sqlite3.Connection, path: Path) -> None:
+    """Copy a store of an earlier schema, so that its release can be used again. Raises StorageError."""
+    kept = path.with_name(f"{path.name}.schema-{_version(db)}")
+    kept.unlink(missing_ok=True)
+    with storage_errors(path):
+        db.execute("VACUUM INTO ?", (str(kept),))
+    _log.warning("store %s: brought forward to schema %d; the file before is %s", path, SCHEMA_VERSION, kept)
 
 
 def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
@@ -94,8 +124,11 @@ def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
     opened.enter_context(locked(path))
     if not path.exists():
         _create(path)
-    db = opened.enter_context(contextlib.closing(open_existing(path)))
+    db = opened.enter_context(contextlib.closing(open_existing(path, may_be_earlier=True)))
     with storage_errors(path):
+        if _version(db) != SCHEMA_VERSION:
+            _keep_earlier(db, path)
+            bring_forward(db, path)
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA synchronous = FULL")
         # freed pages are overwritten only where that costs no additional write
