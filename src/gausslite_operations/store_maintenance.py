@@ -45,7 +45,10 @@ def verify(path: Path, repair: bool = False) -> StoreReport:
     if not repair:
         with _readable(path) as (db, last), sqlite_store.storage_errors(path):
             sqlite_store.require_newest(db, path, last)
-            return _check(db, path)[0]
+            report, damaged = _check(db, path)
+            if not damaged:
+                sqlite_store.require_all_rows(db, path)
+            return report
     with contextlib.ExitStack() as held:
         held.enter_context(sqlite_store.locked(path))
         replaced = _salvage(path)
@@ -67,6 +70,7 @@ def _is_doubtful(db: sqlite3.Connection, path: Path, head: CommitHead) -> bool:
     """Return whether a server refuses the store for something other than its rows."""
     try:
         sqlite_store.require_newest(db, path, head.read())
+        sqlite_store.require_all_rows(db, path)
     except StorageError:
         return True
     return False

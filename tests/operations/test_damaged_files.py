@@ -33,6 +33,9 @@ def fill_store(path: Path, agent_id: str) -> SqliteStore:
     store.save_keyframe(agent_id, 1, bytes(range(256)) * 64)
     store.save_record(agent_id, "objects", b"mug")
     checkpoint(path)
+    shutil.copy(path, path.with_name("earlier-store"))
+    store.put(random_subset(agent_id, 2, dict.fromkeys(range(1000, 1100), 12)))
+    checkpoint(path)
     for first in range(200, 400, 20):
         store.put(random_subset(agent_id, first, dict.fromkeys(range(first, first + 20), 9)))
     store.save_keyframe(agent_id, 2, b"late")
@@ -96,7 +99,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).mkdir()
         for kind, (fill, _) in FILES.items():
             with contextlib.closing(fill(folder / "live" / name / kind, agent_id)):
-                for each in (folder / "live" / name).glob(f"{kind}*"):
+                for each in (folder / "live" / name).glob(f"*{kind}*"):
                     assert each.stat().st_mode & 0o177 == 0 or each.name.endswith("-lock")
                     shutil.copy(each, folder / name / each.name)
     return folder
@@ -144,6 +147,11 @@ def swap(path: Path) -> None:
     shutil.copy(path.parent.parent / "other" / path.name, path)
 
 
+def roll_back(path: Path) -> None:
+    """Put the store's file before a checkpoint in its place, as by a copy that leaves the log."""
+    shutil.copy(path.with_name("earlier-store"), path)
+
+
 def noise(path: Path) -> None:
     path.write_bytes(np.random.default_rng(0).bytes(path.stat().st_size))
 
@@ -156,6 +164,7 @@ SUFFIXES = ("", "-wal", "-shm", "-head")
 DATABASE_FILES = [kind + suffix for kind in ("store", "spool") for suffix in SUFFIXES]
 CASES = [
     *((file, damage) for file in DATABASE_FILES for damage in KINDS),
+    ("store", roll_back),
     # the state of another robot with the same settings is a whole state
     *(("state", damage) for damage in KINDS if damage is not swap),
 ]
