@@ -42,11 +42,14 @@ def verify(path: Path, repair: bool = False) -> StoreReport:
 
     repair: keep what is intact, without a server; then the agents send what is missing.
     """
+    if not repair:
+        with _readable(path) as (db, last), sqlite_store.storage_errors(path):
+            sqlite_store.require_newest(db, path, last)
+            report, damaged = _check(db, path)
+            if not damaged:
+                sqlite_store.require_all_rows(db, path)
+            return report
     with contextlib.ExitStack() as held:
-        if not repair:
-            with _readable(path) as (db, head), sqlite_store.storage_errors(path):
-                sqlite_store.require_newest(db, path, head)
-                return _check(db, path)[0]
         held.enter_context(sqlite_store.locked(path))
         replaced = _salvage(path)
         db = held.enter_context(contextlib.closing(sqlite_store.open_existing(path)))
@@ -67,6 +70,7 @@ def _is_doubtful(db: sqlite3.Connection, path: Path, head: CommitHead) -> bool:
     """Return whether a server refuses the store for something other than its rows."""
     try:
         sqlite_store.require_newest(db, path, head.read())
+        sqlite_store.require_all_rows(db, path)
     except StorageError:
         return True
     return False
@@ -103,7 +107,6 @@ def _salvage(path: Path) -> Path | None:
 def _readable_rows(db: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a table that are not on damaged pages."""
     query = f"SELECT rowid, * FROM {table} WHERE rowid >= ? ORDER BY rowid"  # noqa: S608 - constant names
-    start, steps = 0, [1 << bit for bit in range(62)]
 
     def is_readable(first: int) -> bool:
         with contextlib.suppress(sqlite3.DatabaseError):
@@ -111,19 +114,19 @@ def _readable_rows(db: sqlite3.Connection, table: str) -> Iterator[tuple[Any, ..
             return True
         return False
 
+    start = 0
     while True:
         with contextlib.suppress(sqlite3.DatabaseError):
             for rowid, *row in db.execute(query, (start,)):
                 yield tuple(row)
                 start = rowid + 1
             return
-        # a damaged page has rows that follow each other: the first row behind it, by bisection
-        step = next((step for step in steps if is_readable(start + step)), 0)
-        if not step:
+        # the rows of a damaged page follow each other: find the first behind them, by bisection
+        skipped = next((1 << bit for bit in range(62) if is_readable(start + (1 << bit))), None)
+        if skipped is None:
             return
-        start += step // 2 + bisect.bisect_left(
-            range(step // 2, step + 1), 1, key=lambda skipped, first=start: is_readable(first + skipped)
-        )
+        behind = range(start + skipped // 2, start + skipped)
+        start = behind.start + bisect.bisect_left(behind, True, key=is_readable)
 
 
 def back_up(store: Path, target: Path) -> StoreReport:

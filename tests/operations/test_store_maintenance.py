@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -92,6 +93,64 @@ def test_a_keyframe_with_parts_that_are_missing_or_not_its_own_is_not_served(pat
     assert verify(path, repair=True).damaged_rows == 1
     report = verify(path)
     assert (report.damaged_rows, report.keyframes) == (0, 0)
+
+
+def test_repair_keeps_the_rows_of_intact_pages_and_the_file_before(tmp_path: Path) -> None:
+    path = tmp_path / "store.sqlite"
+    with closing(SqliteStore(path)) as store:
+        for number in range(60):
+            store.put(random_subset("ant", 1 + number, {100 * number: 3}))
+    data = bytearray(path.read_bytes())
+    with closing(sqlite3.connect(path)) as db:
+        query = "SELECT rootpage FROM sqlite_master WHERE name = 'voxel_updates'"
+        [[root]] = db.execute(query)
+    # the third leaf of the table
+    leaf = int.from_bytes(data[4096 * (root - 1) + 12 + 2 * 2 :][:2], "big")
+    page = int.from_bytes(data[4096 * (root - 1) + leaf :][:4], "big")
+    data[4096 * (page - 1) : 4096 * page] = bytes(4096)
+    path.write_bytes(data)
+    for read in (SqliteStore, verify):
+        with pytest.raises(StorageError, match=r"--repair"):
+            read(path)
+    report = verify(path, repair=True)
+    assert (tmp_path / "store.sqlite.replaced-1").read_bytes() == bytes(data)
+    assert report.replaced.endswith("store.sqlite.replaced-1")
+    with closing(SqliteStore(path)) as store:
+        kept = store.batch("ant").keys.tolist()
+    assert 40 < len(kept) < 60
+    assert {0, 5900} < set(kept)
+
+
+@pytest.mark.parametrize("change", ["DELETE FROM properties", "UPDATE properties SET value = 'x'"])
+def test_a_store_without_its_properties_is_one_clear_line(path: Path, change: str) -> None:
+    with sqlite3.connect(path) as db:
+        db.execute(change)
+    db.close()
+    for read in (SqliteStore, verify):
+        with pytest.raises(StorageError, match="expected its properties, got damaged ones; restore a backup"):
+            read(path)
+    verify(path, repair=True)
+    with closing(SqliteStore(path)) as store:
+        assert store.batch("ant").keys.tolist() == list(VOXELS)
+
+
+def test_a_store_in_a_read_only_place_is_verified_and_backed_up_with_its_log(tmp_path: Path) -> None:
+    path, place = tmp_path / "store.sqlite", tmp_path / "read-only"
+    place.mkdir()
+    with closing(SqliteStore(path)) as store:
+        store.put(random_subset("ant", 1, {11: 2}))
+        for each in tmp_path.glob("store.sqlite*"):
+            shutil.copy(each, place / each.name)
+    (place / "store.sqlite-shm").unlink()
+    before = sorted(each.name for each in place.iterdir())
+    for each in (*place.iterdir(), place):
+        each.chmod(each.stat().st_mode & ~0o222)
+    # root may write everywhere
+    with patch("os.access", side_effect=lambda own, _: own == tmp_path):
+        assert verify(place / path.name).voxels == 1
+        assert back_up(place / path.name, tmp_path / "backup").voxels == 1
+    assert sorted(each.name for each in place.iterdir()) == before
+    place.chmod(0o700)
 
 
 @pytest.mark.parametrize("is_database", [False, True])

@@ -20,6 +20,7 @@ from gausslite.fusion.migrations import Query, missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import LogChange
 
+_ROW_SUM = "(SELECT coalesce(sum(number), 0) FROM voxel_updates)"
 _log = logging.getLogger(__name__)
 
 IN_MEMORY = Path(":memory:")
@@ -126,6 +127,13 @@ def content_of(db: sqlite3.Connection, path: Path) -> tuple[str, int]:
     return properties["incarnation_id"], int(count)
 
 
+def require_all_rows(db: sqlite3.Connection, path: Path) -> None:
+    """Raise StorageError unless the rows of updates are those of the last commit, by the sum of their numbers."""
+    query = f"SELECT value FROM properties WHERE name = 'row_sum' AND value != CAST({_ROW_SUM} AS TEXT)"  # noqa: S608
+    if db.execute(query).fetchone():
+        raise StorageError(f"store {path}: expected all rows of its last commit, got others; {RESTORE_ADVICE}")
+
+
 def require_newest(db: sqlite3.Connection, path: Path, head: tuple[str, int] | None) -> None:
     """Raise StorageError if the store lacks commits of its head, which was read first."""
     name, commits = content_of(db, path)
@@ -160,6 +168,8 @@ def _open(path: Path, opened: ExitStack) -> sqlite3.Connection:
         # freed pages are overwritten only where that costs no additional write
         db.execute("PRAGMA secure_delete = FAST")
         db.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
+        # of a store that an earlier release made
+        db.execute(f"INSERT OR IGNORE INTO properties VALUES ('row_sum', {_ROW_SUM})")  # noqa: S608
         head = content_of(db, path) if is_new else CommitHead(path).read()
         require_newest(db, path, head)
         if head is None and content_of(db, path)[1]:
@@ -188,8 +198,8 @@ def create(path: Path) -> None:
 
 def renew_incarnation(db: sqlite3.Connection) -> None:
     """Give the content a new id, so that the agents compare digests; its commits are counted from here."""
-    renew = "INSERT OR REPLACE INTO properties VALUES ('incarnation_id', ?), ('commits', '1')"
-    db.execute(renew, (secrets.token_hex(16),))
+    values = f"('incarnation_id', ?), ('commits', '1'), ('row_sum', {_ROW_SUM})"
+    db.execute(f"INSERT OR REPLACE INTO properties VALUES {values}", (secrets.token_hex(16),))  # noqa: S608
 
 
 def connect(path: Path) -> sqlite3.Connection:
@@ -223,6 +233,7 @@ def _explain(error: sqlite3.Error) -> str:
 
 
 _DELETE = "DELETE FROM voxel_updates WHERE number = ?"
+_ADD_TO_SUM = "UPDATE properties SET value = value + ? WHERE name = 'row_sum'"
 _INSERT = "INSERT INTO voxel_updates VALUES (?, ?, ?, ?)"
 SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM voxel_updates"
 """UpdateRows."""
@@ -295,6 +306,7 @@ class SqliteStore(FusionStore):
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
             rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
             self._log.load(self._require_intact(rows))
+            require_all_rows(self._reader, self._path)
         for (name,) in self._read("SELECT DISTINCT name FROM records"):
             self.records(name)
 
@@ -309,10 +321,13 @@ class SqliteStore(FusionStore):
         self._delete_rows(execute, change.deleted)
         for row in change.rows:
             execute(_INSERT, row)
+        execute(_ADD_TO_SUM, (sum(row[0] for row in change.rows),))
 
     def _delete_rows(self, execute: Execute, numbers: Iterable[int]) -> None:
+        numbers = list(numbers)
         for number in numbers:
             execute(_DELETE, (number,))
+        execute(_ADD_TO_SUM, (-sum(numbers),))
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._read_lock, storage_errors(self._path):
