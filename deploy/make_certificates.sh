@@ -3,7 +3,7 @@
 #   deploy/make_certificates.sh FOLDER NAME[:ROLE[:HOST]]...
 # A name is a host, a compose service or an agent's --agent-id. A role is robot (default), viewer, operator, server
 # for fusion servers that share a mission, or none for a service that calls no other. HOST is a further address (name or
-# IPv4) under which others call it. An existing authority in FOLDER is reused.
+# IPv4) under which others call it; a robot may also act under this name. An existing authority in FOLDER is reused.
 # A team: FOLDER = certs, names server:none:HOST husky-1 operator:operator, where HOST is the address of parser and fusion server. Then
 #   gausslite-fusion-server --listen 0.0.0.0:50052 --tls-cert certs/server/cert.pem --tls-key certs/server/key.pem --tls-ca certs/server/ca.pem
 # and in the same way parser, agents and commands, each with the files of its own name.
