@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from jaxtyping import Float32
-from numpy import ndarray
 
+from gausslite.domain.camera import Camera
+from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
 from gausslite.wire.convert import encode_colour, encode_depth, enum_numbers, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
@@ -73,12 +73,15 @@ def _correction_to_message(status: WorkerStatus) -> pb.MapToOdometry | None:
     )
 
 
-def view_to_message(
-    rgb: Float32[ndarray, "h w 3"], depth_m: Float32[ndarray, "h w"], map_revision: int
-) -> pb.RenderViewResponse:
-    """Encode a rendering as a colour and a depth image: colours in [0, 1], depth in metres."""
+def view_to_message(camera: Camera, rendering: Rendering | None, map_revision: int) -> pb.RenderViewResponse:
+    """Encode a rendering as a colour and a depth image; None, of an empty map, is black without depth."""
+    size = camera.height_px, camera.width_px
+    rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
+    if rendering is not None:
+        rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
+        depth_m = rendering.expected_depth_m()
     return pb.RenderViewResponse(
-        colour_png=encode_colour(np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8), lossless=True),
+        colour_png=encode_colour(rgb, lossless=True),
         depth_png=encode_depth(depth_m),
         map_revision=map_revision,
     )

@@ -204,9 +204,6 @@ def _extent_m(gaussians: Gaussians) -> float:
     return max(0.01, float(np.quantile(distance_m, 0.95)))
 
 
-_MAX_VIEW_PX = 1920 * 1080
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class LayerView:
     """A rendering of a map layer; depth is 0 where the map is not opaque. revision: of the rendered layer."""
@@ -252,10 +249,7 @@ class MapRenderer:
         self._copies: dict[MapLayer, _LayerCopy] = {}
 
     def render(self, camera: Camera, T_world_camera: Float64[ndarray, "4 4"], layer: MapLayer) -> LayerView:
-        """Return a view of a layer. Raises QuotaError above two megapixels, KernelError."""
-        pixels = camera.width_px * camera.height_px
-        if pixels > _MAX_VIEW_PX:
-            raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
+        """Return a view of a layer. Raises KernelError."""
         copy = self._copies.setdefault(layer, _LayerCopy())
         revision = copy.update(self._maps, layer)
         size = camera.height_px, camera.width_px

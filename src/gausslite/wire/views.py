@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_name
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.relevance import CameraView, DetectedBox, DetectedImage
 from gausslite.v1 import agent_service_pb2 as agent_pb
 from gausslite.v1 import fusion_service_pb2 as pb
@@ -20,7 +20,18 @@ from gausslite.v1 import geometry_pb2
 from gausslite.wire import convert
 
 MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
+_MAX_VIEW_PX = 1920 * 1080
+MAX_VIEWS_WAITING = 16
 _SIDES = ("left_px", "top_px", "right_px", "bottom_px")
+
+
+def view_camera_from_message(message: geometry_pb2.Camera) -> Camera:
+    """Decode the camera of a view to render. Raises QuotaError above two megapixels, InvalidInputError."""
+    camera = convert.camera_from_message(message)
+    pixels = camera.width_px * camera.height_px
+    if pixels > _MAX_VIEW_PX:
+        raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
+    return camera
 
 
 def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewResponse:

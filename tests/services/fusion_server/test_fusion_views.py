@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from threading import Event
 from unittest.mock import patch
 
 import grpc
@@ -21,10 +22,12 @@ from gausslite.fusion.engine import FusionEngine
 from gausslite.fusion.frames import FrameFit
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.limits import FusionSettings, MissionConfig
-from gausslite.fusion.refinement import MapRenderer
+from gausslite.fusion.refinement import LayerView, MapRenderer
 from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.v1 import fusion_service_pb2 as pb
+from gausslite.wire.channel import require_serving
 from gausslite.wire.convert import camera_to_message, grid_to_message, transform_to_message
+from gausslite.wire.views import MAX_VIEWS_WAITING
 from gausslite_fusion_server import servicer
 from gausslite_places.frame_aligner import MapAligner
 from gausslite_places.frame_fit import SurfaceSamples, fit_frame
@@ -65,6 +68,29 @@ def test_hostile_views_are_refused() -> None:
             server.stub.RenderView(pb.RenderFusedViewRequest(mission_id="another", **good))
         assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
         assert isinstance(CAMERA, Camera)
+
+
+def test_the_event_loop_answers_while_views_wait_and_too_many_are_refused_by_name() -> None:
+    rendering, released = Event(), Event()
+
+    def render(self: MapRenderer, camera: Camera, *_: object) -> LayerView:
+        rendering.set()
+        assert released.wait(20)
+        size = camera.height_px, camera.width_px
+        return LayerView(np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32), 1)
+
+    view = pb.RenderFusedViewRequest(camera=camera_to_message(CAMERA), t_world_camera=transform_to_message(np.eye(4)))
+    with patch.object(MapRenderer, "render", render), fusion_server() as server:
+        calls = [server.stub.RenderView.future(view) for _ in range(MAX_VIEWS_WAITING + 2)]
+        assert rendering.wait(20)
+        wait_until(lambda: any(call.done() for call in calls))
+        [refused] = [call for call in calls if call.done()]
+        assert refused.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert f"views: expected at most {MAX_VIEWS_WAITING} calls that wait" in refused.details()
+        require_serving(server.client.address, None)
+        assert not server.client.status().agents
+        released.set()
+        assert all(call.result(20).revision == 1 for call in calls if call is not refused)
 
 
 def test_watchers_follow_the_refined_layer() -> None:
