@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
-
-from gausslite.domain.camera import Camera
-from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as pb
-from gausslite.wire.convert import encode_colour, encode_depth, enum_numbers, transform_to_message, values_of
+from gausslite.wire.convert import enum_numbers, transform_to_message, values_of
 from gausslite.wire.convert_task import graph_to_message, object_to_message
 from gausslite.wire.update_sender import UplinkCounters
 from gausslite_agent.mission import AgentMission
@@ -70,18 +66,4 @@ def _correction_to_message(status: WorkerStatus) -> pb.MapToOdometry | None:
         age_seconds=time.monotonic() - status.corrected_at_s,
         translation_std_m=correction.translation_std_m,
         rotation_std_deg=correction.rotation_std_deg,
-    )
-
-
-def view_to_message(camera: Camera, rendering: Rendering | None, map_revision: int) -> pb.RenderViewResponse:
-    """Encode a rendering as a colour and a depth image; None, of an empty map, is black without depth."""
-    size = camera.height_px, camera.width_px
-    rgb, depth_m = np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32)
-    if rendering is not None:
-        rgb = np.rint(np.clip(rendering.rgb, 0.0, 1.0) * 255).astype(np.uint8)
-        depth_m = rendering.expected_depth_m()
-    return pb.RenderViewResponse(
-        colour_png=encode_colour(rgb, lossless=True),
-        depth_png=encode_depth(depth_m),
-        map_revision=map_revision,
     )

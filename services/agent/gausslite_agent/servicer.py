@@ -46,6 +46,7 @@ from gausslite.wire.views import (
     ChangeNotifier,
     camera_view_to_message,
     view_camera_from_message,
+    view_to_pngs,
 )
 from gausslite.wire.worker_pool import WorkerPool
 from gausslite_agent.mapping_worker import MappingWorker
@@ -53,7 +54,6 @@ from gausslite_agent.messages import (
     report_to_message,
     status_to_message,
     summary_to_message,
-    view_to_message,
 )
 from gausslite_agent.mission import AgentMission
 from gausslite_agent.state import FrameReport
@@ -228,7 +228,8 @@ class AgentServicer(pb_grpc.AgentServiceServicer):
 
         def work() -> pb.RenderViewResponse:
             # only rendered on the mapper's thread
-            return view_to_message(camera, *self._worker.run_when_idle(render))
+            rendering, revision = self._worker.run_when_idle(render)
+            return pb.RenderViewResponse(**view_to_pngs(camera, rendering), map_revision=revision)
 
         return await self._views.run(context, work)
 

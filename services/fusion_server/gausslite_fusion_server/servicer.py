@@ -24,7 +24,7 @@ from gausslite.wire.convert_task import graph_from_message, object_to_message, r
 from gausslite.wire.map_changes import EncodedPartCache, follow, read_deadline
 from gausslite.wire.security import Caller, RejectionLog
 from gausslite.wire.server import Service
-from gausslite.wire.views import MAX_VIEWS_WAITING, ChangeNotifier, view_camera_from_message
+from gausslite.wire.views import MAX_VIEWS_WAITING, ChangeNotifier, view_camera_from_message, view_to_pngs
 from gausslite.wire.worker_pool import WorkerPool
 from gausslite_fusion_server import messages
 from gausslite_fusion_server.contributions import Acknowledger, StoredCount
@@ -323,9 +323,12 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         camera = view_camera_from_message(request.camera)
         T_world_camera = convert.transform_from_message("t_world_camera", request.t_world_camera)
         layer = messages.layer_from_message(request.layer)
-        return await self._views.run(
-            context, lambda: messages.view_to_message(self._renderer.render(camera, T_world_camera, layer))
-        )
+
+        def work() -> pb.RenderFusedViewResponse:
+            rendering, revision = self._renderer.render(camera, T_world_camera, layer)
+            return pb.RenderFusedViewResponse(**view_to_pngs(camera, rendering), revision=revision)
+
+        return await self._views.run(context, work)
 
     async def GetSessionStatus(self, request: pb.GetSessionStatusRequest, context: Any) -> pb.GetSessionStatusResponse:
         """Return the figures of the mission and of each agent."""
