@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import functools
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -16,8 +16,7 @@ from gausslite.wire.security import caller_or_connection
 
 _Result = TypeVar("_Result")
 _RETRY_AFTER_S = 1.0
-_LONG_S = 0.05
-_MAX_KNOWN = 1000
+_LONG_S, _MAX_KNOWN = 0.05, 1000
 
 
 class WorkerPool:
@@ -33,7 +32,8 @@ class WorkerPool:
         self._name, self._limit, self._pause = name, waiting, pause
         self._executor = ThreadPoolExecutor(threads, name)
         self._free = threads
-        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
+        # in the order of arrival
+        self._waiting: dict[asyncio.Future[None], str] = {}
         self._running: Counter[str] = Counter()
         self._used_s: dict[str, float] = {}
         # the used time of the latest turn: who comes now begins with it, so that waiting does not collect turns
@@ -65,59 +65,52 @@ class WorkerPool:
         self._executor.shutdown(wait=True, cancel_futures=True)
 
     async def _begin(self, caller: str) -> None:
-        self._used_s[caller] = max(self._used_s.pop(caller, 0.0), self._now_s)
+        self._used_s[caller] = max(self._used_s.get(caller, 0.0), self._now_s)
         turn = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(caller, deque()).append(turn)
+        self._waiting[turn] = caller
         self._start_next()
-        if sum(map(len, self._waiting.values())) > self._limit:
-            self._refuse(max(reversed(self._waiting), key=lambda other: len(self._waiting[other])))
+        if len(self._waiting) > self._limit:
+            self._refuse()
         try:
             await turn
         except asyncio.CancelledError:
             # its call has ended, while it waited or just after its turn had begun
-            if turn.cancelled():
-                self._remove(caller, turn)
-            elif turn.exception() is None:
+            self._waiting.pop(turn, None)
+            if not turn.cancelled() and turn.exception() is None:
                 self._end(caller, time.monotonic())
             raise
 
-    def _refuse(self, caller: str) -> None:
-        turn = self._waiting[caller][-1]
-        self._remove(caller, turn)
-        turn.set_exception(
-            RateLimitError(
-                f"{self._name}: expected at most {self._limit} calls that wait, got more, most of them from "
-                f"{caller[:200]}; call again later",
-                retry_after_s=_RETRY_AFTER_S,
-            )
+    def _refuse(self) -> None:
+        waiting = Counter(self._waiting.values())
+        turn = max(reversed(self._waiting), key=lambda turn: waiting[self._waiting[turn]])
+        message = (
+            f"{self._name}: expected at most {self._limit} calls that wait, got more, most of them from "
+            f"{self._waiting.pop(turn)[:200]}; call again later"
         )
-
-    def _remove(self, caller: str, turn: asyncio.Future[None]) -> None:
-        own = self._waiting.get(caller, deque())
-        if turn in own:
-            own.remove(turn)
-        if not own:
-            self._waiting.pop(caller, None)
+        if not turn.cancelled():
+            turn.set_exception(RateLimitError(message, retry_after_s=_RETRY_AFTER_S))
 
     def _start_next(self) -> None:
         while self._free and self._waiting:
-            caller = min(self._waiting, key=lambda other: (self._running[other], self._used_s[other]))
-            turn = self._waiting[caller][0]
-            self._remove(caller, turn)
-            if turn.done():
+            turn = min(self._waiting, key=lambda turn: self._rank(self._waiting[turn]))
+            caller = self._waiting.pop(turn)
+            if turn.cancelled():
                 continue
             self._free -= 1
             self._running[caller] += 1
             self._now_s = max(self._now_s, self._used_s[caller])
             turn.set_result(None)
 
+    def _rank(self, caller: str) -> tuple[int, float]:
+        return self._running[caller], self._used_s[caller]
+
     def _end(self, caller: str, begin_s: float) -> None:
         took_s = time.monotonic() - begin_s
         self._used_s[caller] += took_s
         self._running -= Counter([caller])
-        for other in list(self._used_s)[: max(0, len(self._used_s) - _MAX_KNOWN)]:
-            if other not in self._waiting and other not in self._running:
-                del self._used_s[other]
+        if len(self._used_s) > _MAX_KNOWN:
+            active = {*self._running, *self._waiting.values()}
+            self._used_s = {other: used_s for other, used_s in self._used_s.items() if other in active}
         asyncio.get_running_loop().call_later(self._pause * took_s if took_s > _LONG_S else 0.0, self._free_one)
 
     def _free_one(self) -> None:
