@@ -22,7 +22,7 @@ from gausslite.wire.security import Tls, TlsFiles
 from gausslite.wire.server import Service, serve_until_stopped
 from gausslite.wire.worker_pool import WorkerPool
 
-_WORKERS = 4  # a language model answers several at once
+_WORKERS = 2  # a language model that is slow to answer one caller leaves a thread for others
 SERVICE_NAME = parser_service_pb2.DESCRIPTOR.services_by_name["ParserService"].full_name
 
 
