@@ -38,7 +38,7 @@ WITHOUT_OUTPUT = ("chaos", "fuzz", "raster", "server")
         (("server", "--held", "many"), "--held"),
         (("server", "--agents", "0"), "--agents"),
         (("server", "--seconds", "0"), "--seconds"),
-        (("server", "--hostile", "unknown"), "--hostile: expected all, or some of large"),
+        (("server", "--hostile", "unknown"), "--hostile: expected all, or some of busy"),
         (("team", "--homes", "9"), "homes"),
         (("team", "--homes", "x"), "homes"),
         (("team", "--team-sizes", "7"), "agents"),

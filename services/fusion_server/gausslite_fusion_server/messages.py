@@ -21,7 +21,6 @@ from gausslite.fusion.frames import AlignmentState, FrameAlignment
 from gausslite.fusion.fused_map import MapLayer
 from gausslite.fusion.keyframe_pool import AgentKeyframe, EncodedKeyframe
 from gausslite.fusion.limits import SessionRecord
-from gausslite.fusion.refinement import LayerView
 from gausslite.fusion.traffic import AgentContribution
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1.geometry_pb2 import EncodedFrame
@@ -136,15 +135,6 @@ def layer_from_message(number: int) -> MapLayer:
     if number not in _LAYERS:
         raise InvalidInputError(f"layer: expected VOTE or REFINED, got {number}")
     return _LAYERS[number]
-
-
-def view_to_message(view: LayerView) -> pb.RenderFusedViewResponse:
-    """Encode a rendered view as PNG images."""
-    return pb.RenderFusedViewResponse(
-        colour_png=convert.encode_colour(view.rgb, lossless=True),
-        depth_png=convert.encode_depth(view.depth_m),
-        revision=view.revision,
-    )
 
 
 def declare_frame(engine: FusionEngine, request: pb.JoinSessionRequest) -> None:

@@ -12,15 +12,37 @@ from numpy import ndarray
 
 from gausslite.domain.camera import Camera
 from gausslite.domain.checks import require_name
-from gausslite.domain.errors import InvalidInputError
+from gausslite.domain.errors import InvalidInputError, QuotaError
 from gausslite.domain.relevance import CameraView, DetectedBox, DetectedImage
+from gausslite.render.rasterizer import Rendering
 from gausslite.v1 import agent_service_pb2 as agent_pb
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.v1 import geometry_pb2
 from gausslite.wire import convert
 
 MAX_POSES, MAX_KEYFRAMES, MAX_BOXES = 1000, 60, 100
+_MAX_VIEW_PX = 1920 * 1080
+MAX_VIEWS_WAITING = 16
 _SIDES = ("left_px", "top_px", "right_px", "bottom_px")
+
+
+def view_camera_from_message(message: geometry_pb2.Camera) -> Camera:
+    """Decode the camera of a view to render. Raises QuotaError above two megapixels, InvalidInputError."""
+    camera = convert.camera_from_message(message)
+    pixels = camera.width_px * camera.height_px
+    if pixels > _MAX_VIEW_PX:
+        raise QuotaError(f"view: expected at most {_MAX_VIEW_PX} pixels, got {pixels}")
+    return camera
+
+
+def view_to_pngs(camera: Camera, rendering: Rendering | None) -> dict[str, bytes]:
+    """Encode a view as the fields of its message; None, of an empty map, is black without depth."""
+    size = camera.height_px, camera.width_px
+    rgb, depth_m = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
+    if rendering is not None:
+        rgb, depth_m = rendering.rgb, rendering.expected_depth_m()
+    rgb_8 = np.rint(np.clip(rgb, 0.0, 1.0) * 255).astype(np.uint8)
+    return {"colour_png": convert.encode_colour(rgb_8, lossless=True), "depth_png": convert.encode_depth(depth_m)}
 
 
 def camera_view_to_message(view: CameraView | None) -> agent_pb.GetCameraViewResponse:

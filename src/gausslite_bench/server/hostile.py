@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,7 +47,6 @@ _STORM_THREADS = 8
 _NOUN = "mug"
 _TASK = f"Pick up the {_NOUN} on the table"
 _LONG_TASK = ", then ".join([_TASK] * 27)
-_Client = TypeVar("_Client", bound=ServiceChannel)
 
 
 def _note_begin(nice: int = 10) -> None:
@@ -87,8 +86,8 @@ def _resend(address: str, count: int, make: Callable[[str], bytes]) -> None:
 
 def _storm(
     address: str,
-    call: Callable[[_Client, int], object],
-    connect: Callable[[str, float], _Client] = FusionClient,
+    call: Callable[[Any, int], object],
+    connect: Callable[[str, float], ServiceChannel] = FusionClient,
     callers: int = _STORM_THREADS,
 ) -> None:
     """Call from several threads, each again as soon as it is answered, whatever the answer."""
@@ -119,9 +118,7 @@ def _storm_of_queries(address: str) -> None:
     _storm(address, lambda client, _: client.query_objects(_NOUN))
 
 
-def _storm_of_views(
-    address: str, callers: int, connect: Callable[[str, float], FusionClient | AgentClient] = FusionClient
-) -> None:
+def _storm_of_views(address: str, callers: int, connect: Callable[[str, float], ServiceChannel] = FusionClient) -> None:
     frame = keyframe(0, 1920, 1080)
     _storm(address, lambda client, _: client.render(frame.camera, frame.T_world_camera), connect, callers)
 
