@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from gausslite.domain.errors import InvalidInputError, ModelFileError
-from gausslite.perception.depth_segmenter import DepthSegmenter
 from gausslite.perception.detector import BoxDetector, Detector, SegmentedDetector, Segmenter
 from gausslite.perception.detector_file import DetectorOptions
+from gausslite_detectors.depth_segmenter import DepthSegmenter
 from gausslite_detectors.model_file import OpenModel, open_model, sha256_of
 from gausslite_detectors.yolo_network import MASK_COEFFICIENTS, YoloNetwork, class_names
 

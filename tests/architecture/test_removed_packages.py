@@ -33,6 +33,7 @@ _MAP = ("gausslite", "map", SEQUENCE, *_TASK)
 COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_language": (("gausslite", "parse", "Find the cup"), _MAP, ("gausslite_parser",)),
     "gausslite_detectors": (("gausslite", "models", "list"), _MAP, (*_MAP, "--detector", "../detector.onnx")),
+    "gausslite_selection": (("gausslite", "map", SEQUENCE, "--set", "target-at=0,0,1", "--out", "refused"),),
     "gausslite_calibration": (("gausslite", "calibrate", SEQUENCE),),
     "gausslite_places": (("gausslite", "diff", "a", "b"), (*_MAP, "--prior", "a")),
     "gausslite_gpu": (("gausslite", "map", SEQUENCE, "--out", "refused", "--set", "rasterizer=cuda"),),
