@@ -46,6 +46,7 @@ _MAX_STANDING_M = 0.06
 """Height of an object's lowest point up to which it stands on the floor."""
 _LOWEST_PERCENTILE = 0.5
 """Share of a surface's voxels, in percent, below its lowest point."""
+_OTHER_NAMES = (MatchBasis.SYNONYM, MatchBasis.KIND, MatchBasis.TEXT_FEATURES, MatchBasis.SIMILAR)
 
 
 class SupportingSurfaces:
@@ -230,9 +231,6 @@ def _is_of_any_height(head: str) -> bool:
 
 def _is_within(value: float, limits: Sequence[float]) -> bool:
     return limits[0] <= value <= limits[1]
-
-
-_OTHER_NAMES = (MatchBasis.SYNONYM, MatchBasis.KIND, MatchBasis.TEXT_FEATURES, MatchBasis.SIMILAR)
 
 
 def _is_found(match: NounMatch) -> bool:
