@@ -23,7 +23,6 @@ WORKING = (
     ("gausslite", "--help"),
     ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--roi", "../regions.npz", "--out", "roi"),
     ("gausslite", "map", SEQUENCE, *FEW_GAUSSIANS, "--poses", "track", "--out", "uniform"),
-    ("gausslite", "fuse", "roi/map.ply", "uniform/map.ply", "--out", "fused.ply"),
     ("gausslite_fusion_server", "--store", "fusion.sqlite"),
     ("gausslite_agent",),
 )
@@ -43,6 +42,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gausslite_recorders": (),
     "gausslite_operations": (
         ("gausslite", "status", "127.0.0.1:1"),
+        ("gausslite", "fuse", "a.ply", "b.ply", "--out", "fused.ply"),
         ("gausslite_fusion_server", "verify", "fusion.sqlite"),
         ("gausslite_fusion_server", "--listen", "127.0.0.1:0", "--metrics", "127.0.0.1:0"),
     ),
