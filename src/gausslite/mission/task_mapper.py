@@ -40,6 +40,8 @@ _LEAST_MOTION_M, _LEAST_MOTION_DEG = 0.02, 1.0
 """An image that is repeated at a pose within these is of a robot at rest."""
 _NS_PER_S = 1e9
 _MAX_SHOWN = 16
+_MAX_REEVALUATED = 3
+"""Earlier keyframes that are evaluated again with each frame, after a task change and when an object becomes known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -358,7 +360,7 @@ class TaskMapper:
 
     def _may_evaluate(self, keyframes: int) -> bool:
         """Return True if one more earlier keyframe may be evaluated with this frame."""
-        if keyframes == self._mapper.settings.task_change.keyframes_per_frame:
+        if keyframes == _MAX_REEVALUATED:
             return False
         return keyframes == 0 or self._scheduler.has_time_for(Stage.REEVALUATION)
 
