@@ -27,7 +27,6 @@ from gausslite.v1.geometry_pb2 import EncodedFrame
 from gausslite.wire import convert
 from gausslite.wire.map_changes import read_deadline
 from gausslite.wire.security import Caller
-from gausslite.wire.views import region_from_png
 
 _MAX_SELECTED_KEYFRAMES = 10_000
 
@@ -58,7 +57,7 @@ def store_keyframe(engine: FusionEngine, request: pb.ContributeKeyframesRequest,
     engine.settings.quotas.require_keyframe(message.index, pixels, message.ByteSize())
     # decoded here to refuse invalid images; stored as received, which needs less space
     frame = convert.frame_from_message(message)
-    region_from_png(message.region_png, frame.camera)
+    convert.decode_region(message.region_png, frame.camera)
     data = message.SerializeToString()
     keyframe = EncodedKeyframe(agent_id, frame.index, frame.capture_time_ns, frame.depth_m.size, data)
     engine.keyframes.add(keyframe, request.selected[:_MAX_SELECTED_KEYFRAMES], request.session_id)

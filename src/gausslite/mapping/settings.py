@@ -255,20 +255,6 @@ class DensitySettings:
 
 
 @dataclass(frozen=True, slots=True)
-class TaskChangeSettings:
-    """keyframes_per_frame: maximum number of earlier keyframes to evaluate again with each frame.
-
-    They are evaluated after a task change, and when an object becomes known.
-    """
-
-    keyframes_per_frame: int = 3
-
-    def __post_init__(self) -> None:
-        count = self.keyframes_per_frame
-        _require(count >= 1, "task change keyframes_per_frame", "at least 1", count)
-
-
-@dataclass(frozen=True, slots=True)
 class MapperSettings:
     """A mapping policy.
 
@@ -285,7 +271,6 @@ class MapperSettings:
     optimization: OptimizationSettings = field(default_factory=OptimizationSettings)
     saturation: SaturationSettings = field(default_factory=SaturationSettings)
     density: DensitySettings = field(default_factory=DensitySettings)
-    task_change: TaskChangeSettings = field(default_factory=TaskChangeSettings)
     pose_prior: PoseExposurePrior = field(default_factory=PoseExposurePrior)
     pose_anchor_share: float = 0.1
     leaves_out_moving: bool = True

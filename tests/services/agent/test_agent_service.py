@@ -46,6 +46,7 @@ from gausslite.wire.uplink import Uplink
 from gausslite_agent.mapping_worker import MappingWorker
 from gausslite_agent.servicer import MapChangeLog, NewestTask
 from gausslite_language.rules import RuleParser
+from gausslite_view.decoding import camera_view_from_message
 
 
 def test_a_task_is_text_or_a_graph() -> None:
@@ -350,10 +351,10 @@ def test_views_wait_for_frames_and_are_refused_by_name_without_time_for_them() -
 
 def test_the_camera_view_shows_the_newest_keyframe_and_the_path() -> None:
     with agent() as a:
-        assert a.client.camera_view() is None
+        assert camera_view_from_message(a.client.camera_view()) is None
         a.client.assign_task(TASK)
         list(a.client.ingest([frame(index) for index in range(3)]))
-        view = a.client.camera_view()
+        view = camera_view_from_message(a.client.camera_view())
     assert view is not None
     assert view.camera == CAMERA
     assert np.abs(view.rgb.astype(int) - frame(view.frame_index).rgb).mean() < 5
