@@ -19,8 +19,8 @@ those of the means 6 times. With the 3DGS rates small seeds do not grow enough t
 mapping. Means that move 6 times instead of twice as fast gain 0.2 dB in the region and 0.5 dB over the whole image.
 
 They decay from the 150th update of a Gaussian on: with constant rates, Gaussians oscillate between views, and more
-iterations make a region worse. A decay from the 50th update on loses 0.3 dB over the whole image of a HoloLens recording
-at 32 iterations per frame.
+iterations make a region worse. A decay from the 50th update on loses 0.3 dB over the whole images of a HoloLens
+recording at 32 iterations per frame.
 """
 
 REFINE_RATES = replace(ONLINE_RATES, means=2e-4, decay_after_updates=20)
