@@ -14,6 +14,7 @@ from threading import Event, Lock, Thread
 from typing import Any
 
 from gausslite.domain.errors import StorageError
+from gausslite.fusion.epochs import RECORD as EPOCH
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import LogChange
 
@@ -223,6 +224,7 @@ class SqliteStore(FusionStore):
             check = self._reader.execute("PRAGMA quick_check(1)").fetchone()[0]
             if check != "ok":
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
+            self._log.epochs.load(self.records(EPOCH))
             rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
             self._log.load(self._require_intact(rows))
 

@@ -115,7 +115,7 @@ def test_outdated_rows_are_deleted(open_store: OpenStore) -> None:
     log = store._log
     for seq in range(1, 80):
         store.put(random_subset("ant", seq, dict.fromkeys(range(seq % 3, 60, 3), 2), seed=seq))
-    held = sum(sum(tile.sizes.values()) for tile in log._tiles.values())
+    held = sum(tile.written for tile in log.index.tiles("ant").values())
     in_use = sum(2 + 2 for _ in range(60))
     assert held < 4 * in_use + 4 * 60
     store.close()
