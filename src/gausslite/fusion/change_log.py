@@ -102,7 +102,8 @@ class VoxelLog:
         added["offsets"], added["revisions"] = offsets[: len(changed)], self.revision
         for tile, places in by_tile(keys):
             table = self._tiles.pop(tile, (0, _NO_TABLE))[1]
-            table = replaced(table, find(table, offsets[places]), added.take(places[places < len(changed)]))
+            here = added.take(places[places < len(changed)]) if len(removed) else added.take(places)
+            table = replaced(table, find(table, offsets[places]), here) if len(table) else here
             if len(table):
                 self._tiles[tile] = self.revision, table
         for key in changed.tolist() if self._removed_at else ():

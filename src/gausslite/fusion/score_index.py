@@ -138,11 +138,10 @@ class ScoreIndex:
 
     def memory_bytes(self, names: Iterable[str], name: str, added: Int64[ndarray, " k"]) -> int:
         """Return the memory that these maps take in the index and the change log, with voxels added to one, at most."""
-        new = int(np.count_nonzero(self._stored(name, added)["rows"] < 0))
-        tiles = len(set(tiles_of(added).tolist()) - self.tiles(name).keys()) if new else 0
+        tiles = len(set(tiles_of(added).tolist()) - self.tiles(name).keys())
         maps = [self._maps[own] for own in names]
-        voxels = new + sum(own.totals.voxels for own in maps)
-        return VOXEL_BYTES * voxels + TILE_BYTES * (tiles + sum(len(own.tiles) for own in maps))
+        voxels = sum(own.totals.voxels for own in maps)
+        return VOXEL_BYTES * (len(added) + voxels) + TILE_BYTES * (tiles + sum(len(own.tiles) for own in maps))
 
     def digests(self, name: str) -> TileDigests:
         """Return the digests of a map's rows, which are kept with each change; empty for an unknown one."""
@@ -224,7 +223,7 @@ class ScoreIndex:
         hashes -= np.where(was_there, hash_columns(keys, before["update_seqs"]), np.uint64(0))
         for number, places in by_tile(keys):
             tile, part = self.tile(name, number), added.take(places)
-            tile.table = replaced(tile.table, find(tile.table, part["offsets"]), part)
+            tile.table = replaced(tile.table, find(tile.table, part["offsets"]) if len(tile.table) else places, part)
             tile.used += int(sizes[places].sum())
             tile.digest = (tile.digest + int(hashes[places].sum())) % _MODULUS
         own = self._maps[name]

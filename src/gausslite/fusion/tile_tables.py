@@ -62,7 +62,9 @@ def find(table: Table, offsets: UInt16[ndarray, " n"]) -> Int64[ndarray, " n"]:
 
 
 def replaced(table: Table, removed: Int64[ndarray, " n"], added: Table) -> Table:
-    """Return the table without the elements at these places (-1: none), with the added ones."""
+    """Return the table without the elements at these places (-1: none), with the added ones, whose offsets ascend."""
+    if len(table) == 0:
+        return added
     kept = np.ones(len(table), np.bool_)
     kept[removed[removed >= 0]] = False
     joined = join_elements([table[kept], added])
