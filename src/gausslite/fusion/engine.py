@@ -44,7 +44,7 @@ from gausslite.fusion.updates import MissionClock, PendingUpdate, UpdateChecks, 
 from gausslite.fusion.vote_input import VoteInput
 
 _log = logging.getLogger(__name__)
-_PUBLISHED_TILES = 32
+_PUBLISHED_TILES = 8
 
 
 class JoinResult(NamedTuple):
@@ -426,10 +426,10 @@ class FusionEngine:
     def _begin_map(self, agent_id: str) -> None:
         """Let the agent's present map become a former one, in constant time. Raises StorageError."""
         former = self.maps.begin_map(agent_id, (ALIGNMENT,), (OBJECTS, ORDER_RECORD))
-        for part in (self.frames, self.keyframes):
-            part.begin_map(agent_id, former)
-        for part in (self.objects, self.traffic):
-            part.remove_agent(agent_id)
+        self.frames.begin_map(agent_id, former)
+        self.keyframes.begin_map(agent_id, former)
+        self.objects.remove_agent(agent_id)
+        self.traffic.remove_agent(agent_id)
         if agent_id in self._unrecorded:
             self._unrecorded[former] = self._unrecorded.pop(agent_id)
         self._forget(agent_id)

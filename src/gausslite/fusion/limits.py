@@ -118,7 +118,7 @@ def _half_of_memory() -> int:
 class FusionSettings:
     """The server's configuration. If mission_id or world_frame is empty, the first agent that names it fixes it.
 
-    max_removed_voxels: number of removed voxels that a watcher can still catch up with; see RevisionLog.
+    max_removed_voxels: number of removed voxels that a watcher can still catch up with; see VoxelLog.
     lease_s: time after an agent's last call during which no other robot can take its name.
     """
 

@@ -20,7 +20,10 @@ from gausslite.domain.voxels import BITS_PER_AXIS, TILE_VOXELS, tiles_of
 
 Table = NDArray[Any]
 _LOW = TILE_VOXELS - 1
-_KEYS = sum(np.arange(TILE_VOXELS**3) // TILE_VOXELS**axis % TILE_VOXELS << (axis * BITS_PER_AXIS) for axis in range(3))
+_PLACES = np.arange(TILE_VOXELS**3)
+_KEYS = np.bitwise_or.reduce(
+    [_PLACES // TILE_VOXELS**axis % TILE_VOXELS << (axis * BITS_PER_AXIS) for axis in range(3)]
+)
 
 
 def by_tile(keys: Int64[ndarray, " n"]) -> Iterator[tuple[int, Int64[ndarray, " p"]]]:

@@ -157,9 +157,10 @@ class VoteInput:
     def begin_map(self, agent_id: str, moved: Sequence[str], dropped: Sequence[str]) -> str:
         """Begin another map of an agent; as FusionStore.begin_map. Raises StorageError."""
         former = self._store.begin_map(agent_id, moved, dropped)
-        for own in (self._frames, self._moved):
-            if agent_id in own:
-                own[former] = own.pop(agent_id)
+        if agent_id in self._frames:
+            self._frames[former] = self._frames.pop(agent_id)
+        if agent_id in self._moved:
+            self._moved[former] = self._moved.pop(agent_id)
         if former not in self.agents():
             self.remove_agent(former)
         return former

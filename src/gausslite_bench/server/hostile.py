@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import NamedTuple, TypeVar
@@ -46,6 +46,7 @@ _SEQ = 1 << 20
 _SAMPLE_S = 0.2
 _STORM_THREADS = 8
 _HELD_VOXELS = 400_000
+_TOKEN = "bad"  # noqa: S105 - of the attackers
 _NOUN = "mug"
 _TASK = f"Pick up the {_NOUN} on the table"
 _LONG_TASK = ", then ".join([_TASK] * 27)
@@ -59,9 +60,13 @@ def _note_begin(nice: int = 10) -> None:
     sys.stdout.flush()
 
 
+def _client(address: str, deadline_s: float) -> FusionClient:
+    return FusionClient(address, deadline_s, token=_TOKEN)
+
+
 def _join(address: str, count: int) -> list[tuple[str, str]]:
     """Return the names of these attackers and their sessions."""
-    with FusionClient(address, deadline_s=60.0) as client:
+    with _client(address, 60.0) as client:
         return [(name, client.join(name, GRID).session_id) for name in (f"bad-{number}" for number in range(count))]
 
 
@@ -128,18 +133,18 @@ def _storm_of_views(
     _storm(address, lambda client, _: client.render(frame.camera, frame.T_world_camera), connect, callers)
 
 
+async def _send(address: str, session_id: str, messages: Iterable[bytes]) -> None:
+    async with UpdateStreams(address) as streams:
+        stream = streams.open(session_id)
+        for message in messages:
+            await stream.send(message)
+        await stream.close()
+
+
 def _hold_map(address: str) -> str:
     """Join and store _HELD_VOXELS; returns the session."""
     ((name, session_id),) = _join(address, 1)
-
-    async def send() -> None:
-        async with UpdateStreams(address) as streams:
-            stream = streams.open(session_id)
-            for message in fill_messages(name, 1_000_000, _HELD_VOXELS):
-                await stream.send(message)
-            await stream.close()
-
-    asyncio.run(send())
+    asyncio.run(_send(address, session_id, fill_messages(name, 1_000_000, _HELD_VOXELS)))
     return session_id
 
 
@@ -148,9 +153,9 @@ def _new_maps(address: str) -> None:
 
     def begin(client: FusionClient, _: int) -> None:
         session_id = client.join("bad-0", GRID, fresh_map=True).session_id
-        client.contribute(session_id, [RoiSubset("bad-0", "", 1, 1, voxels_batch(range(50), 7))], GRID)
+        asyncio.run(_send(address, session_id, [_voxels("bad-0", 50)]))
 
-    _storm(address, begin, callers=1)
+    _storm(address, begin, _client, callers=1)
 
 
 def _storm_of_digests(address: str) -> None:
