@@ -41,7 +41,8 @@ def by_tile(keys: Int64[ndarray, " n"]) -> Iterator[tuple[int, Int64[ndarray, " 
 def offsets_of(keys: Int64[ndarray, " n"]) -> UInt16[ndarray, " n"]:
     """Return the place of each voxel in its tile; places ascend as the keys of a tile do."""
     i, j, k = (keys >> (axis * BITS_PER_AXIS) & _LOW for axis in (2, 1, 0))
-    return ((i * TILE_VOXELS + j) * TILE_VOXELS + k).astype(np.uint16)
+    offsets: UInt16[ndarray, " n"] = ((i * TILE_VOXELS + j) * TILE_VOXELS + k).astype(np.uint16)
+    return offsets
 
 
 def keys_of(tiles: Sequence[int], tables: Sequence[Table]) -> Int64[ndarray, " n"]:

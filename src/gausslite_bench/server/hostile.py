@@ -32,7 +32,6 @@ from gausslite_bench.server.agent_load import RATE_HZ, AgentLoad, LoadResult, lo
 from gausslite_bench.server.synthetic_updates import (
     GAUSSIANS_PER_VOXEL,
     GRID,
-    fill_messages,
     keyframe,
     object_report,
     tombstone_message,
@@ -144,7 +143,9 @@ async def _send(address: str, session_id: str, messages: Iterable[bytes]) -> Non
 def _hold_map(address: str) -> str:
     """Join and store _HELD_VOXELS; returns the session."""
     ((name, session_id),) = _join(address, 1)
-    asyncio.run(_send(address, session_id, fill_messages(name, 1_000_000, _HELD_VOXELS)))
+    parts = np.array_split(np.arange(1_000_000, 1_000_000 + _HELD_VOXELS), 100)
+    subsets = (RoiSubset(name, "", seq, seq, voxels_batch(part, seq, 1)) for seq, part in enumerate(parts, start=1))
+    asyncio.run(_send(address, session_id, (encode_subset(subset, GRID) for subset in subsets)))
     return session_id
 
 
