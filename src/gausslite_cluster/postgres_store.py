@@ -20,6 +20,7 @@ import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
 from gausslite.domain.errors import InvalidInputError, StorageError
+from gausslite.fusion.epochs import RECORD as EPOCH
 from gausslite.fusion.migrations import missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import SLOT_BITS, LogChange
@@ -162,6 +163,7 @@ SELECT %s::smallint, * FROM unnest(%s::bigint[], %s::text[], %s::bigint[], %b::b
 _DELETE = "DELETE FROM gausslite.voxel_updates WHERE slot = %s::smallint AND number = ANY(%s::bigint[])"
 _SELECT_UPDATES = "SELECT number, agent_id, checksum, voxels FROM gausslite.voxel_updates WHERE"
 _SELECT_ROWS = f"{_SELECT_UPDATES} slot = %s::smallint AND number = ANY(%s::bigint[])"
+_SELECT_EPOCHS = "SELECT agent_id, data, checksum FROM gausslite.records WHERE name = %s"
 _SET_PROPERTY = """
 INSERT INTO gausslite.properties VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SET value = excluded.value
 """
@@ -235,6 +237,7 @@ class PostgresStore(FusionStore):
 
     def _load(self, db: Database) -> None:
         """Check every row of updates and fill the index; read the id of the content."""
+        self._log.epochs.load(self._intact(EPOCH, db.execute(_SELECT_EPOCHS, (EPOCH,), binary=True)))
         with db.transaction(), db.cursor("load", binary=True) as cursor:
             slots = sorted(ALL_SLOTS if self._owned is None else self._owned.slots)
             cursor.execute(f"{_SELECT_UPDATES} slot = ANY(%s::smallint[]) ORDER BY slot, number", (slots,))

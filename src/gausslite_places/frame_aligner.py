@@ -14,7 +14,7 @@ from gausslite.domain.checks import quote_name
 from gausslite.domain.errors import StorageError, UnavailableError
 from gausslite.domain.voxels import VoxelGrid
 from gausslite.fusion.alignment import FrameDecisions, TeamView
-from gausslite.fusion.earlier_map import earlier_map_of
+from gausslite.fusion.epochs import agent_of
 from gausslite.fusion.frames import FrameAlignment, FrameFit
 from gausslite_places.fit_process import FitProcess
 from gausslite_places.frame_fit import MIN_SAMPLES, Fit, SurfaceSamples, fit_frame
@@ -275,7 +275,9 @@ class MapAligner:
             names = [name for name in frames if name in self._maps and frames[name].is_localised]
             quarantined = find_quarantined({name: i for i, name in enumerate(names)}, self._comparisons)
             outdated = [
-                earlier_map_of(name) for name, against in quarantined.items() if set(against) == {earlier_map_of(name)}
+                min(against)
+                for name, against in quarantined.items()
+                if {agent_of(other) for other in against} == {name}
             ]
             if not outdated:
                 break

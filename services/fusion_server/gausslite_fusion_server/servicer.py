@@ -91,6 +91,8 @@ _ALIGN_DELAY_S = 0.1
 _ALIGN_PAUSE = 4.0
 """Shortest pause after a comparison of an agent, in its durations: all together take a fifth of a core at most."""
 _ALIGN_RETRY_S = 30.0
+_SLICE_PAUSE = 4.0
+"""Pause after a slice of background work, in its durations."""
 
 _Result = TypeVar("_Result")
 
@@ -110,6 +112,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._aligner = ThreadPoolExecutor(1, "align")
         self._views = WorkerPool("views", waiting=MAX_VIEWS_WAITING)
         self._aligning: asyncio.Task[None] | None = None
+        self._slices: asyncio.Task[None] | None = None
         self._align_again, self._align_pause_s = False, _ALIGN_DELAY_S
         self._renderer = MapRenderer(engine.maps, refinement_worker.create_rasterizer)
         self._map_changes = ChangeNotifier()
@@ -131,8 +134,9 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
     def drain(self) -> None:
         """End every open stream and every later call with UNAVAILABLE."""
         self._gate.close()
-        if self._aligning is not None:
-            self._aligning.cancel()
+        for task in (self._aligning, self._slices):
+            if task is not None:
+                task.cancel()
         self._map_changes.notify()
 
     async def store_message(self, session: SessionRecord, message: bytes | EncodedSubset) -> StoredCount:
@@ -151,6 +155,8 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         self._map_changes.notify()
         if self.engine.frames.are_compared:
             self._align_in_background()
+        if self.engine.has_background_work and self._gate.is_open and (self._slices is None or self._slices.done()):
+            self._slices = asyncio.create_task(self._work_in_slices())
 
     def _commit_soon(self) -> None:
         """Commit what is queued in the commit thread; one call serves all messages queued before it begins."""
@@ -185,7 +191,7 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
         if task is not None:
             objects = await self._work(context, self.engine.objects.of_task, request.agent_id, task)
             await self._work(context, self.engine.objects.report, joined.session, ObjectReport(task, objects))
-        self._map_changes.notify()
+        self.publish_changes()
         return pb.JoinSessionResponse(
             session_id=joined.session.session_id,
             highest_update_seq=joined.highest_update_seq,
@@ -391,6 +397,20 @@ class FusionServicer(pb_grpc.FusionServiceServicer):
             self._align_again |= run.is_due
             if run.is_changed:
                 self._map_changes.notify()
+
+    async def _work_in_slices(self) -> None:
+        """Do the engine's background work, with pauses in which others have the disk and the processor."""
+        loop = asyncio.get_running_loop()
+        while self.engine.has_background_work and self._gate.is_open:
+            start_s = loop.time()
+            try:
+                await loop.run_in_executor(None, self.engine.work_in_background)
+                pause_s = _SLICE_PAUSE * (loop.time() - start_s)
+            except GaussLiteError as error:
+                _log.error("former maps are not deleted, again in %.0f s: %s", _ALIGN_RETRY_S, error)
+                pause_s = _ALIGN_RETRY_S
+            self._map_changes.notify()
+            await asyncio.sleep(pause_s)
 
     async def _session(self, session_id: str, context: Any) -> SessionRecord:
         """Return a session. Raises SessionUnknownError, NotPermittedError if the caller is another robot."""

@@ -173,13 +173,11 @@ class FrameAlignments:
         self._save(agent_id, self._next_id, alignment)
         self._next_id += 1
 
-    def add_earlier(self, name: str, agent_id: str) -> None:
-        """Set the alignment of the agent's earlier map, which is in the fused frame. Raises StorageError."""
-        if name not in self._frames:
-            own = self.get(agent_id)
-            is_reference = own.state is AlignmentState.REFERENCE
-            state = AlignmentState.REFERENCE if is_reference else AlignmentState.ALIGNED
-            self.add(name, FrameAlignment(own.order, state, is_unknown=own.is_unknown))
+    def begin_map(self, agent_id: str, former: str) -> None:
+        """Let the agent's alignment stay with its former map; the store has moved its record."""
+        self._frames = {former if name == agent_id else name: own for name, own in self._frames.items()}
+        self._contributors = {former if name == agent_id else name for name in self._contributors}
+        self.unmoved = frozenset(former if name == agent_id else name for name in self.unmoved)
 
     def contribute(self, agent_id: str) -> None:
         """Note an update of the agent: its first one fixes its rank. Raises StorageError.

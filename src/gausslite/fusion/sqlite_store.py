@@ -16,6 +16,7 @@ from typing import Any
 
 from gausslite.codec.commit_head import COUNT_COMMIT, CommitHead
 from gausslite.domain.errors import StorageError
+from gausslite.fusion.epochs import RECORD as EPOCH
 from gausslite.fusion.migrations import Query, missing_steps
 from gausslite.fusion.store import TABLES, Execute, FusionStore
 from gausslite.fusion.update_log import LogChange
@@ -304,6 +305,7 @@ class SqliteStore(FusionStore):
             check = self._reader.execute("PRAGMA quick_check(1)").fetchone()[0]
             if check != "ok":
                 raise StorageError(f"store {self._path}: expected an undamaged file, got {check!r}; {RESTORE_ADVICE}")
+            self._log.epochs.load(self.records(EPOCH))
             rows = self._reader.execute(f"{SELECT_UPDATES} ORDER BY number")
             self._log.load(self._require_intact(rows))
             require_all_rows(self._reader, self._path)

@@ -139,7 +139,7 @@ def run_compute(options: argparse.Namespace) -> int:
     results = {step: _run(options, study) for step, study in studies.items()}
     found = curves(results)
     table = growth_table(chosen.quantity, steps, found)
-    trials = [trial for each in results.values() for trial in each.trials_as_json()]
+    trials = [trial for step in results.values() for trial in step.trials_as_json()]
     write_results(options.out, "compute", table, trials)
     write_atomic(options.out / "compute.svg", growth_plot(steps, found).encode())
     print(f"{table}→ {options.out / 'compute.md'}, compute.svg")

@@ -45,7 +45,7 @@ def curves(steps: Mapping[str, StudyResults]) -> list[Curve]:
         for raw, fitted in _METRICS:
             for policy in first.variants:
                 metric = fitted if first.values(scene, policy, fitted, first.budgets[0]) else raw
-                values = [each.values(scene, policy, metric, each.budgets[0]) for each in steps.values()]
+                values = [step.values(scene, policy, metric, step.budgets[0]) for step in steps.values()]
                 if all(values):
                     found.append(Curve(scene, policy, metric.title, [fmean(one) for one in values]))
     return found

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, NamedTuple
@@ -44,6 +44,8 @@ GOOD_AGENTS = 4
 _SEQ = 1 << 20
 _SAMPLE_S = 0.2
 _STORM_THREADS = 8
+_HELD_VOXELS = 400_000
+_TOKEN = "bad"  # noqa: S105 - of the attackers
 _NOUN = "mug"
 _TASK = f"Pick up the {_NOUN} on the table"
 _LONG_TASK = ", then ".join([_TASK] * 27)
@@ -56,9 +58,13 @@ def _note_begin(nice: int = 10) -> None:
     sys.stdout.flush()
 
 
+def _client(address: str, deadline_s: float) -> FusionClient:
+    return FusionClient(address, deadline_s, token=_TOKEN)
+
+
 def _join(address: str, count: int) -> list[tuple[str, str]]:
     """Return the names of these attackers and their sessions."""
-    with FusionClient(address, deadline_s=60.0) as client:
+    with _client(address, 60.0) as client:
         return [(name, client.join(name, GRID).session_id) for name in (f"bad-{number}" for number in range(count))]
 
 
@@ -121,6 +127,38 @@ def _storm_of_queries(address: str) -> None:
 def _storm_of_views(address: str, callers: int, connect: Callable[[str, float], ServiceChannel] = FusionClient) -> None:
     frame = keyframe(0, 1920, 1080)
     _storm(address, lambda client, _: client.render(frame.camera, frame.T_world_camera), connect, callers)
+
+
+async def _send(address: str, session_id: str, messages: Iterable[bytes]) -> None:
+    async with UpdateStreams(address) as streams:
+        stream = streams.open(session_id)
+        for message in messages:
+            await stream.send(message)
+        await stream.close()
+
+
+def _hold_map(address: str) -> str:
+    """Join and store _HELD_VOXELS; returns the session."""
+    ((name, session_id),) = _join(address, 1)
+    parts = np.array_split(np.arange(1_000_000, 1_000_000 + _HELD_VOXELS), 100)
+    subsets = (RoiSubset(name, "", seq, seq, voxels_batch(part, seq, 1)) for seq, part in enumerate(parts, start=1))
+    asyncio.run(_send(address, session_id, (encode_subset(subset, GRID) for subset in subsets)))
+    return session_id
+
+
+def _new_maps(address: str) -> None:
+    _hold_map(address)
+
+    def begin(client: FusionClient, _: int) -> None:
+        session_id = client.join("bad-0", GRID, fresh_map=True).session_id
+        asyncio.run(_send(address, session_id, [_voxels("bad-0", 50)]))
+
+    _storm(address, begin, _client, callers=1)
+
+
+def _storm_of_digests(address: str) -> None:
+    session_id = _hold_map(address)
+    _storm(address, lambda client, _: client.stored_digests(session_id), callers=16)
 
 
 def _new_snapshot(client: FusionClient, number: int) -> None:
@@ -201,6 +239,8 @@ ATTACKS: Mapping[str, Attack] = {
     "watchers": Attack(
         "50 that watch the map anew, each without another name", lambda to: _storm(to, _new_snapshot, callers=50)
     ),
+    "fresh-map": Attack("one that holds 400 000 voxels and begins new maps of 50", _new_maps),
+    "digests": Attack("16 that ask for the digests of 400 000 voxels", _storm_of_digests),
     "keyframes": Attack("8 that send keyframes of 1920 x 1080, noise as PNG", _large_keyframes),
     "slow-readers": Attack("64 watchers that read one block", _slow_readers),
     "half-open": Attack("300 silent connections, 384 silent streams", _half_open),
