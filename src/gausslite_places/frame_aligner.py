@@ -311,7 +311,7 @@ class MapAligner:
         return deleted
 
     def _follow(self, majority: Majority, frames: _Frames) -> None:
-        """Take back the corrections to agents that lead no more, and compare those that a leader has found to differ."""
+        """Take back corrections to agents that lead no more, and compare those that a leader has found to differ."""
         for name in majority.supporters:
             before = own = frames[name]
             for witness in {witness for segment in own.segments for witness in segment.witnesses}:

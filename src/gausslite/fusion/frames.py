@@ -53,8 +53,8 @@ class FrameFit:
 
     shift_m, rotation_deg: the motion of the overlap's centre and its angle. compared: number of held-out samples.
     is_better: distance and colour improve by more than four times their uncertainty. is_apart: before the motion, the
-    surfaces are farther apart than those of maps in the same frame. is_sure: with the motion, or as they are if it is no
-    better, the maps fit better than after any shift or turn.
+    surfaces are farther apart than those of maps in the same frame. is_sure: with the motion, or as they are if it is
+    no better, the maps fit better than after any shift or turn.
     """
 
     motion: Float64[ndarray, "4 4"]

@@ -144,9 +144,10 @@ def run_attack(attack: str, seed: int) -> FrameAttack:
 def main(runs: int, attacks: list[str]) -> None:
     """Print the table, with the worst and the mean run of each attack."""
     print(
-        "| attack | runs | good robots harmed: at the end, after evict | within 10 cm: worst, mean | after evict | released |"
+        "| attack | runs | good robots harmed at the end, after evict | within 10 cm at the end (worst, mean) | "
+        "after evict (worst) | released |"
     )
-    print("|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|", flush=True)
     for attack in attacks:
         found = [run_attack(attack, seed) for seed in range(runs)]
         harmed, after = (sum(result.harmed[i] for result in found) for i in (0, 1))
