@@ -141,7 +141,8 @@ class FrameAlignment:
 
         A quarantine holds while one of those that the agent contradicts is there.
         """
-        against = tuple(name for name in self.against if name != witness or not is_gone)
+        is_quarantined = self.state is AlignmentState.QUARANTINED
+        against = tuple(name for name in self.against if name != witness or not (is_gone and is_quarantined))
         lost = [i for i, segment in enumerate(self.segments) if witness in segment.witnesses]
         if not lost and against == self.against:
             return self
@@ -149,9 +150,9 @@ class FrameAlignment:
         if lost and segments:
             # where the updates from here on were measured, they are measured again
             segments += (segments[-1]._replace(first_seq=self.segments[lost[0]].first_seq),)
-        if self.is_unknown and not segments:
+        if lost and self.is_unknown and not segments:
             return self.unlocalised(f"it was found by the map of {witness}")
-        is_kept = against if self.state is AlignmentState.QUARANTINED else segments
+        is_kept = against if is_quarantined else segments
         state, message = (self.state, self.message) if is_kept else (AlignmentState.UNKNOWN, "")
         return replace(self, segments=segments, against=against, fit=None, state=state, message=message)
 
