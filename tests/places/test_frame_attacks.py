@@ -56,6 +56,7 @@ def test_the_same_frame_declared_again_takes_back_a_correction_and_ends_no_quara
     assert state_of(engine, "bee") is AlignmentState.CORRECTED
     engine.declare_frame("bee", np.eye(4))
     assert engine.frames.get("bee").is_identity
+    engine.evict("bee")
     send_twice(engine, "cat", move_gaussians(corner(2), WRONG))
     assert state_of(engine, "cat") is AlignmentState.QUARANTINED
     engine.declare_frame("cat", np.eye(4))
