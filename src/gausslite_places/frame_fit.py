@@ -165,7 +165,7 @@ def evaluate_motion(
     is_apart = bool(before[0].mean() > _APART)
     kept, placed = (after, motion) if is_better else (before, np.eye(4))
     is_sure = kept[2].mean() >= _MIN_MATCHED and all(
-        _lower_bound(sum(target.residuals(held_out.moved(probe @ placed))[:2]) - sum(kept[:2]), blocks) > 0
+        _lower_bound(np.add(*target.residuals(held_out.moved(probe @ placed))[:2]) - np.add(*kept[:2]), blocks) > 0
         for probe in _probes(transform_points(placed, centre_m[None])[0])
     )
     misfit_before, misfit_after = (

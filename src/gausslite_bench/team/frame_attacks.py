@@ -69,7 +69,7 @@ def _parts(rng: np.random.Generator, T_agent_fused: Float64[ndarray, "4 4"]) -> 
     n = len(rows)
     whole = Gaussians(
         (rows[:, MEAN] + rng.normal(0, _NOISE_M, (n, 3))).astype(np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         np.full((n, 3), 0.03, np.float32),
         np.full(n, 0.9, np.float32),
         (rows[:, RGB] * rng.uniform(0.9, 1.1) + rng.normal(0, 0.02, (n, 3))).astype(np.float32),
@@ -113,7 +113,7 @@ def _near(engine: FusionEngine) -> float:
 def _harmed(engine: FusionEngine, good: list[str]) -> int:
     frames = [engine.frames.get(name) for name in good]
     moved_m = [np.linalg.norm(transform_points(own.T_fused_agent, _MIDDLE_M[None]) - _MIDDLE_M) for own in frames]
-    return sum(not own.is_used or away_m > _NEAR_M for own, away_m in zip(frames, moved_m, strict=True))
+    return sum(not own.is_used or bool(away_m > _NEAR_M) for own, away_m in zip(frames, moved_m, strict=True))
 
 
 def run_attack(attack: str, seed: int) -> FrameAttack:
@@ -128,7 +128,8 @@ def run_attack(attack: str, seed: int) -> FrameAttack:
     parts = {name: _parts(rng, T_bad if name in bad else np.eye(4)) for name in (*bad, *good)}
     late = good if is_first else bad
     turns = sorted((number + (name in late), name in late, name, number) for name in parts for number in range(_PARTS))
-    released, quarantined = 0, set()
+    released = 0
+    quarantined: set[str] = set()
     for *_, name, number in turns:
         _send(engine, name, parts[name], number)
         states = {own: engine.frames.get(own).state for own in bad}
