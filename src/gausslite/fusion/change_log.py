@@ -13,19 +13,19 @@ from numpy import ndarray
 
 from gausslite.domain.errors import RevisionGoneError
 from gausslite.domain.voxel_changes import MAX_REMOVED_VOXELS
-from gausslite.fusion.tile_tables import Table, by_tile, find, keys_of, offsets_of, replaced
+from gausslite.fusion.packed_table import PackedTable, Table, keys_of, places_of, tiles_at
 from gausslite.fusion.vote import VoteResult
 
-_CHANGED = np.dtype([("offsets", "u2"), ("winners", "u2"), ("counts", "u4"), ("revisions", "i8")])
+_CHANGED = np.dtype([("winners", "u2"), ("counts", "u4"), ("revisions", "i8")])
 _NOBODY = (1 << 16) - 1
-_NO_TABLE: Table = np.zeros(0, _CHANGED)
-_ABSENT = np.array((0, _NOBODY, 0, 0), _CHANGED)
+_ABSENT = np.array((_NOBODY, 0, 0), _CHANGED)
+_NO_TILE = np.array((0, 0), np.dtype([("voxels", "u4"), ("revisions", "i8")]))
 
 
 class VoxelLog:
     """One layer of the fused map: its voxels, and the revision of the last change of each and of each tile.
 
-    It has 16 bytes for each voxel of the layer, and the latest `max_removed` voxels that became empty. A watcher that
+    It has 22 bytes for each voxel of the layer, and the latest `max_removed` voxels that became empty. A watcher that
     misses an older removal has to begin with a snapshot. `first_revision` must exceed all revisions from before a
     restart. A tile has 16 x 16 x 16 voxels; its name is the smallest key that it can hold. Not thread-safe.
     """
@@ -33,41 +33,37 @@ class VoxelLog:
     def __init__(self, first_revision: int, max_removed: int) -> None:
         self.revision = self._oldest = first_revision
         self._max_removed = max_removed
-        # both in the order of the revisions, so that changed_since reads only what changed
-        self._tiles: dict[int, tuple[int, Table]] = {}
+        self._voxels, self._tiles = PackedTable(_ABSENT), PackedTable(_NO_TILE)
+        # in the order of the revisions
         self._removed_at: OrderedDict[int, int] = OrderedDict()
 
     def copy(self) -> VoxelLog:
         """Return an equal log that changes on its own."""
         other = copy(self)
-        other._tiles, other._removed_at = dict(self._tiles), OrderedDict(self._removed_at)
+        other._voxels, other._tiles = self._voxels.copy(), self._tiles.copy()
+        other._removed_at = OrderedDict(self._removed_at)
         return other
 
     def tiles(self) -> Int64[ndarray, " t"]:
         """Return the tiles that have voxels, ascending."""
-        return np.sort(np.fromiter(self._tiles, np.int64, len(self._tiles)))
+        return keys_of(self._tiles.select()[0])
 
     def keys(self, tile: int) -> Int64[ndarray, " k"]:
         """Return the voxels of a tile, ascending."""
-        return keys_of([tile], [self._tiles.get(tile, (0, _NO_TABLE))[1]])
+        return keys_of(self._voxels.in_tiles(places_of(np.array([tile])))[0])
 
     def all_keys(self) -> Int64[ndarray, " k"]:
         """Return the voxels of all tiles, ascending."""
-        return np.sort(keys_of(list(self._tiles), [table for _, table in self._tiles.values()]))
+        return np.sort(keys_of(self._voxels.select()[0]))
 
     def tile_revision(self, tile: int) -> int:
         """Return the revision of the last change in a tile; the current one if it has no voxels."""
-        return self._tiles[tile][0] if tile in self._tiles else self.revision
+        own = self._tiles.get(places_of(np.array([tile])))[0]
+        return int(own["revisions"]) if own["voxels"] else self.revision
 
     def find(self, keys: Int64[ndarray, " k"]) -> Table:
         """Return the winner, the number of Gaussians and the revision of each voxel; _ABSENT of others."""
-        found, offsets = np.full(len(keys), _ABSENT), offsets_of(keys)
-        for tile, places in by_tile(keys):
-            if tile in self._tiles:
-                table = self._tiles[tile][1]
-                at = find(table, offsets[places])
-                found[places[at >= 0]] = table.take(at[at >= 0])
-        return found
+        return self._voxels.get(places_of(keys))
 
     def changed_since(self, revision: int) -> Int64[ndarray, " c"]:
         """Return the keys of the voxels that changed or became empty after this revision, ascending.
@@ -78,11 +74,13 @@ class VoxelLog:
             raise RevisionGoneError(
                 f"since_revision: expected {self._oldest} to {self.revision}, or 0 for a snapshot, got {revision}"
             )
-        newest = itertools.takewhile(lambda tile: self._tiles[tile][0] > revision, reversed(self._tiles))
-        tables = {tile: self._tiles[tile][1] for tile in newest}
-        recent = {tile: table[table["revisions"] > revision] for tile, table in tables.items()}
+        if revision == self.revision:
+            return np.zeros(0, np.int64)
+        tiles, _ = self._tiles.select(lambda own: own["revisions"] > revision)
+        places, voxels = self._voxels.in_tiles(tiles)
+        recent = keys_of(places[voxels["revisions"] > revision])
         removed = itertools.takewhile(lambda key: self._removed_at[key] > revision, reversed(self._removed_at))
-        return np.sort(np.append(keys_of(list(recent), list(recent.values())), np.array(list(removed), np.int64)))
+        return np.sort(np.append(recent, np.array(list(removed), np.int64)))
 
     def touch(self, keys: Int64[ndarray, " k"]) -> None:
         """Record as one revision that these voxels of the layer have changed."""
@@ -96,16 +94,18 @@ class VoxelLog:
         if not (len(changed) or len(removed)):
             return
         self.revision += 1
-        keys = np.append(changed, removed)
-        offsets = offsets_of(keys)
-        added = np.zeros(len(changed), _CHANGED) if won is None else won.copy()
-        added["offsets"], added["revisions"] = offsets[: len(changed)], self.revision
-        for tile, places in by_tile(keys):
-            table = self._tiles.pop(tile, (0, _NO_TABLE))[1]
-            here = added.take(places[places < len(changed)]) if len(removed) else added.take(places)
-            table = replaced(table, find(table, offsets[places]), here) if len(table) else here
-            if len(table):
-                self._tiles[tile] = self.revision, table
+        keys, elements = np.append(changed, removed), np.full(len(changed) + len(removed), _ABSENT)
+        elements[: len(changed)] = 0 if won is None else won
+        elements["revisions"][: len(changed)] = self.revision
+        places = places_of(keys)
+        before = self._voxels.put(places, elements)
+        added = self._voxels.is_present(elements).astype(np.int64) - self._voxels.is_present(before)
+        numbers, index = np.unique(tiles_at(places), return_inverse=True)
+        tiles = self._tiles.get(numbers)
+        # unsigned numbers wrap around, so that a decrease is the addition of a large one
+        np.add.at(tiles["voxels"], index, added.astype(np.uint32))
+        tiles["revisions"] = self.revision
+        self._tiles.put(numbers, tiles)
         for key in changed.tolist() if self._removed_at else ():
             self._removed_at.pop(key, None)
         for key in removed.tolist():

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import itertools
 from array import array
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from gausslite.codec.encoded_voxels import RECORD, EncodedSubset, EncodedVoxels, join_elements, to_records
 from gausslite.domain.voxel_changes import TileDigests, hash_columns
-from gausslite.domain.voxels import VoxelBatch, tiles_of
-from gausslite.fusion.tile_tables import Table, by_tile, find, joined, keys_of, offsets_of, replaced
+from gausslite.domain.voxels import VoxelBatch
+from gausslite.fusion.packed_table import PackedTable, Table, keys_of, places_of, tiles_at
 
 _COLUMNS = [("update_seqs", "i8"), ("kappa_sums", "u8"), ("counts", "u4"), ("rows", "i8")]
 SCORES = np.dtype([("keys", "i8"), *_COLUMNS])
@@ -29,10 +29,14 @@ Scores = NDArray[Any]
 update_seq and row are -1 where the agent has no update of a voxel.
 """
 NO_SCORES: Scores = np.zeros(0, SCORES)
-VOXEL_BYTES, TILE_BYTES = 50, 900
+VOXEL_BYTES, TILE_BYTES = 65, 60
 """What a voxel, and each map's tile with voxels, take in memory here and in the change log; measured."""
+MORE_ROWS_BYTES, ROW_BYTES = 200, 9
+"""What the rows of a tile beside the first take, together and each."""
+_LEAST_SIZE = 16
+"""What a tile that is deleted costs at least, in voxels."""
 VOXEL_UNITS = 2
-"""The size of a voxel beside its Gaussians, in Gaussians."""
+"""The size of a voxel beside its Gaussians, in units of one Gaussian."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,153 +85,181 @@ def _exact_sum(values: UInt64[ndarray, " k"]) -> int:
     return sum(values.tolist())
 
 
-_PACKED = np.dtype([("offsets", "u2"), *_COLUMNS])
-_NO_TABLE: Table = np.zeros(0, _PACKED)
-_MISSING = np.zeros((), _PACKED)
-_MISSING["update_seqs"] = _MISSING["rows"] = -1
-_MODULUS = 1 << 64
+ROWS = np.dtype([("tiles", "i8"), ("numbers", "i8"), ("sizes", "i8")])
+"""Rows of a store: their tiles, numbers, and sizes in units."""
+_TILES = np.dtype([("written", "u4"), ("used", "u4"), ("digests", "u8"), ("rows", "i8")])
+_NO_TILE = np.array((0, 0, 0, -1), _TILES)
+_PACKED = np.dtype(_COLUMNS)
+_NO_VOXEL = np.array((-1, 0, 0, -1), _PACKED)
 ReadVoxels = Callable[[str, Int64[ndarray, " k"]], Sequence[EncodedVoxels]]
 """Returns an agent's stored updates of some voxels in parts, each with ascending keys."""
 
 
-@dataclass(slots=True, eq=False)
-class MapTile:
-    """A map's part in a tile. written, used: the size of its rows, and of its voxels in them, in Gaussians."""
-
-    table: Table = field(default_factory=lambda: _NO_TABLE)
-    rows: array[int] = field(default_factory=lambda: array("q"))
-    written: int = 0
-    used: int = 0
-    digest: int = 0
-
-
-@dataclass(slots=True, eq=False)
 class _Map:
-    tiles: dict[int, MapTile] = field(default_factory=dict)
-    totals: AgentTotals = field(default_factory=AgentTotals)
+    """What is known of a map.
+
+    tiles: the size of a tile's rows (written), and of its voxels in them (used), in units; its digest and its first
+    row. more_rows: the others of tiles that have several; added_rows: their number.
+    """
+
+    def __init__(self) -> None:
+        self.voxels, self.tiles = PackedTable(_NO_VOXEL), PackedTable(_NO_TILE)
+        self.more_rows: dict[int, array[int]] = {}
+        self.totals = AgentTotals()
+        self.added_rows = 0
+
+    @property
+    def memory_bytes(self) -> int:
+        """What it takes here and in the change log."""
+        tables = VOXEL_BYTES * len(self.voxels) + TILE_BYTES * len(self.tiles)
+        return tables + MORE_ROWS_BYTES * len(self.more_rows) + ROW_BYTES * self.added_rows
 
 
 _NO_MAP = _Map()
 
 
 class ScoreIndex:
-    """Totals by map and voxel, 30 bytes each. Not thread-safe; the store holds a lock."""
+    """Totals by map and voxel. Not thread-safe; the store holds a lock."""
 
     def __init__(self) -> None:
         self._maps: dict[str, _Map] = {}
         self.agents: tuple[str, ...] = ()
         """The names of the maps with rows, sorted."""
 
+    def _map(self, name: str) -> _Map:
+        return self._maps.get(name, _NO_MAP)
+
     def totals(self, name: str) -> AgentTotals:
         """Return the sums over a map's rows; zero for an unknown one."""
-        return self._maps.get(name, _NO_MAP).totals
-
-    def tiles(self, name: str) -> dict[int, MapTile]:
-        """Return the tiles of a map; empty for an unknown one."""
-        return self._maps.get(name, _NO_MAP).tiles
-
-    def tile(self, name: str, tile: int) -> MapTile:
-        """Return a tile of a map; both exist from then on."""
-        if name not in self._maps:
-            self._maps[name] = _Map()
-            self.agents = tuple(sorted(self._maps))
-        tiles = self._maps[name].tiles
-        if tile not in tiles:
-            tiles[tile] = MapTile()
-        return tiles[tile]
+        return self._map(name).totals
 
     def memory_bytes(self, names: Iterable[str], name: str, added: Int64[ndarray, " k"]) -> int:
         """Return the memory that these maps take in the index and the change log, with voxels added to one, at most."""
-        tiles = len(set(tiles_of(added).tolist()) - self.tiles(name).keys())
-        maps = [self._maps[own] for own in names]
-        voxels = sum(own.totals.voxels for own in maps)
-        return VOXEL_BYTES * (len(added) + voxels) + TILE_BYTES * (tiles + sum(len(own.tiles) for own in maps))
+        added_tiles = self._map(name).tiles.get(np.unique(tiles_at(places_of(added))))
+        tiles = int(np.count_nonzero(added_tiles["written"] == 0))
+        before = sum(self._maps[own].memory_bytes for own in names)
+        return before + VOXEL_BYTES * len(added) + TILE_BYTES * tiles
 
     def digests(self, name: str) -> TileDigests:
         """Return the digests of a map's rows, which are kept with each change; empty for an unknown one."""
-        tiles = self.tiles(name)
-        names = np.fromiter(tiles, np.int64, len(tiles))
-        hashes = np.fromiter((tile.digest for tile in tiles.values()), np.uint64, len(tiles))
-        order = np.argsort(names)
-        return TileDigests(names[order], hashes[order])
+        places, tiles = self._map(name).tiles.select()
+        return TileDigests(keys_of(places), np.ascontiguousarray(tiles["digests"]))
+
+    def keys(self, name: str) -> Int64[ndarray, " v"]:
+        """Return the keys of a map's voxels, ascending."""
+        return np.sort(keys_of(self._map(name).voxels.select()[0]))
 
     def scores_of(self, name: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the map's totals on these voxels, in their order."""
-        found = self._stored(name, keys)
-        return _scores(keys, found)
+        return _scores(keys, self._map(name).voxels.get(places_of(keys)))
 
     def scores(self, keys: Int64[ndarray, " k"] | None = None) -> VoxelScoreTable:
         """Return the totals of all maps on these voxels, or on all."""
-        wanted = None if keys is None else np.unique(keys)
-        tiles = set(tiles_of(wanted).tolist()) if wanted is not None else None
-        present = [
-            index for index, name in enumerate(self.agents) if tiles is None or not tiles.isdisjoint(self.tiles(name))
-        ]
-        parts = [self.sorted_scores(self.agents[index], wanted) for index in present]
-        agent_index = np.repeat(np.array(present, np.int32), [len(part) for part in parts])
+        parts = self._sorted_scores(self.agents, None if keys is None else np.unique(keys))
+        agent_index = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
         return VoxelScoreTable(self.agents, agent_index, join_elements([NO_SCORES, *parts]))
 
     def sorted_scores(self, name: str, keys: Int64[ndarray, " k"] | None = None) -> Scores:
         """Return the map's totals on those of these voxels (ascending keys) that it has, or on all."""
-        if keys is not None:
-            found = self._stored(name, keys)
-            present = found["rows"] >= 0
-            return _scores(keys[present], found[present])
-        tiles = self.tiles(name)
-        tables = [tile.table for tile in tiles.values()]
-        scores = _scores(keys_of(list(tiles), tables), joined(tables, _PACKED))
-        return scores.take(np.argsort(scores["keys"]))
+        return self._sorted_scores([name], keys)[0]
+
+    def _sorted_scores(self, names: Sequence[str], keys: Int64[ndarray, " k"] | None) -> list[Scores]:
+        tables = [self._map(name).voxels for name in names]
+        if keys is None:
+            scores = [_scores(keys_of(places), found) for places, found in (own.select() for own in tables)]
+            return [own.take(np.argsort(own["keys"])) for own in scores]
+        places = places_of(keys)
+        found = [own.get(places) for own in tables]
+        present = [np.flatnonzero(own["rows"] >= 0) for own in found]
+        return [_scores(keys[at], own.take(at)) for own, at in zip(found, present, strict=True)]
 
     def put(self, name: str, scores: Scores) -> None:
-        """Replace the map's totals on the voxels of the scores."""
-        scores = scores.take(np.argsort(scores["keys"], kind="stable"))
-        keys, added = np.ascontiguousarray(scores["keys"]), np.empty(len(scores), _PACKED)
-        added["offsets"] = offsets_of(keys)
+        """Replace the map's totals on the voxels of the scores; `add_rows` came before."""
+        own, keys, added = self._maps[name], np.ascontiguousarray(scores["keys"]), np.empty(len(scores), _PACKED)
         for column, _ in _COLUMNS:
             added[column] = scores[column]
-        before = self._stored(name, keys)
-        self._replace(name, keys, before, added)
+        places = places_of(keys)
+        before = own.voxels.put(places, added)
+        was_there = before["rows"] >= 0
+        sizes = added["counts"].astype(np.int64) + VOXEL_UNITS
+        sizes -= np.where(was_there, before["counts"].astype(np.int64) + VOXEL_UNITS, 0)
+        hashes = hash_columns(keys, added["update_seqs"])
+        hashes -= np.where(was_there, hash_columns(keys, before["update_seqs"]), np.uint64(0))
+        numbers, index = np.unique(tiles_at(places), return_inverse=True)
+        tiles = own.tiles.get(numbers)
+        # unsigned numbers wrap around, so that a decrease is the addition of a large one
+        np.add.at(tiles["used"], index, sizes.astype(np.uint32))
+        np.add.at(tiles["digests"], index, hashes)
+        own.tiles.put(numbers, tiles)
+        own.totals = own.totals.replace_part(before, added)
 
-    def remove_tiles(self, name: str, tiles: Iterable[int]) -> Int64[ndarray, " v"]:
-        """Delete the map's rows in these tiles; returns the keys of their voxels. A map without tiles is unknown."""
-        own = self._maps.get(name, _NO_MAP)
-        removed = {tile: own.tiles.pop(tile).table for tile in tiles}
-        own.totals = own.totals.replace_part(joined(removed.values(), _PACKED), _NO_TABLE)
-        if name in self._maps and not own.tiles:
+    def outdated_rows(self, name: str, tiles: Int64[ndarray, " t"], spare: int, at_most: int) -> dict[int, list[int]]:
+        """Return the rows of tiles of which more than half, and than `spare`, is outdated: of about so many units."""
+        own = self._map(name)
+        found = own.tiles.get(places_of(tiles))
+        written, used = (found[column].astype(np.int64) for column in ("written", "used"))
+        outdated = np.flatnonzero(written - used > np.maximum(used, spare))
+        outdated = outdated[np.cumsum(written[outdated]) - written[outdated] < at_most]
+        rows = zip(tiles[outdated].tolist(), found["rows"][outdated].tolist(), strict=True)
+        return {tile: [row, *own.more_rows.get(tile, ())] for tile, row in rows}
+
+    def add_rows(self, name: str, rows: Table, emptied: Collection[int] = ()) -> None:
+        """Add ROWS to tiles of a map; emptied: those that have none of their earlier rows any more."""
+        if name not in self._maps:
+            self._maps[name] = _Map()
+            self.agents = tuple(sorted(self._maps))
+        own, tiles = self._maps[name], rows["tiles"]
+        places, first, index = np.unique(places_of(tiles), return_index=True, return_inverse=True)
+        found = own.tiles.get(places)
+        gone = places.searchsorted(places_of(np.array(list(emptied), np.int64)))
+        found["written"][gone], found["rows"][gone] = 0, -1
+        for tile in emptied:
+            own.added_rows -= len(own.more_rows.pop(tile, ()))
+        np.add.at(found["written"], index, rows["sizes"].astype(np.uint32))
+        is_first = found["rows"] < 0
+        found["rows"][is_first] = rows["numbers"][first[is_first]]
+        own.tiles.put(places, found)
+        more = np.delete(rows, first[is_first])
+        own.added_rows += len(more)
+        for tile, number, _ in more.tolist():
+            own.more_rows.setdefault(tile, array("q")).append(number)
+
+    def last_tiles(self, name: str, at_most: int) -> tuple[int, list[int]]:
+        """Return the place where a map's last tiles begin, with about so many voxels, and the rows of these tiles."""
+        own, size, rows = self._map(name), 0, list[int]()
+        places, tiles = own.tiles.last(max(at_most // _LEAST_SIZE, 1))
+        voxels = own.voxels.last(len(own.voxels))[0]
+        counts = np.diff(voxels.searchsorted(places), append=len(voxels))
+        first, columns = len(places), (keys_of(places), counts, tiles["rows"])
+        for tile, count, row in zip(*(column[::-1].tolist() for column in columns), strict=True):
+            own_rows = [row, *own.more_rows.get(tile, ())]
+            rows, first, size = rows + own_rows, first - 1, size + max(count, len(own_rows), _LEAST_SIZE)
+            if size >= at_most:
+                break
+        return int(places[first]) if rows else 0, rows
+
+    def remove_from(self, name: str, place: int) -> Int64[ndarray, " v"]:
+        """Delete a map's rows in the tiles from this place on; returns the keys of their voxels, ascending.
+
+        A map without tiles is unknown.
+        """
+        if name not in self._maps:
+            return np.zeros(0, np.int64)
+        own = self._maps[name]
+        for tile in keys_of(own.tiles.remove_from(place)[0]).tolist():
+            own.added_rows -= len(own.more_rows.pop(tile, ()))
+        places, removed = own.voxels.remove_from(place)
+        own.totals = own.totals.replace_part(removed, removed[:0])
+        if len(own.tiles) == 0:
             del self._maps[name]
             self.agents = tuple(sorted(self._maps))
-        return np.sort(keys_of(list(removed), list(removed.values())))
+        return np.sort(keys_of(places))
 
     def rename(self, name: str, other: str) -> None:
         """Give a map another name, if it exists."""
         if name in self._maps:
             self._maps[other] = self._maps.pop(name)
             self.agents = tuple(sorted(self._maps))
-
-    def _stored(self, name: str, keys: Int64[ndarray, " k"]) -> Table:
-        """Return the map's elements on these voxels, in their order; _MISSING where it has none."""
-        found, offsets, tiles = np.full(len(keys), _MISSING), offsets_of(keys), self.tiles(name)
-        for tile, places in by_tile(keys) if tiles else ():
-            own = tiles.get(tile)
-            if own is not None:
-                at = find(own.table, offsets[places])
-                found[places[at >= 0]] = own.table.take(at[at >= 0])
-        return found
-
-    def _replace(self, name: str, keys: Int64[ndarray, " k"], before: Table, added: Table) -> None:
-        """Put these elements in the place of those from before, and follow with the sums of map and tiles."""
-        was_there = before["rows"] >= 0
-        sizes = added["counts"].astype(np.int64) + VOXEL_UNITS
-        sizes -= np.where(was_there, before["counts"].astype(np.int64) + VOXEL_UNITS, 0)
-        hashes = hash_columns(keys, added["update_seqs"])
-        hashes -= np.where(was_there, hash_columns(keys, before["update_seqs"]), np.uint64(0))
-        for number, places in by_tile(keys):
-            tile, part = self.tile(name, number), added.take(places)
-            tile.table = replaced(tile.table, find(tile.table, part["offsets"]) if len(tile.table) else places, part)
-            tile.used += int(sizes[places].sum())
-            tile.digest = (tile.digest + int(hashes[places].sum())) % _MODULUS
-        own = self._maps[name]
-        own.totals = own.totals.replace_part(before, added)
 
 
 def _scores(keys: Int64[ndarray, " k"], packed: Table) -> Scores:

@@ -30,7 +30,6 @@ from gausslite.fusion.epochs import RECORD as EPOCH
 from gausslite.fusion.epochs import agent_of
 from gausslite.fusion.limits import MissionConfig, SessionRecord
 from gausslite.fusion.score_index import AgentTotals, Scores, VoxelScoreTable
-from gausslite.fusion.tile_tables import keys_of
 from gausslite.fusion.update_log import (
     LogChange,
     PutOutcome,
@@ -152,11 +151,12 @@ class FusionStore(ABC):
     def remove_slice(self, name: str) -> Int64[ndarray, " v"]:
         """Delete some tiles of a map, about SLICE_VOXELS; returns the keys of their voxels, ascending."""
         with self._log_lock:
-            tiles, numbers = self._log.removable(name, SLICE_VOXELS)
-            if tiles:
+            with self._index_lock:
+                place, numbers = self._log.removable(name, SLICE_VOXELS)
+            if numbers:
                 self._write(lambda execute: self._delete_rows(execute, numbers))
             with self._index_lock:
-                return self._log.remove(name, tiles)
+                return self._log.remove(name, place)
 
     def remove_agent(self, name: str) -> Int64[ndarray, " v"]:
         """Delete a map's updates, keyframes and records; returns the keys of the updates' voxels, ascending."""
@@ -203,8 +203,7 @@ class FusionStore(ABC):
     def keys(self, agent_id: str) -> Int64[ndarray, " v"]:
         """Return the keys of an agent's updates (with tombstones), ascending."""
         with self._index_lock:
-            tables = {tile: own.table for tile, own in self._log.index.tiles(agent_id).items()}
-        return np.sort(keys_of(list(tables), list(tables.values())))
+            return self._log.index.keys(agent_id)
 
     def scores_of(self, agent_id: str, keys: Int64[ndarray, " k"]) -> Scores:
         """Return the agent's totals on these voxels, in their order."""

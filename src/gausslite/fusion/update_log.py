@@ -10,8 +10,7 @@ highest (update_seq, row) is a voxel's latest.
 from __future__ import annotations
 
 import itertools
-from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import google_crc32c
@@ -21,9 +20,9 @@ from numpy import ndarray
 
 from gausslite.codec.encoded_voxels import VOXELS, EncodedSubset, EncodedVoxels, join_elements
 from gausslite.domain.errors import GaussLiteError, InvalidInputError, StorageError
-from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of
+from gausslite.domain.voxels import VoxelBatch, empty_batch, merge_batches, tile_of, tiles_of
 from gausslite.fusion.epochs import Epochs
-from gausslite.fusion.score_index import SCORES, VOXEL_UNITS, MapTile, ScoreIndex, Scores, newer_voxels
+from gausslite.fusion.score_index import ROWS, SCORES, VOXEL_UNITS, ScoreIndex, Scores, newer_voxels
 
 UpdateRow = tuple[int, str, int, bytes]
 """number, label of the map (see Epochs), checksum, voxels."""
@@ -37,8 +36,8 @@ SlotsOf = Callable[[Int64[ndarray, " n"]], Int64[ndarray, " n"]]
 """Returns the slot of each voxel; those of a tile have the same."""
 _SPARE_UNITS = 1 << 8
 """About 5 kB of Gaussians, which may be outdated in each tile."""
-_LEAST_SIZE = 16
-"""What a tile that is deleted costs at least, in voxels."""
+_REWRITTEN = 4
+"""How many times its own size a message may write anew; at 2, it would remove no more than it adds."""
 _LOADED_VOXELS = 1 << 16
 """Those of the rows that are read at a time."""
 
@@ -51,8 +50,8 @@ class PutOutcome:
     stale: Int64[ndarray, " s"]
 
 
-_TileName = tuple[str, int]
-"""A map and a tile."""
+_TileRow = tuple[int, int, EncodedVoxels]
+"""tile, number, voxels."""
 
 
 @dataclass(slots=True)
@@ -61,9 +60,8 @@ class LogChange:
 
     deleted: list[int] = field(default_factory=list)
     rows: list[UpdateRow] = field(default_factory=list)
-    added: list[tuple[_TileName, int, int]] = field(default_factory=list)
-    emptied: list[tuple[_TileName, list[int]]] = field(default_factory=list)
-    puts: list[tuple[str, Scores]] = field(default_factory=list)
+    puts: list[tuple[str, list[_TileRow], dict[int, list[int]]]] = field(default_factory=list)
+    """Map, its new rows, and the rows of the tiles that were written anew."""
     outcomes: list[PutOutcome] = field(default_factory=list)
 
 
@@ -94,9 +92,8 @@ class UpdateLog:
 
     def _load(self, parts: Sequence[tuple[str, int, EncodedVoxels]]) -> None:
         for name in {name for name, _, _ in parts}:
-            own = [(number, voxels) for owner, number, voxels in parts if owner == name]
-            for number, voxels in own:
-                self._add_row((name, tile_of(int(voxels.keys[0]))), number, _size(voxels))
+            own = [(tile_of(int(voxels.keys[0])), number, voxels) for owner, number, voxels in parts if owner == name]
+            self._add_rows(name, own)
             scores = _scores_of(own)
             order = np.lexsort((scores["rows"], scores["update_seqs"], scores["keys"]))
             keys = scores["keys"][order]
@@ -113,45 +110,31 @@ class UpdateLog:
             keys = update.voxels.keys
             change.outcomes.append(PutOutcome(keys[newer], keys[~newer]))
             accepted = update.voxels if newer.all() else update.voxels.take(np.flatnonzero(newer))
-            parts = accepted.by_tile()
-            written = [row for part in parts for row in self._add(change, update.agent_id, part, read)]
-            if written:
-                change.puts.append((update.agent_id, _scores_of(written)))
+            if len(accepted):
+                self._add(change, update.agent_id, accepted, read)
         return change
 
     def apply(self, change: LogChange) -> None:
         """Record a change whose transaction is committed."""
         self._outdated = []
-        for name, numbers in change.emptied:
-            tile = self.index.tile(*name)
-            tile.rows, tile.written = array("q"), 0
-            self._outdated += numbers
-        for name, number, size in change.added:
-            self._add_row(name, number, size)
-        for map_name, scores in change.puts:
-            self.index.put(map_name, scores)
+        for name, rows, outdated in change.puts:
+            self._add_rows(name, rows, outdated)
+            self.index.put(name, _scores_of(rows))
+            self._outdated += itertools.chain.from_iterable(outdated.values())
 
-    def removable(self, name: str, at_most: int) -> tuple[list[int], list[int]]:
-        """Return tiles of a map with about so many voxels, and what to delete with them: their rows, and outdated ones.
+    def removable(self, name: str, at_most: int) -> tuple[int, list[int]]:
+        """Return where a map's last tiles begin, with about so many voxels, and what to delete with them.
 
-        Nothing of an unknown map.
+        These are their rows, and outdated ones; nothing of an unknown map.
         """
-        tiles: list[int] = []
-        numbers: list[int] = []
-        size = 0
-        for number, tile in self.index.tiles(name).items():
-            if size >= at_most:
-                break
-            tiles.append(number)
-            numbers += tile.rows
-            size += max(len(tile.table), len(tile.rows), _LEAST_SIZE)
-        return tiles, [*numbers, *self._outdated] if tiles else []
+        place, numbers = self.index.last_tiles(name, at_most)
+        return place, [*numbers, *self._outdated] if numbers else []
 
-    def remove(self, name: str, tiles: Sequence[int]) -> Int64[ndarray, " v"]:
+    def remove(self, name: str, place: int) -> Int64[ndarray, " v"]:
         """Record that what is `removable` is deleted; returns the keys of the voxels, ascending."""
-        if tiles:
+        if name in self.index.agents:
             self._outdated = []
-        return self.index.remove_tiles(name, tiles)
+        return self.index.remove_from(name, place)
 
     def places(self, agent_id: str, keys: Int64[ndarray, " k"] | None) -> Places:
         """Return where the agent's updates of these voxels, or all, are."""
@@ -162,39 +145,42 @@ class UpdateLog:
         keys, rows = self.places(agent_id, keys)
         return _voxels_of(keys, rows, read(np.unique(rows).tolist()))
 
-    def _add(
-        self, change: LogChange, agent_id: str, part: EncodedVoxels, read: ReadRows
-    ) -> Iterator[tuple[int, EncodedVoxels]]:
-        """Add a row with these voxels of a tile, and all others of the agent's tile if that is outdated; yields it."""
-        name = agent_id, tile_of(int(part.keys[0]))
-        own = self.index.tiles(agent_id).get(name[1])
-        parts = {part.size_m: [part]}
-        if own is not None and _is_outdated(own):
-            for number, data in read(sorted(own.rows)).items():
-                voxels = EncodedVoxels.from_row(data)
-                is_used = self.index.scores_of(agent_id, voxels.keys)["rows"] == number
-                is_used &= ~np.isin(voxels.keys, part.keys)
-                if is_used.any():
-                    parts.setdefault(voxels.size_m, []).append(voxels.take(np.flatnonzero(is_used)))
-            change.emptied.append((name, sorted(own.rows)))
-        slot = int(self._slots_of(part.keys[:1])[0]) << SLOT_BITS
-        label = self.epochs.label_of(agent_id)
+    def _add(self, change: LogChange, name: str, accepted: EncodedVoxels, read: ReadRows) -> None:
+        """Add a row for each tile of these voxels, with all others of the map's tile if that is outdated."""
+        label, rows = self.epochs.label_of(name), list[_TileRow]()
+        at_most = _SPARE_UNITS + _REWRITTEN * _size(accepted)
+        outdated = self.index.outdated_rows(name, np.unique(tiles_of(accepted.keys)), _SPARE_UNITS, at_most)
+        parts = {accepted.size_m: [accepted]}
+        for others in self._others(name, accepted.keys, list(itertools.chain(*outdated.values())), read):
+            parts.setdefault(others.size_m, []).append(others)
         for same_size in parts.values():
-            self._last += 1
-            number, voxels = slot + self._last, _in_order(EncodedVoxels.concatenate(same_size))
-            data = voxels.to_row()
-            change.rows.append((number, label, data_checksum(label, number, data), data))
-            change.added.append((name, number, _size(voxels)))
-            yield number, voxels
+            voxels = _in_order(EncodedVoxels.concatenate(same_size))
+            tiles = np.unique(tiles_of(voxels.keys))
+            slots = (self._slots_of(tiles) << SLOT_BITS).tolist()
+            for tile, slot, part in zip(tiles.tolist(), slots, voxels.by_tile(), strict=True):
+                self._last += 1
+                number, data = slot + self._last, part.to_row()
+                change.rows.append((number, label, data_checksum(label, number, data), data))
+                rows.append((tile, number, part))
+        change.puts.append((name, rows, outdated))
 
-    def _add_row(self, name: _TileName, number: int, size: int) -> None:
-        tile = self.index.tile(*name)
-        tile.rows.append(number)
-        tile.written += size
+    def _others(
+        self, name: str, keys: Int64[ndarray, " k"], numbers: Sequence[int], read: ReadRows
+    ) -> Iterator[EncodedVoxels]:
+        """Yield what these rows have of the map's latest updates, without these voxels."""
+        rows = [(number, EncodedVoxels.from_row(data)) for number, data in read(numbers).items()] if numbers else []
+        if rows:
+            scores = _scores_of([(0, *row) for row in rows])
+            is_used = self.index.scores_of(name, scores["keys"])["rows"] == scores["rows"]
+            is_used &= ~np.isin(scores["keys"], keys)
+            ends = np.cumsum([len(voxels) for _, voxels in rows])
+            for (_, voxels), own in zip(rows, np.split(is_used, ends[:-1]), strict=True):
+                if own.any():
+                    yield voxels.take(np.flatnonzero(own))
 
-
-def _is_outdated(tile: MapTile) -> bool:
-    return tile.written - tile.used > max(tile.used, _SPARE_UNITS)
+    def _add_rows(self, name: str, rows: Sequence[_TileRow], emptied: Collection[int] = ()) -> None:
+        added = [(tile, number, _size(voxels)) for tile, number, voxels in rows]
+        self.index.add_rows(name, np.array(added, ROWS), emptied)
 
 
 def require_storable(update: EncodedSubset) -> None:
@@ -250,12 +236,12 @@ def _size(voxels: EncodedVoxels) -> int:
     return len(voxels.gaussians) + VOXEL_UNITS * len(voxels)
 
 
-def _scores_of(rows: Sequence[tuple[int, EncodedVoxels]]) -> Scores:
+def _scores_of(rows: Sequence[_TileRow]) -> Scores:
     """Return the totals of the voxels of these numbered rows, in order."""
-    table = join_elements([voxels.voxels for _, voxels in rows])
+    table = join_elements([voxels.voxels for _, _, voxels in rows])
     scores = np.empty(len(table), SCORES)
     for name in VOXELS.names or ():
         scores[name] = table[name]
-    numbers = np.array([number for number, _ in rows], np.int64)
-    scores["rows"] = np.repeat(numbers, [len(voxels) for _, voxels in rows])
+    numbers = np.array([number for _, number, _ in rows], np.int64)
+    scores["rows"] = np.repeat(numbers, [len(voxels) for _, _, voxels in rows])
     return scores

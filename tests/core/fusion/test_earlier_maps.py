@@ -149,9 +149,9 @@ def test_former_maps_are_few_and_leave_in_slices(open_store: OpenStore) -> None:
 
 
 def test_the_memory_of_an_agents_voxels_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = engine_on(memory_bytes=64 * 10_000)
+    engine = engine_on(memory_bytes=64 * 5_000)
     send(engine, reboot(engine), 1, {cell: [9] for cell in range(50)})
-    with pytest.raises(QuotaError, match=r"at most 10000 bytes of memory \(memory-mb divided by quota-agents\)"):
+    with pytest.raises(QuotaError, match=r"at most 5000 bytes of memory \(memory-mb divided by quota-agents\)"):
         send(engine, reboot(engine, "bee"), 1, {cell: [9] for cell in range(300)}, "bee")
     session = reboot(engine)
     # the former map makes room

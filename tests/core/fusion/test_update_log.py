@@ -13,9 +13,10 @@ from support.sample_batches import make_batch, random_subset
 from gausslite.codec.encoded_voxels import EncodedSubset, EncodedVoxels
 from gausslite.codec.subset_codec import decode_subset, encode_subset, unpack_subset
 from gausslite.domain.voxel_changes import TileDigests
-from gausslite.domain.voxels import RoiSubset, VoxelBatch, VoxelGrid
+from gausslite.domain.voxels import TILE_VOXELS, RoiSubset, VoxelBatch, VoxelGrid
 from gausslite.fusion import update_log
 from gausslite.fusion.score_index import voxel_records
+from gausslite.fusion.sqlite_store import SqliteStore
 from gausslite.fusion.store import FusionStore
 
 AGENTS = ("ant", "bee", "cat")
@@ -119,7 +120,21 @@ def test_outdated_rows_are_deleted(open_store: OpenStore) -> None:
     log = store._log
     for seq in range(1, 80):
         store.put(random_subset("ant", seq, dict.fromkeys(range(seq % 3, 60, 3), 2), seed=seq))
-    held = sum(tile.written for tile in log.index.tiles("ant").values())
+    held = int(log.index._maps["ant"].tiles.select()[1]["written"].sum())
     in_use = sum(2 + 2 for _ in range(60))
     assert held < 4 * in_use + 4 * 60
     store.close()
+
+
+def test_a_message_rewrites_in_proportion_to_its_own_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(update_log, "_SPARE_UNITS", 60)
+    store = SqliteStore()
+    read = Mock(wraps=store._read_rows)
+    monkeypatch.setattr(store, "_read_rows", read)
+    for seq in range(1, 100):
+        # one voxel of three units in each of 20 tiles, which are all outdated at once
+        store.put(random_subset("ant", seq, dict.fromkeys(range(0, 20 * TILE_VOXELS, TILE_VOXELS), 1)))
+    rows_of_a_tile = 60 // 3 + 2
+    assert max(len(call.args[0]) for call in read.mock_calls) <= (60 + 4 * 20 * 3) // 3 + 2 * rows_of_a_tile
+    ((held,),) = store._read("SELECT count(*) FROM voxel_updates")
+    assert held < 2 * 20 * rows_of_a_tile
