@@ -122,7 +122,7 @@ class FrameAlignment:
 
     def is_placed_as(self, other: FrameAlignment) -> bool:
         """Return whether the vote reads the agent's updates in the same way with the other alignment."""
-        own, theirs = ((Segment(0, each.declared), *each.segments) for each in (self, other))
+        own, theirs = ((Segment(0, placed.declared), *placed.segments) for placed in (self, other))
         return (
             self.is_used == other.is_used
             and len(own) == len(theirs)
