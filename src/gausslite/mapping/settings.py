@@ -154,7 +154,7 @@ class KeyframeSettings:
         )
 
 
-_BALANCED_LOSS = LossWeights(normalise_by_image=True)
+BALANCED_LOSS = LossWeights(normalise_by_image=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ class OptimizationSettings:
     active_iterations: int = 6
     active_views: int = 8
     active_phase: ActivePhase = ActivePhase.ALL_GAUSSIANS
-    loss: LossWeights = _BALANCED_LOSS
+    loss: LossWeights = BALANCED_LOSS
     adam: AdamSettings = ONLINE_RATES
     decay_after_updates: float = 150.0
     isotropic: bool = False

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_subset
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_batch, make_subset
 from grpc_health.v1 import health_pb2, health_pb2_grpc
+from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.camera import Camera
@@ -14,10 +17,14 @@ from gausslite.domain.errors import (
     MismatchError,
     QuotaError,
 )
+from gausslite.domain.frame import Frame
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings
+from gausslite.render.rasterizer import gaussians_to_rows
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
+
+CELLS = {cell: [3] * 4 for cell in (-1, 0, 1)}
 
 
 def test_keyframes_are_limited_and_invalid_ones_reported() -> None:
@@ -37,10 +44,20 @@ def test_keyframes_are_limited_and_invalid_ones_reported() -> None:
         assert answer.rejected[0].reason
 
 
+def seen(index: int) -> Frame:
+    """A photograph of the voted map, a little brighter."""
+    rows = gaussians_to_rows(make_batch(CELLS).gaussians)
+    rendering = ReferenceRasterizer().forward(rows, CAMERA, np.eye(4))
+    rgb = np.clip(np.rint(rendering.rgb * 255) + 9, 0, 255).astype(np.uint8)
+    return replace(frame(index), rgb=rgb, depth_m=rendering.expected_depth_m())
+
+
 def contributed(t: RunningServer) -> str:
     session = t.client.join("ant", GRID).session_id
-    t.contribute_subsets(session, make_subset("ant", 1, {cell: [3] * 4 for cell in (-1, 0, 1)}))
-    t.client.contribute_keyframes(session, [frame(1), frame(2)])
+    t.contribute_subsets(session, make_subset("ant", 1, CELLS))
+    t.client.contribute_keyframes(session, [seen(1), seen(2)])
+    # of an agent without a voxel, as a wrong pose would show
+    t.client.contribute_keyframes(t.client.join("bee", GRID).session_id, [frame(1)])
     return session
 
 
@@ -52,6 +69,7 @@ def test_refinement_reports_progress_and_its_map_shows_newer_votes() -> None:
         progress = list(t.client.refine(iterations=4))
         assert [p.done for p in progress] == [False] * (len(progress) - 1) + [True]
         assert progress[-1].iteration == progress[-1].iterations == 4
+        assert progress[-1].left_out == ["bee: 1 of 1 keyframes"]
         assert t.client.status().refined
         refined, voted = (gaussians_from_ply(t.client.export(Export(name))) for name in ("refined", "vote"))
         assert refined.rgb.tobytes() != voted.rgb.tobytes()
@@ -89,7 +107,7 @@ def test_a_refinement_without_useful_keyframes_is_refused() -> None:
             list(t.client.refine())
         behind = np.diag([1.0, -1.0, -1.0, 1.0])
         t.client.contribute_keyframes(session, [frame(1, CAMERA, behind)])
-        with pytest.raises(InvalidInputError, match="but none does"):
+        with pytest.raises(InvalidInputError, match="got 1: 0 show it"):
             list(t.client.refine())
 
 
