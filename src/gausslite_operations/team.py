@@ -164,11 +164,11 @@ def run_refine(options: argparse.Namespace) -> int:
     """
     if options.out is not None:
         prepare_file(options.out, MAP_FILE)
-    gaussians, left_out = 0, ()
+    gaussians, left_out = 0, list[str]()
     with fusion_client(options) as client:
         with progress_bar(options.iterations, "refine", "it") as bar:
             for progress in client.refine(options.iterations, seed=options.seed):
-                bar.total, gaussians, left_out = progress.iterations, progress.gaussians, progress.left_out
+                bar.total, gaussians, left_out = progress.iterations, progress.gaussians, list(progress.left_out)
                 bar.set_postfix_str(f"loss {progress.loss:.4f}", refresh=False)
                 bar.update(progress.iteration - bar.n)
         for line in left_out:

@@ -172,8 +172,8 @@ def _matching_pairs(landmarks: Sequence[ObjectLandmark], owner: Int64[ndarray, "
     # a pair can be in several groups
     number, first = np.unique(np.concatenate(numbers), return_index=True)
     order = np.lexsort((number, np.concatenate(distances)[first]))
-    pairs = np.stack(np.divmod(number[order], len(landmarks)), axis=1)
-    return pairs[~repeated[pairs].any(axis=1)]
+    i, j = np.divmod(number[order], len(landmarks))
+    return np.stack([i, j], axis=1)[~(repeated[i] | repeated[j])]
 
 
 def group_boxes(low: Float64[ndarray, "n d"], high: Float64[ndarray, "n d"]) -> list[Int64[ndarray, " g"]]:

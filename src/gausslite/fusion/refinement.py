@@ -41,7 +41,7 @@ _HELD_OUT_EVERY, _FIRST_HELD_OUT = 8, 4
 _PATIENCE = 4
 """Checks without an improvement after which a refinement ends."""
 _UPDATES = 50
-"""Weight of a refinement against a Gaussian's kappa updates in the mission."""
+"""Weight of a refinement against the most kappa updates of a voxel's Gaussians in the mission."""
 _MIN_ITERATIONS, _GAUSSIANS_PER_ITERATION = 500, 200
 
 
@@ -113,8 +113,10 @@ class Refinement:
         self._first_errors = self._pool.errors(self._table.rows)
         self._vote_rows = self._best_rows = self._table.rows.copy()
         self._mean_rows, self._states, self._best_score = self._vote_rows.copy(), 1, 0.0
-        kappa = vote.gaussians.kappa[:, None].astype(np.float32)
-        self._share = np.float32(_UPDATES) / (np.float32(_UPDATES) + kappa)
+        voxel = np.unique(vote.grid.keys(vote.gaussians.means_m), return_inverse=True)[1]
+        kappa = np.zeros(len(voxel), np.float32)
+        np.maximum.at(kappa, voxel, vote.gaussians.kappa)
+        self._share = (_UPDATES / (_UPDATES + kappa[voxel, None])).astype(np.float32)
         self._iterations = settings.iterations or min(
             max(_MIN_ITERATIONS, len(vote.gaussians) // _GAUSSIANS_PER_ITERATION), MAX_REFINE_ITERATIONS
         )
@@ -153,7 +155,7 @@ class Refinement:
     def _keep_if_best(self) -> bool:
         """Keep the mean of the states if it is the best yet, and nowhere worse than the vote; returns whether it is.
 
-        The mean has less noise than the last state. A Gaussian that its mission trained often stays near the vote,
+        The mean has less noise than the last state. A voxel that its mission trained often stays near the vote,
         because the mission had all frames: off the keyframes' paths, the demo's mug would lose 0.7 dB.
         """
         self._states += 1
@@ -240,7 +242,8 @@ class _ViewPool:
             for column, region in enumerate(self._columns):
                 shown = squared[view.region >= BACKGROUND if region == BACKGROUND else view.region == region]
                 sums[column] += shown.sum(dtype=np.float64), len(shown)
-        return sums[:, 0] / sums[:, 1]
+        means: Float64[ndarray, " c"] = sums[:, 0] / sums[:, 1]
+        return means
 
     def _prepare(self, number: int, region: int) -> _Prepared:
         found = self._prepared.get((number, region))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_batch, make_subset
+from fusion_running import CAMERA, GRID, RunningServer, frame, fusion_server, make_subset, photograph
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from torch_oracle.rasterizer import ReferenceRasterizer
 
 from gausslite.codec.ply import gaussians_from_ply
 from gausslite.domain.camera import Camera
@@ -17,10 +14,8 @@ from gausslite.domain.errors import (
     MismatchError,
     QuotaError,
 )
-from gausslite.domain.frame import Frame
 from gausslite.fusion.limits import FusionSettings, Quotas
 from gausslite.fusion.refinement import RefineSettings
-from gausslite.render.rasterizer import gaussians_to_rows
 from gausslite.v1 import fusion_service_pb2 as pb
 from gausslite.wire.clients import Export
 
@@ -44,18 +39,10 @@ def test_keyframes_are_limited_and_invalid_ones_reported() -> None:
         assert answer.rejected[0].reason
 
 
-def seen(index: int) -> Frame:
-    """A photograph of the voted map, a little brighter."""
-    rows = gaussians_to_rows(make_batch(CELLS).gaussians)
-    rendering = ReferenceRasterizer().forward(rows, CAMERA, np.eye(4))
-    rgb = np.clip(np.rint(rendering.rgb * 255) + 9, 0, 255).astype(np.uint8)
-    return replace(frame(index), rgb=rgb, depth_m=rendering.expected_depth_m())
-
-
 def contributed(t: RunningServer) -> str:
     session = t.client.join("ant", GRID).session_id
     t.contribute_subsets(session, make_subset("ant", 1, CELLS))
-    t.client.contribute_keyframes(session, [seen(1), seen(2)])
+    t.client.contribute_keyframes(session, [photograph(1, CELLS), photograph(2, CELLS)])
     # of an agent without a voxel, as a wrong pose would show
     t.client.contribute_keyframes(t.client.join("bee", GRID).session_id, [frame(1)])
     return session
