@@ -173,7 +173,8 @@ def _matching_pairs(landmarks: Sequence[ObjectLandmark], owner: Int64[ndarray, "
     number, first = np.unique(np.concatenate(numbers), return_index=True)
     order = np.lexsort((number, np.concatenate(distances)[first]))
     i, j = np.divmod(number[order], len(landmarks))
-    return np.stack([i, j], axis=1)[~(repeated[i] | repeated[j])]
+    once = ~(repeated[i] | repeated[j])
+    return np.stack([i[once], j[once]], axis=1)
 
 
 def group_boxes(low: Float64[ndarray, "n d"], high: Float64[ndarray, "n d"]) -> list[Int64[ndarray, " g"]]:
